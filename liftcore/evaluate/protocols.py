@@ -48,7 +48,7 @@ class EvaluationProtocol(StrEnum):
     P1 = "P1"
     P2 = "P2"
     P3 = "P3"
-    OWN = "own"
+    OBJECTS = "own"
 
 
 @dataclass(frozen=True)
@@ -225,5 +225,5 @@ SEGMENTERS: dict[EvaluationProtocol, type[Segmenter]] = {
     EvaluationProtocol.P1: RenderedFeatures,
     EvaluationProtocol.P2: SelectedSplats,
     EvaluationProtocol.P3: RenderedScores,
-    EvaluationProtocol.OWN: OwnMasks,
+    EvaluationProtocol.OBJECTS: OwnMasks,
 }

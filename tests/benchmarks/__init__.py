@@ -1,1 +1,1 @@
-"""What splatlift measures about itself: scripts run by hand (`python -m tests.benchmarks.NAME`), never by pytest."""
+"""Measurements of splatlift: scripts that are run by hand (`python -m tests.benchmarks.NAME`), never by pytest."""

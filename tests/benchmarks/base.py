@@ -1,4 +1,4 @@
-"""What the benchmarks share: scene folders, tables, and the machine that took the figures."""
+"""Helpers of the benchmarks: scene folders, tables, and the machine of the figures."""
 
 import argparse
 import json
@@ -22,7 +22,7 @@ PRESETS = ("row-sum", "tikhonov")
 
 
 def cameras_of(folder: Path) -> Path:
-    """What the cameras of a scene folder are read from: ``cameras.json`` if it is there, else the folder."""
+    """Return the path of a scene folder's cameras: ``cameras.json`` if it exists, else the folder."""
     inria = folder / "cameras.json"
     return inria if inria.is_file() else folder
 
@@ -38,10 +38,10 @@ def read_scene(folder: Path) -> tuple[lc.Splats, lc.Cameras]:
     return lc.read_splats(splats), lc.read_cameras(cameras)
 
 
-def read_pack(folder: Path, name: str, every: int = 1) -> Mapping[str, ViewFeatures]:
+def read_pack(folder: Path, name: str, stride: int = 1) -> Mapping[str, ViewFeatures]:
     """Every n-th view of a feature pack of a scene folder; the pack itself where that is all of them."""
     views = lc.read_features(folder / f"{name}.safetensors")
-    return views if every == 1 else {view: views[view] for view in views.views[::every]}
+    return views if stride == 1 else {view: views[view] for view in views.views[::stride]}
 
 
 def mask_iou(mask: Tensor | np.ndarray, truth: Tensor | np.ndarray) -> float:
@@ -51,11 +51,11 @@ def mask_iou(mask: Tensor | np.ndarray, truth: Tensor | np.ndarray) -> float:
     return int((mask & truth).sum()) / union if union else 1.0
 
 
-def box_iou(one: np.ndarray, other: np.ndarray) -> float:
+def box_iou(a: np.ndarray, b: np.ndarray) -> float:
     """Volume of the intersection over that of the union of two boxes [2, d], corners; 0 where both are flat."""
-    sides = np.minimum(one[1], other[1]) - np.maximum(one[0], other[0])
+    sides = np.minimum(a[1], b[1]) - np.maximum(a[0], b[0])
     common = float(np.prod(np.maximum(sides, 0)))
-    union = float(np.prod(one[1] - one[0]) + np.prod(other[1] - other[0])) - common
+    union = float(np.prod(a[1] - a[0]) + np.prod(b[1] - b[0])) - common
     return common / union if union > 0 else 0.0
 
 
@@ -79,7 +79,9 @@ def table_of(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] = ()) -> 
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def tell(rows: Iterable[Mapping[str, Any]], *, as_json: bool, note: str = "", columns: Sequence[str] = ()) -> None:
+def print_rows(
+    rows: Iterable[Mapping[str, Any]], *, as_json: bool, note: str = "", columns: Sequence[str] = ()
+) -> None:
     """Print the rows with the machine: a Markdown table, or one JSON object."""
     rows = list(rows)
     if as_json:

@@ -28,8 +28,8 @@ import liftcore as lc
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.text import TextEncoder, open_encoder
 from liftcore.values.views import ViewFeatures
-from tests.benchmarks.base import command_line, read_pack, tell
-from tests.benchmarks.tabletop import Truth, counted, tabletop
+from tests.benchmarks.base import command_line, print_rows, read_pack
+from tests.benchmarks.tabletop import Truth, evaluated_splats, tabletop
 from tests.still_life.masks import Mistakes, mistaken_regions, observe, true_labels
 from tests.still_life.objects import Piece, small_things
 from tests.still_life.scene import still_life
@@ -60,22 +60,22 @@ SETTINGS: dict[str, dict[str, Any]] = {
 }
 
 
-def with_mistakes(folder: Path, kind: str, seed: int, every: int = 4) -> dict[str, ViewFeatures]:
-    """Every ``every``-th view of tabletop's exact masks, with mistakes."""
+def with_mistakes(folder: Path, kind: str, seed: int, stride: int = 4) -> dict[str, ViewFeatures]:
+    """Every ``stride``-th view of tabletop's exact masks, with mistakes."""
     packs, (mistakes, cone) = lc.read_features(folder / "features_clean.safetensors"), MISTAKES[kind]
-    rng, made = np.random.default_rng(100 + seed), dict[str, ViewFeatures]()
-    for view in packs.views[seed % every :: every]:
+    rng, views = np.random.default_rng(100 + seed), dict[str, ViewFeatures]()
+    for view in packs.views[seed % stride :: stride]:
         exact = packs[view]
         assert isinstance(exact, lc.Regions)
-        made[view] = in_cone(mistaken_regions(exact, mistakes, rng), cone)
-    return made
+        views[view] = in_cone(mistaken_regions(exact, mistakes, rng), cone)
+    return views
 
 
 def in_cone(regions: lc.Regions, share: float) -> lc.Regions:
     """Unit vectors drawn towards one fixed random direction, as CLIP's image vectors are: that much of each is it."""
     axis = torch.randn(regions.codebook.shape[1], generator=torch.Generator().manual_seed(1))
-    drawn = (1 - share**2) ** 0.5 * regions.codebook.float() + share * normalize(axis, dim=0)
-    return replace(regions, codebook=normalize(drawn, dim=1).half()) if share else regions
+    rows = (1 - share**2) ** 0.5 * regions.codebook.float() + share * normalize(axis, dim=0)
+    return replace(regions, codebook=normalize(rows, dim=1).half()) if share else regions
 
 
 def still_life_scene(
@@ -83,21 +83,25 @@ def still_life_scene(
 ) -> tuple[Truth, dict[str, ViewFeatures]]:
     """The still life, or other pieces in its place, with mistakes, and its truth; minilm if no encoder is named."""
     encoder = encoder or open_encoder("minilm")
-    made, (mistakes, cone) = still_life(seed, pieces=pieces), MISTAKES[kind]
-    raster = CpuRaster(made.splats)
+    scene, (mistakes, cone) = still_life(seed, pieces=pieces), MISTAKES[kind]
+    raster = CpuRaster(scene.splats)
     views: dict[str, ViewFeatures] = {
-        view: in_cone(seen, cone) for view, seen in observe(made, raster, encoder, mistakes, seed).items()
+        view: in_cone(view_features, cone)
+        for view, view_features in observe(scene, raster, encoder, mistakes, seed).items()
     }
-    held_out = {view: torch.from_numpy(true_labels(made, raster, view)[0]) for view in made.held_out}
-    classes = normalize(torch.from_numpy(np.asarray(encoder.encode(made.things))).float(), dim=1)
-    things, seen = torch.from_numpy(made.splat_things), counted(made.splats, made.cameras, views)
-    return Truth(raster, made.cameras, made.things, classes, things, seen, held_out), views
+    held_out = {view: torch.from_numpy(true_labels(scene, raster, view)[0]) for view in scene.held_out}
+    classes = normalize(torch.from_numpy(np.asarray(encoder.encode(scene.things))).float(), dim=1)
+    object_rows, view_features = (
+        torch.from_numpy(scene.splat_things),
+        evaluated_splats(scene.splats, scene.cameras, views),
+    )
+    return Truth(raster, scene.cameras, scene.things, classes, object_rows, view_features, held_out), views
 
 
 def ranked(truth: Truth, lifted: lc.LiftResult, values: Tensor) -> float:
     """AUROC of values [P] on splats for being right."""
-    right = (truth.scores(lifted).argmax(dim=1) == truth.objects)[truth.counted].numpy()
-    ranks, hits = rankdata(values[truth.counted].numpy()), int(right.sum())
+    right = (truth.scores(lifted).argmax(dim=1) == truth.objects)[truth.evaluated].numpy()
+    ranks, hits = rankdata(values[truth.evaluated].numpy()), int(right.sum())
     return float((ranks[right].sum() - hits * (hits + 1) / 2) / max(hits * (right.size - hits), 1))
 
 
@@ -109,7 +113,7 @@ def measured(name: str, truth: Truth, views: Mapping[str, ViewFeatures], setting
         start = time.perf_counter()
         lifted = truth.lift(views, **SETTINGS[label])
         seconds[label] = time.perf_counter() - start
-        row[label] = " / ".join(f"{value:.4f}" for value in vars(truth.judge(lifted)).values())
+        row[label] = " / ".join(f"{value:.4f}" for value in vars(truth.evaluate(lifted)).values())
         if label == "default" and lifted.confidence is not None:
             row["confidence"] = ranked(truth, lifted, lifted.confidence)
             row["agreement"] = ranked(truth, lifted, lifted.agreement)
@@ -118,17 +122,17 @@ def measured(name: str, truth: Truth, views: Mapping[str, ViewFeatures], setting
     return row
 
 
-def rows_of(chosen: Namespace) -> Iterator[dict[str, Any]]:
+def rows_of(options: Namespace) -> Iterator[dict[str, Any]]:
     """Packs of tabletop, then mistakes on it, on the still life and on small things."""
-    truth = tabletop(chosen.folder)
-    for pack in chosen.packs:
-        for stride in chosen.strides if pack != "grids" else (1,):
-            yield measured(pack, truth, read_pack(chosen.folder, pack, stride), chosen.settings)
-    for kind, seed in product(chosen.mistakes, chosen.seeds):
-        views = with_mistakes(chosen.folder, kind, seed)
-        yield measured(f"tabletop, {kind} {seed}", truth, views, chosen.settings)
+    truth = tabletop(options.folder)
+    for pack in options.packs:
+        for stride in options.strides if pack != "grids" else (1,):
+            yield measured(pack, truth, read_pack(options.folder, pack, stride), options.settings)
+    for kind, seed in product(options.mistakes, options.seeds):
+        views = with_mistakes(options.folder, kind, seed)
+        yield measured(f"tabletop, {kind} {seed}", truth, views, options.settings)
         for name, pieces in (("still life", None), ("small things", small_things())):
-            yield measured(f"{name}, {kind} {seed}", *still_life_scene(kind, seed, pieces), chosen.settings)
+            yield measured(f"{name}, {kind} {seed}", *still_life_scene(kind, seed, pieces), options.settings)
 
 
 def main() -> None:
@@ -143,8 +147,8 @@ def main() -> None:
         ("--seeds", {"nargs": "*", "type": int, "default": (7, 8)}),
         ("--settings", {"nargs": "*", "default": tuple(SETTINGS), "choices": tuple(SETTINGS)}),
     )
-    chosen = parser.parse_args()
-    tell(rows_of(chosen), as_json=chosen.json)
+    options = parser.parse_args()
+    print_rows(rows_of(options), as_json=options.json)
 
 
 if __name__ == "__main__":

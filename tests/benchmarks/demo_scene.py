@@ -25,9 +25,9 @@ from liftcore.text import BUILT_IN, LVIS_TABLE, open_encoder
 from liftcore.values.pack import write_pack
 from service.commands.demo import SHIPPED
 
-EVERY = 3  # of the views with features
+STRIDE = 3  # of the views with features
 PACK = "features_hard"
-ASKED = ("penguin", "pizza", "teapot", "cat", "sofa")  # the last is not there
+QUERIES = ("penguin", "pizza", "teapot", "cat", "sofa")  # the last is not there
 PICTURED = "view_030"  # of the held-out views, the one that shows all that is asked
 GSPLY = "gsply==0.4.6"
 # gsply takes the frame as it is: SPZ is right, up, back, a PLY right, down, front. A half turn about x.
@@ -48,15 +48,15 @@ def make(data: Path, out: Path) -> None:
     shutil.copyfile(source / "cameras.json", out / "cameras.json")
     truth = json.loads((source / "truth.json").read_text())
     shutil.copyfile(data / "text_tables" / "lvis_clip_vit_b_32.safetensors", LVIS_TABLE)
-    open_encoder("lvis").encode(ASKED)
-    _features(source / f"{PACK}.safetensors", truth["feature_views"][::EVERY], out)
+    open_encoder("lvis").encode(QUERIES)
+    _features(source / f"{PACK}.safetensors", truth["feature_views"][::STRIDE], out)
     arrays = load_file(source / "truth.safetensors")
     views = sorted(truth["held_out_views"], key=lambda view: view != PICTURED)
     _compressed(save({f"{view}/mask": arrays[f"{view}/mask"] for view in views}), out / "truth.safetensors.zst")
-    things = [{key: thing[key] for key in ("class", "source", "splats", "license")} for thing in truth["objects"]]
-    absent = {phrase: [] for phrase in ASKED if phrase not in {thing["class"] for thing in things}}
-    told = {"objects": things, "held_out_views": views, "ask": ASKED, "phrases": absent}
-    (out / "truth.json").write_text(json.dumps(told, indent=1) + "\n")
+    entries = [{key: entry[key] for key in ("class", "source", "splats", "license")} for entry in truth["objects"]]
+    absent = {phrase: [] for phrase in QUERIES if phrase not in {entry["class"] for entry in entries}}
+    truth_file = {"objects": entries, "held_out_views": views, "ask": QUERIES, "phrases": absent}
+    (out / "truth.json").write_text(json.dumps(truth_file, indent=1) + "\n")
 
 
 def _splats(ply: Path, spz: Path) -> None:
@@ -65,19 +65,19 @@ def _splats(ply: Path, spz: Path) -> None:
         python = Path(folder) / "bin" / "python"
         subprocess.run([python, "-m", "pip", "install", "--quiet", GSPLY], check=True)
         subprocess.run([python, "-c", TO_SPZ, ply, spz], check=True)
-    given, kept = lc.read_splats(ply), lc.read_splats(spz)
+    ply_splats, spz_splats = lc.read_splats(ply), lc.read_splats(spz)
     # Rows must stay: the truth is by row. Positions have 12 bits behind the point.
-    if not torch.allclose(given.means, kept.means, rtol=0, atol=2.0**-12):
+    if not torch.allclose(ply_splats.means, spz_splats.means, rtol=0, atol=2.0**-12):
         sys.exit(f"{spz}: other rows or another frame than {ply}")
 
 
 def _features(pack: Path, views: list[str], out: Path) -> None:
     features = lc.read_features(pack)
-    told = {"encoder": "words of CLIP ViT-B/32 with noise", "text_space": BUILT_IN["lvis"], "normalised": "true"}
+    header = {"encoder": "words of CLIP ViT-B/32 with noise", "text_space": BUILT_IN["lvis"], "normalised": "true"}
     with tempfile.TemporaryDirectory() as folder:
-        plain = Path(folder) / "features.safetensors"
-        write_pack(plain, {view: features[view] for view in views}, told)
-        _compressed(plain.read_bytes(), out / f"{plain.name}.zst")
+        path = Path(folder) / "features.safetensors"
+        write_pack(path, {view: features[view] for view in views}, header)
+        _compressed(path.read_bytes(), out / f"{path.name}.zst")
 
 
 def _compressed(content: bytes, path: Path) -> None:

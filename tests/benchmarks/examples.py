@@ -27,9 +27,9 @@ from liftcore.query.question import Query
 from liftcore.query.scene import Scene
 from liftcore.query.terms import Pixel
 from liftcore.query.threshold import METHODS, find_threshold
-from tests.benchmarks.base import PACKS, PRESETS, command_line, read_pack, read_scene, tell
+from tests.benchmarks.base import PACKS, PRESETS, command_line, print_rows, read_pack, read_scene
 from tests.benchmarks.tabletop import Truth, tabletop
-from tests.benchmarks.thresholds import judged
+from tests.benchmarks.thresholds import compare_thresholds
 
 Case = tuple[Pixel, list[tuple[str, Tensor]]]  # an example, and what it shows: views, and [H, W] bool in each
 
@@ -44,30 +44,30 @@ def deepest_pixel(truth: Tensor) -> tuple[int, int]:
 def measure(scene: Scene, cases: Iterable[Case]) -> dict[str, float]:
     """Mean IoU over examples and views by column, how many were asked, and how many had no feature."""
     rows: dict[str, list[float]] = {name: [] for name in (*METHODS, "anywhere", "rendered", "best")}
-    asked = refused = 0
+    queries = rejected = 0
     for example, truths in cases:
-        asked += 1
+        queries += 1
         try:
             answers = {name: ask(scene, Query.of((example,), threshold=name)) for name in METHODS}
         except lc.InvalidQuery:
-            refused += 1
+            rejected += 1
             continue
         auto = answers["auto"]
         cut = find_threshold(auto.scores[auto.seen], "auto", scene.weights).value
         answers["anywhere"] = ask(scene, Query.of((example,), threshold=cut))
-        for name, values in judged(scene, answers, truths).items():
+        for name, values in compare_thresholds(scene, answers, truths).items():
             rows[name] += values
-    return {"asked": asked, "refused": refused} | {name: float(np.mean(values)) for name, values in rows.items()}
+    return {"asked": queries, "refused": rejected} | {name: float(np.mean(values)) for name, values in rows.items()}
 
 
 def objects_of(truth: Truth) -> Iterator[Case]:
     """The objects that the first held-out view shows, and where the others show them."""
-    first, *others = truth.held_out
+    first, *other_views = truth.held_out
     for number in range(len(truth.classes)):
-        shown = truth.held_out[first] == number
-        if shown.any():
-            rest = [(view, truth.held_out[view] == number) for view in others]
-            yield Pixel(first, *deepest_pixel(shown)), [(view, mask) for view, mask in rest if mask.any()]
+        visible = truth.held_out[first] == number
+        if visible.any():
+            rest = [(view, truth.held_out[view] == number) for view in other_views]
+            yield Pixel(first, *deepest_pixel(visible)), [(view, mask) for view, mask in rest if mask.any()]
 
 
 def regions_of(scene: Scene, level: int) -> Iterator[Case]:
@@ -79,9 +79,9 @@ def regions_of(scene: Scene, level: int) -> Iterator[Case]:
         size = (camera.height, camera.width)
         of_pixels = torch.nn.functional.interpolate(labels, size=size, mode="nearest")[0, 0]
         for region in of_pixels.unique().tolist():
-            shown = of_pixels == region
-            if region >= 0 and 0.02 <= float(shown.float().mean()) <= 0.5:
-                yield Pixel(view, *deepest_pixel(shown)), [(view, shown)]
+            mask = of_pixels == region
+            if region >= 0 and 0.02 <= float(mask.float().mean()) <= 0.5:
+                yield Pixel(view, *deepest_pixel(mask)), [(view, mask)]
 
 
 def main() -> None:
@@ -100,7 +100,7 @@ def main() -> None:
     if (folder / "truth.json").exists():
         truth = tabletop(folder)
         for pack, preset in product(options.features, options.presets):
-            scene = truth.opened(truth.lift(read_pack(folder, pack), preset=preset))
+            scene = truth.open_scene(truth.lift(read_pack(folder, pack), preset=preset))
             head = {"scene": folder.name, "features": pack, "preset": preset}
             rows.append(head | measure(scene, objects_of(truth)))
     else:
@@ -111,7 +111,7 @@ def main() -> None:
             for level in range(3):
                 head = {"scene": folder.name, "features": f"regions {level}", "preset": preset}
                 rows.append(head | measure(scene, regions_of(scene, level)))
-    tell(rows, as_json=options.json)
+    print_rows(rows, as_json=options.json)
 
 
 if __name__ == "__main__":

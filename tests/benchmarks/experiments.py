@@ -1,4 +1,4 @@
-"""What the paper measured, measured on a scene of one's own: one table an experiment.
+"""Experiments of the paper on a scene of one's own: one table an experiment.
 
     python -m tests.benchmarks.experiments NAME SCENE [--every N] [--json]
 
@@ -29,7 +29,7 @@ from liftcore.solve.least_squares import AllRays, Channels, solve_block
 from liftcore.solve.rays import sample_pixels
 from liftcore.values.settings import TIKHONOV_GAIN
 from liftcore.values.views import NO_LABEL, ViewFeatures
-from tests.benchmarks.base import PRESETS, command_line, mask_iou, read_pack, read_scene, tell
+from tests.benchmarks.base import PRESETS, command_line, mask_iou, print_rows, read_pack, read_scene
 from tests.benchmarks.tabletop import Truth, tabletop
 
 Rows = Iterator[dict[str, Any]]
@@ -40,16 +40,16 @@ def packs_of(folder: Path, *names: str) -> list[str]:
     return [name for name in names if (folder / f"{name}.safetensors").is_file()]
 
 
-def judged(truth: Truth, lifted: lc.LiftResult, raster: CpuRaster | None = None) -> dict[str, float]:
+def figures_of(truth: Truth, lifted: lc.LiftResult, raster: CpuRaster | None = None) -> dict[str, float]:
     """Accuracy and held-out mIoU of a lift."""
-    found = truth.judge(lifted, raster)
-    return {"accuracy": found.accuracy, "miou": found.miou}
+    figures = truth.evaluate(lifted, raster)
+    return {"accuracy": figures.accuracy, "miou": figures.miou}
 
 
 # --- the paper's tables ---
 
 
-def ablation(folder: Path, every: int) -> Rows:
+def ablation(folder: Path, stride: int) -> Rows:
     """Table 1c: guidance (T), robust step (R) and aggregation (P) on and off.
 
     mIoU by argmax knows all classes; phrase IoU asks for each class of a view alone and cuts its map by an automatic
@@ -58,9 +58,9 @@ def ablation(folder: Path, every: int) -> Rows:
     truth, parts = tabletop(folder), product((False, True), repeat=3)
     for pack, (guided, robust, aggregated) in product(packs_of(folder, "features", "features_hard"), parts):
         settings = {"preset": "tikhonov" if guided else "row-sum", "robust_steps": int(robust)}
-        made = truth.lift(read_pack(folder, pack, every), **settings, aggregation=aggregated)
+        lifted = truth.lift(read_pack(folder, pack, stride), **settings, aggregation=aggregated)
         marks = {name: "on" if on else "-" for name, on in (("T", guided), ("R", robust), ("P", aggregated))}
-        yield {"pack": pack, **marks, **judged(truth, made), "phrase_iou": phrase_iou(truth, made)}
+        yield {"pack": pack, **marks, **figures_of(truth, lifted), "phrase_iou": phrase_iou(truth, lifted)}
 
 
 def phrase_iou(truth: Truth, lifted: lc.LiftResult) -> float:
@@ -68,14 +68,14 @@ def phrase_iou(truth: Truth, lifted: lc.LiftResult) -> float:
     ious, params = [], lifted.settings.render_params
     maps = truth.rendered(truth.scores(lifted), params)
     for (view, mask), scores in zip(truth.held_out.items(), maps, strict=True):
-        met = truth.raster.row_sums(truth.cameras[view], params) >= MINIMUM_ROW_SUM
+        hit = truth.raster.row_sums(truth.cameras[view], params) >= MINIMUM_ROW_SUM
         for k in mask.unique().tolist():
-            cut = find_threshold(scores[:, :, k][met], "auto").value
-            ious.append(mask_iou(met & (scores[:, :, k] >= cut), mask == k))
+            cut = find_threshold(scores[:, :, k][hit], "auto").value
+            ious.append(mask_iou(hit & (scores[:, :, k] >= cut), mask == k))
     return float(np.mean(ious))
 
 
-POSED = {
+POSE_SETTINGS = {
     "row-sum": {"preset": "row-sum"},
     "the paper's": {"preset": "tikhonov", "aggregation": True},
     "default": {},
@@ -83,22 +83,22 @@ POSED = {
 }
 
 
-def pose_noise(folder: Path, every: int) -> Rows:
+def pose_noise(folder: Path, stride: int) -> Rows:
     """Table on noisy poses: N of 100 feature views turned by a degree and moved by a hundredth of the scene.
 
     Splats and held-out cameras stay right.
     """
-    truth, views = tabletop(folder), read_pack(folder, "features", every)
+    truth, views = tabletop(folder), read_pack(folder, "features", stride)
     order = np.random.default_rng(1).permutation(len(views))
     for share in (0, 1, 2, 3, 10, 20, 50, 100):
         wrong = [list(views)[k] for k in order[: math.ceil(len(views) * share / 100)]]
-        moved = replace(truth, cameras=noisy_poses(truth.cameras, wrong, seed=0))
-        for name, settings in POSED.items():
-            found = judged(truth, moved.lift(views, **settings))
-            yield {"pack": "features", "noisy_of_100": share, "method": name, **found}
+        noisy = replace(truth, cameras=noisy_poses(truth.cameras, wrong, seed=0))
+        for name, settings in POSE_SETTINGS.items():
+            figures = figures_of(truth, noisy.lift(views, **settings))
+            yield {"pack": "features", "noisy_of_100": share, "method": name, **figures}
 
 
-def kernels(folder: Path, every: int) -> Rows:
+def kernels(folder: Path, stride: int) -> Rows:
     """Table 2a: one trained 3DGS scene, and the same read as discs and as beta kernels (conversions, not trained)."""
     truth = tabletop(folder)
     trained = truth.raster.splats
@@ -108,25 +108,25 @@ def kernels(folder: Path, every: int) -> Rows:
         "2dgs": (to_discs(trained), {}),
         "dbs": (to_betas(trained), {}),
     }
-    for kernel, (splats, more) in forms.items():
+    for kernel, (splats, options) in forms.items():
         raster = CpuRaster(splats)
         for pack, preset in product(packs_of(folder, "features", "features_hard"), PRESETS):
-            made = replace(truth, raster=raster).lift(read_pack(folder, pack, every), preset=preset, **more)
-            params = made.settings.render_params
+            lifted = replace(truth, raster=raster).lift(read_pack(folder, pack, stride), preset=preset, **options)
+            params = lifted.settings.render_params
             sums = [raster.row_sums(truth.cameras[view], params).mean() for view in truth.held_out]
             head = {"pack": pack, "kernel": kernel, "preset": preset, "row_sum_mean": float(np.mean(sums))}
-            yield head | judged(truth, made, raster)
+            yield head | figures_of(truth, lifted, raster)
 
 
-def lambda_sweep(folder: Path, every: int) -> Rows:
+def lambda_sweep(folder: Path, stride: int) -> Rows:
     """Table on Tikhonov Guidance: the scale lambda of the opacity logits, lifting and rendering apart."""
     truth, pack = tabletop(folder), "features_hard"
-    same = (1.0, 1.1, 1.2, 1.35, 1.5, 2.0, 4.0, 8.0)
-    pairs = [(0.5, 1.0), (0.8, 1.0), (1.2, 1.0), *((gain, gain) for gain in same)]
+    strengths = (1.0, 1.1, 1.2, 1.35, 1.5, 2.0, 4.0, 8.0)
+    pairs = [(0.5, 1.0), (0.8, 1.0), (1.2, 1.0), *((gain, gain) for gain in strengths)]
     for power, (lift_gain, render_gain) in product((1, 2), pairs):
         values = {"power": power, "lift_gain": lift_gain, "render_gain": render_gain}
-        made = truth.lift(read_pack(folder, pack, every), preset="tikhonov", **values)
-        yield {"pack": pack, **values, **judged(truth, made)}
+        lifted = truth.lift(read_pack(folder, pack, stride), preset="tikhonov", **values)
+        yield {"pack": pack, **values, **figures_of(truth, lifted)}
 
 
 NOISE_METHODS: dict[str, dict[str, Any]] = {
@@ -138,21 +138,21 @@ NOISE_METHODS: dict[str, dict[str, Any]] = {
 }
 
 
-def mask_noise(folder: Path, every: int) -> Rows:
+def mask_noise(folder: Path, stride: int) -> Rows:
     """Wrong masks: a growing share of exact regions merged, mislabelled or dropped; the same for all methods."""
     truth, exact = tabletop(folder), read_pack(folder, "features_clean")
     maps = {name: view for name, view in exact.items() if isinstance(view, lc.Regions)}
     for rate in (0.0, 0.1, 0.2, 0.4, 0.6):
         wrong = noisy_masks(maps, rate, seed=0)
         for method, settings in NOISE_METHODS.items():
-            found = judged(truth, truth.lift(wrong, view_stride=every, **settings))
-            yield {"method": method, "rate": rate, **found}
+            figures = figures_of(truth, truth.lift(wrong, view_stride=stride, **settings))
+            yield {"method": method, "rate": rate, **figures}
 
 
-def row_sums(folder: Path, every: int) -> Rows:
+def row_sums(folder: Path, stride: int) -> Rows:
     """Property 2: how close the rows of A come to one, over all pixels, without and with the opacity scale."""
     splats, cameras = read_scene(folder)
-    raster, views = CpuRaster(splats), list(cameras.values())[::every]
+    raster, views = CpuRaster(splats), list(cameras.values())[::stride]
     for gain in (1.0, TIKHONOV_GAIN):
         sums = [raster.row_sums(camera, lc.CompositingParams(gain)).numpy().ravel() for camera in views]
         rays = np.concatenate(sums).astype(np.float64)
@@ -167,37 +167,37 @@ RAYS = 150_000  # of the scene
 NEIGHBOURS = 1_200  # splats whose dense spectrum is taken
 
 
-def conditioning(folder: Path, every: int) -> Rows:
-    """What lambda does to G = A^T A, on rays of the scene.
+def conditioning(folder: Path, stride: int) -> Rows:
+    """Measure the effect of lambda on G = A^T A, on rays of the scene.
 
     own_share: how much of what the closed form gives a splat is the splat's own, ``(C^T A)_jj / (C^T A 1)_j`` with
     C = A^p; dominant: the share of splats where it is over a half. cond: of the unit-diagonal form of C^T C over
     splats that lie together, by interlacing a lower bound of the whole.
     """
     splats, cameras = read_scene(folder)
-    raster, views = CpuRaster(splats), list(cameras.values())[::every]
+    raster, views = CpuRaster(splats), list(cameras.values())[::stride]
     total_weight = np.asarray(rays_of(raster, views, 1.0).sum(axis=0)).ravel()
-    chosen = neighbourhood(splats.means, total_weight)
+    subset = neighbourhood(splats.means, total_weight)
     for gain in (0.5, 0.8, 1.0, 1.2, 1.5, 2.0, 4.0, 8.0):
-        yield {"gain": gain, **conditions(rays_of(raster, views, gain), total_weight, chosen)}
+        yield {"gain": gain, **conditions(rays_of(raster, views, gain), total_weight, subset)}
 
 
-def conditions(A: csr_array, total_weight: np.ndarray, chosen: np.ndarray) -> dict[str, float]:
-    """The figures of `conditioning` for A [R, P], total weight [P] and the splats ``chosen`` of the spectrum."""
-    met, found = total_weight > 0, {}
+def conditions(A: csr_array, total_weight: np.ndarray, subset: np.ndarray) -> dict[str, float]:
+    """The figures of `conditioning` for A [R, P], total weight [P] and the splats ``subset`` of the spectrum."""
+    hit, figures = total_weight > 0, {}
     for power, key in ((1, "w"), (2, "w2")):
         C = A if power == 1 else A.multiply(A).tocsr()
-        own, total = np.asarray(A.multiply(C).sum(axis=0)).ravel(), C.T @ (A @ np.ones(len(total_weight)))
-        shares = np.divide(own, total, out=np.zeros_like(own), where=total > 0)
-        G = (C[:, chosen].T @ C[:, chosen]).toarray()
+        diagonal, total = np.asarray(A.multiply(C).sum(axis=0)).ravel(), C.T @ (A @ np.ones(len(total_weight)))
+        shares = np.divide(diagonal, total, out=np.zeros_like(diagonal), where=total > 0)
+        G = (C[:, subset].T @ C[:, subset]).toarray()
         visible = np.diag(G) > 1e-24
         scale = 1 / np.sqrt(np.diag(G)[visible])
         values = np.linalg.eigvalsh(G[np.ix_(visible, visible)] * scale[:, None] * scale)
-        found[f"own_share_{key}"] = float(np.average(shares, weights=total_weight))
-        found[f"cond_{key}"] = float(values[-1] / max(values[0], 1e-16 * values[-1]))
+        figures[f"own_share_{key}"] = float(np.average(shares, weights=total_weight))
+        figures[f"cond_{key}"] = float(values[-1] / max(values[0], 1e-16 * values[-1]))
         if power == 1:
-            found["dominant"] = float((shares[met] > 0.5).mean())
-    return found
+            figures["dominant"] = float((shares[hit] > 0.5).mean())
+    return figures
 
 
 def rays_of(raster: CpuRaster, views: Sequence[lc.Camera], gain: float) -> csr_array:
@@ -205,9 +205,9 @@ def rays_of(raster: CpuRaster, views: Sequence[lc.Camera], gain: float) -> csr_a
     parts = []
     for number, camera in enumerate(views):
         stride = max(round((camera.width * camera.height * len(views) / RAYS) ** 0.5), 1)
-        walk = lc.CompositingParams(gain, stride=stride)
-        pixels = sample_pixels(camera, camera.width * camera.height, (0, number), walk)
-        rows = raster.ray_rows(camera, pixels, walk)
+        params = lc.CompositingParams(gain, stride=stride)
+        pixels = sample_pixels(camera, camera.width * camera.height, (0, number), params)
+        rows = raster.ray_rows(camera, pixels, params)
         entries = rows.weights.double().numpy(), rows.splats.numpy(), rows.indptr.numpy()
         parts.append(csr_array(entries, shape=(len(pixels), raster.splats.count)))
     return csr_array(vstack(parts))
@@ -223,30 +223,30 @@ def neighbourhood(means: Tensor, total_weight: np.ndarray) -> np.ndarray:
 # --- least squares under wrong masks ---
 
 
-def overfitting(folder: Path, every: int) -> Rows:
+def overfitting(folder: Path, stride: int) -> Rows:
     """Section 3.2: conjugate gradients towards the smallest ``|A X - B|^2`` under wrong masks, with several dampings.
 
     All runs in the channels ``X C^T``, C the class vectors: closed form and least squares are linear in B, so these
     are exactly the class scores of the full solutions, at the cost of 14 channels.
     """
-    scene, views = tabletop(folder), read_pack(folder, "features_hard", every)
+    scene, views = tabletop(folder), read_pack(folder, "features_hard", stride)
     observed = [scored(view, scene.classes) for view in views.values()]
-    cameras, plain = [scene.cameras[name] for name in views], lc.CompositingParams()
-    rays = AllRays(scene.raster, scene.raster.splats.count, cameras, observed.__getitem__, plain)
-    met = rays.row_sums > 0
+    cameras, params = [scene.cameras[name] for name in views], lc.CompositingParams()
+    rays = AllRays(scene.raster, scene.raster.splats.count, cameras, observed.__getitem__, params)
+    hit = rays.row_sums > 0
     part = Channels(0, len(scene.classes), None)
     sums, _ = rays.gradient(np.zeros((rays.count, part.end), np.float32), part.project)
-    scale = np.divide(1.0, rays.row_sums, out=np.zeros(rays.count), where=met)
+    scale = np.divide(1.0, rays.row_sums, out=np.zeros(rays.count), where=hit)
     first = torch.from_numpy(sums * scale.astype(np.float32)[:, None])  # D^-1 A^T B
-    truth = replace(scene, counted=scene.counted & torch.from_numpy(met))
+    truth = replace(scene, evaluated=scene.evaluated & torch.from_numpy(hit))
 
     def row(damping: float | None, steps: int, loss: float, scores: Tensor) -> dict[str, Any]:
-        found, cosine = truth.judge_scores(scores, plain), centred_cosine(truth, scores)
+        figures, cosine = truth.evaluate_scores(scores, params), centred_cosine(truth, scores)
         head = {"damping": damping, "steps": steps, "residual": loss / max(rays.rows, 1)}
-        return head | {"accuracy": found.accuracy, "cosine": cosine, "miou": found.miou}
+        return head | {"accuracy": figures.accuracy, "cosine": cosine, "miou": figures.miou}
 
     for damping in (0.0, 0.1, 0.3, 1.0):
-        block = solve_block(rays, part, first, met, damping, 20)
+        block = solve_block(rays, part, first, hit, damping, 20)
         if damping == 0:
             yield row(None, 0, block.losses[0], first)
         yield row(damping, len(block.losses) - 1, block.losses[-1], first + torch.from_numpy(block.step))
@@ -262,7 +262,7 @@ def centred_cosine(truth: Truth, scores: Tensor) -> float:
     """Mean cosine of the splats' scores [P, K] to the true ones, both centred on their means over the classes."""
     true = (truth.classes @ truth.classes.T)[truth.objects.long()]
     left, right = (part - part.mean(dim=1, keepdim=True) for part in (scores, true))
-    return float(cosine_similarity(left, right, dim=1, eps=1e-12)[truth.counted].mean())
+    return float(cosine_similarity(left, right, dim=1, eps=1e-12)[truth.evaluated].mean())
 
 
 # --- ways to be wrong, by an explicit seed ---
@@ -276,17 +276,17 @@ def noisy_poses(cameras: lc.Cameras, wrong: Collection[str], seed: int) -> lc.Ca
     """
     centres = np.stack([camera.centre for camera in cameras.values()])
     scale = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
-    random, moved = np.random.default_rng(seed), []
+    random, cameras_out = np.random.default_rng(seed), []
     for camera in cameras.values():
         turn, shift = random.normal(0, 1.0, 3), random.normal(0, 0.01 * scale, 3)
         if camera.name not in wrong:
-            moved.append(camera)
+            cameras_out.append(camera)
             continue
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_euler("ZXY", turn, degrees=True).as_matrix() @ camera.viewmat[:3, :3]
         pose[:3, 3] = -pose[:3, :3] @ (camera.centre + shift)
-        moved.append(camera.replace(viewmat=pose))
-    return lc.Cameras(moved)
+        cameras_out.append(camera.replace(viewmat=pose))
+    return lc.Cameras(cameras_out)
 
 
 def noisy_masks(maps: Mapping[str, lc.Regions], rate: float, seed: int) -> dict[str, lc.Regions]:
@@ -313,8 +313,8 @@ def _spoilt(regions: lc.Regions, rate: float, vectors: Tensor, random: np.random
                 neighbour = _neighbour(level, int(region))
                 if neighbour == NO_LABEL:
                     continue
-                both = torch.cat(codebook)[[int(region), neighbour]].float()
-                vector = normalize(both.mean(dim=0), dim=0)
+                pair = torch.cat(codebook)[[int(region), neighbour]].float()
+                vector = normalize(pair.mean(dim=0), dim=0)
                 area |= level == neighbour
             elif kind == 1:
                 vector = vectors[other].float()
@@ -330,8 +330,8 @@ def _spoilt(regions: lc.Regions, rate: float, vectors: Tensor, random: np.random
 def _neighbour(level: np.ndarray, region: int) -> int:
     """The label that shares the longest border with a region; NO_LABEL where it touches none."""
     touching = []
-    for one, other in ((level[1:], level[:-1]), (level[:, 1:], level[:, :-1])):
-        touching += [other[one == region], one[other == region]]
+    for a, b in ((level[1:], level[:-1]), (level[:, 1:], level[:, :-1])):
+        touching += [b[a == region], a[b == region]]
     around = np.concatenate([part.ravel() for part in touching])
     around = around[(around != region) & (around != NO_LABEL)]
     return int(np.bincount(around).argmax()) if around.size else NO_LABEL
@@ -348,8 +348,8 @@ def to_discs(splats: lc.Splats) -> lc.Splats:
     order = torch.tensor(_ORDERS)[splats.log_scales.argmin(dim=1)]
     log_scales = splats.log_scales.gather(1, order[:, :2]).contiguous()
     axes = Rotation.from_quat(splats.quats.numpy(), scalar_first=True).as_matrix()
-    turned = Rotation.from_matrix(np.take_along_axis(axes, order.numpy()[:, None], axis=2))
-    quats = torch.from_numpy(turned.as_quat(scalar_first=True)).float()
+    rotation = Rotation.from_matrix(np.take_along_axis(axes, order.numpy()[:, None], axis=2))
+    quats = torch.from_numpy(rotation.as_quat(scalar_first=True)).float()
     return replace(splats, kernel=Kernel.GAUSSIAN_2D, quats=quats, log_scales=log_scales, **_BARE)
 
 
@@ -364,8 +364,8 @@ def to_betas(splats: lc.Splats) -> lc.Splats:
 
 
 EXPERIMENTS: dict[str, Callable[[Path, int], Rows]] = {
-    made.__name__: made
-    for made in (
+    table.__name__: table
+    for table in (
         ablation, conditioning, kernels, lambda_sweep, mask_noise, overfitting, pose_noise, row_sums,
     )
 }  # fmt: skip
@@ -383,7 +383,7 @@ def main() -> None:
     options = parser.parse_args()
     experiment = EXPERIMENTS[options.name]
     note = f"{options.name} on {options.scene.resolve().name}: {experiment.__doc__}"
-    tell(experiment(options.scene, options.every), as_json=options.json, note=note)
+    print_rows(experiment(options.scene, options.every), as_json=options.json, note=note)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What an extreme is, and ways to measure one beside exact arithmetic: weights of a view, whole lifts, sums.
+"""Extreme inputs and their measurement against exact arithmetic: weights of a view, full lifts, sums.
 
 The float64 reference is `liftcore.raster.reference`; of features, the dense definition of the closed form over it.
 """
@@ -42,12 +42,12 @@ def always(_: object) -> bool:
 
 
 @dataclass(frozen=True)
-class Found:
-    """What float32 gave on one extreme with one kernel."""
+class Outcome:
+    """The result of float32 on one extreme with one kernel."""
 
     gives: str  # in figures, for people
     error: float | None  # against exact arithmetic, as the case says; None where the input is refused
-    told: tuple[str, ...] = ()  # what the user reads: warnings, or the error
+    text: tuple[str, ...] = ()  # what the user reads: warnings, or the error
     holds: bool = True  # whether what exact arithmetic says is so, of the float64 and of the float32 result
     flips: int = 0  # rays within a hair of a cut-off where float32 decided otherwise; they are left out of the error
     rays: int = 0
@@ -58,10 +58,10 @@ class Extreme:
     """One row of the table, and one test a kernel."""
 
     name: str
-    measure: Callable[[Kernel], Found]
+    measure: Callable[[Kernel], Outcome]
     kernels: tuple[Kernel, ...] = KERNELS
     bound: float = WEIGHTS  # of the error; the test holds it
-    told: str = ""  # what some message must contain; "" where nothing is lost and nothing need be told
+    text: str = ""  # text that some message must contain; "" where no message is needed
 
 
 # --- weights of a view ---
@@ -82,20 +82,20 @@ class Comparison:
     finite: bool
 
 
-def exact_view(splats: lc.Splats, camera: lc.Camera, walk: lc.CompositingParams) -> DenseView:
+def exact_view(splats: lc.Splats, camera: lc.Camera, params: lc.CompositingParams) -> DenseView:
     """The oracle; logits far below zero overflow its exponential on the way to an exact zero."""
     with np.errstate(over="ignore"):
-        return dense_view(splats, camera, walk)
+        return dense_view(splats, camera, params)
 
 
 def weights_of(
-    splats: lc.Splats, camera: lc.Camera, walk: lc.CompositingParams, power: int = 1
+    splats: lc.Splats, camera: lc.Camera, params: lc.CompositingParams, power: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:
     """A^p [H * W, P] and the total weight [P], through region weights with one region a pixel."""
     rays = camera.width * camera.height
     labels = torch.arange(rays, dtype=torch.int32).reshape(1, camera.height, camera.width)
     every_ray = lc.Regions(labels, torch.ones(rays, 1))
-    got = CpuRaster(splats, threads=2).region_weights(camera, every_ray, walk, Weighting(power))
+    got = CpuRaster(splats, threads=2).region_weights(camera, every_ray, params, Weighting(power))
     A = np.zeros((rays, splats.count))
     rows = np.repeat(got.splats.numpy(), np.diff(got.indptr.numpy()))
     A[got.region.numpy(), rows] = got.weight.numpy()
@@ -104,31 +104,33 @@ def weights_of(
     return A, total_weight
 
 
-def traced(splats: lc.Splats, camera: lc.Camera, walk: lc.CompositingParams) -> np.ndarray:
+def trace_weights(splats: lc.Splats, camera: lc.Camera, params: lc.CompositingParams) -> np.ndarray:
     """A [H * W, P] by single rays, as the diagnostics take it."""
     y, x = np.mgrid[: camera.height, : camera.width]
     pixels = torch.tensor(np.stack([x.ravel(), y.ravel()], axis=1), dtype=torch.int32)
-    rows = CpuRaster(splats, threads=1).ray_rows(camera, pixels, walk)
+    rows = CpuRaster(splats, threads=1).ray_rows(camera, pixels, params)
     A = np.zeros((camera.width * camera.height, splats.count))
     A[np.repeat(np.arange(A.shape[0]), np.diff(rows.indptr.numpy())), rows.splats.numpy()] = rows.weights.numpy()
     return A
 
 
-def compare(splats: lc.Splats, camera: lc.Camera, walk: lc.CompositingParams | None = None) -> Comparison:
+def compare(splats: lc.Splats, camera: lc.Camera, params: lc.CompositingParams | None = None) -> Comparison:
     """A by region weights, by single rays and squared, the row sums and the total weight, against the oracle."""
-    walk = walk or lc.CompositingParams()
-    exact = exact_view(splats, camera, walk)
-    weights, total_weight = weights_of(splats, camera, walk)
-    single, squares = traced(splats, camera, walk), weights_of(splats, camera, walk, power=2)[0]
-    sums = CpuRaster(splats, threads=2).row_sums(camera, walk).numpy().ravel()
+    params = params or lc.CompositingParams()
+    exact = exact_view(splats, camera, params)
+    weights, total_weight = weights_of(splats, camera, params)
+    single, squares = trace_weights(splats, camera, params), weights_of(splats, camera, params, power=2)[0]
+    sums = CpuRaster(splats, threads=2).row_sums(camera, params).numpy().ravel()
     errors = np.abs(np.concatenate([weights - exact.A, single - exact.A, squares - exact.A**2], axis=1)).max(axis=1)
     errors = np.maximum(errors, np.abs(sums - exact.A.sum(axis=1)))
     worst = float(errors[~exact.cut].max(initial=0))
-    plain = (
-        exact if walk.opacity_logit_scale == 1 else exact_view(splats, camera, replace(walk, opacity_logit_scale=1.0))
+    reference = (
+        exact
+        if params.opacity_logit_scale == 1
+        else exact_view(splats, camera, replace(params, opacity_logit_scale=1.0))
     )
-    if not plain.cut.any():
-        total = plain.A.sum(axis=0)
+    if not reference.cut.any():
+        total = reference.A.sum(axis=0)
         worst = max(worst, float((np.abs(total_weight - total) / np.maximum(total, 1)).max()))
     finite = all(bool(np.isfinite(part).all()) for part in (weights, single, squares, sums, total_weight))
     flips = int((errors[exact.cut] > FLIP).sum())
@@ -137,15 +139,15 @@ def compare(splats: lc.Splats, camera: lc.Camera, walk: lc.CompositingParams | N
 
 @dataclass(frozen=True)
 class View:
-    """What a view looks at, and how."""
+    """Splats, camera and compositing parameters of a view."""
 
     splats: lc.Splats
     camera: lc.Camera
-    walk: lc.CompositingParams
+    params: lc.CompositingParams
 
 
 Scene = Callable[[Kernel], View]
-CAMERA, PLAIN = camera_at_origin(), lc.CompositingParams()
+CAMERA, DEFAULTS = camera_at_origin(), lc.CompositingParams()
 
 
 def at(
@@ -153,20 +155,20 @@ def at(
     log_scales: ArrayLike = -2.0,
     *,
     camera: lc.Camera = CAMERA,
-    walk: lc.CompositingParams = PLAIN,
-    **more: Any,
+    params: lc.CompositingParams = DEFAULTS,
+    **options: Any,
 ) -> Scene:
     """Splats at the means, as ``splats_at`` takes them, of whatever kernel."""
-    return lambda kernel: View(splats_at(means, log_scales, **more, kernel=kernel), camera, walk)
+    return lambda kernel: View(splats_at(means, log_scales, **options, kernel=kernel), camera, params)
 
 
-def walked(
+def view_of(
     name: str,
     scene: Scene,
     claim: Callable[[np.ndarray], bool] = always,
     like: Scene | None = None,
     of: Callable[[np.ndarray], np.ndarray] = np.asarray,
-    **more: Any,
+    **options: Any,
 ) -> Extreme:
     """An extreme whose weights are held to the oracle.
 
@@ -174,24 +176,24 @@ def walked(
         name: of the row. scene: the view, for a kernel.
         claim: what exact arithmetic says of A [H * W, P], of the oracle's and of the float32 raster's.
         like: another view that has the same A, or the same as ``of`` gives of it.
-        more: kernels, bound and told of the Extreme.
+        options: kernels, bound and text of the Extreme.
     """
 
-    def measure(kernel: Kernel) -> Found:
+    def measure(kernel: Kernel) -> Outcome:
         view = scene(kernel)
-        got = compare(view.splats, view.camera, view.walk)
-        both = got.A, got.got
+        got = compare(view.splats, view.camera, view.params)
+        pair = got.A, got.got
         exact = exact_weights(like(kernel)) if like else None
-        alike = exact is None or all(float(np.abs(of(A) - exact).max()) < WEIGHTS for A in both)
+        is_equal = exact is None or all(float(np.abs(of(A) - exact).max()) < WEIGHTS for A in pair)
         gives = f"{int((got.got > 0).any(axis=0).sum())} of {view.splats.count} met"
         gives += f", weights to {got.got.max(initial=0):.3g}"
-        holds = got.finite and alike and all(claim(A) for A in both)
-        return Found(gives, got.error, told_of(view.splats, view.camera), holds, got.flips, got.rays)
+        holds = got.finite and is_equal and all(claim(A) for A in pair)
+        return Outcome(gives, got.error, messages_of(view.splats, view.camera), holds, got.flips, got.rays)
 
-    return Extreme(name, measure, **more)
+    return Extreme(name, measure, **options)
 
 
-def told_of(splats: lc.Splats, camera: lc.Camera) -> tuple[str, ...]:
+def messages_of(splats: lc.Splats, camera: lc.Camera) -> tuple[str, ...]:
     """The warnings of ``inspect`` and of a lift on such splats and such a camera."""
     warnings = describe_splats(splats)["warnings"] + describe_cameras(lc.Cameras((camera,)))["warnings"]
     return tuple(warnings + order_warnings(splats, [camera]))
@@ -199,7 +201,7 @@ def told_of(splats: lc.Splats, camera: lc.Camera) -> tuple[str, ...]:
 
 def exact_weights(view: View) -> np.ndarray:
     """The oracle's A [H * W, P] f64."""
-    return exact_view(view.splats, view.camera, view.walk).A
+    return exact_view(view.splats, view.camera, view.params).A
 
 
 # --- whole lifts ---
@@ -208,11 +210,11 @@ WIDTH, HEIGHT = 16, 12
 AWAY = "away"  # the view that looks where nothing is
 CLOUD = 30  # splats
 SUM = 2e-6  # of the longest value, for what is stored in float32
-EVERYTHING = {"preset": "default", "aggregation": True, "aggregation_cluster_size": 3}
-EVERYTHING |= {"cg_steps": 3, "damping": 0.0, "reference_channels": 2}
+ALL_STEPS = {"preset": "default", "aggregation": True, "aggregation_cluster_size": 3}
+ALL_STEPS |= {"cg_steps": 3, "damping": 0.0, "reference_channels": 2}
 
 
-def lifted(
+def lift_of(
     name: str,
     views: ViewFeatures | Mapping[str, ViewFeatures],
     claim: Callable[[lc.LiftResult], bool] = always,
@@ -220,7 +222,7 @@ def lifted(
     splats: lc.Splats | None = None,
     settings: Mapping[str, Any] | None = None,
     bound: float = SUM,
-    **more: Any,
+    **options: Any,
 ) -> Extreme:
     """An extreme whose features are held to the dense definition, relative to the longest value that came in.
 
@@ -229,41 +231,45 @@ def lifted(
     Args:
         name: of the row. views: one, or several by name; AWAY looks where nothing is.
         claim: what exact arithmetic says of the lift. splats: None takes a random cloud.
-        settings: of the lift. more: kernels and told of the Extreme.
+        settings: of the lift. options: kernels and text of the Extreme.
     """
-    named = views if isinstance(views, Mapping) else {"v0": views}
+    by_name = views if isinstance(views, Mapping) else {"v0": views}
 
-    def measure(kernel: Kernel) -> Found:
-        own = splats or cloud(kernel)
-        made, warnings = run(named, own, **(settings or {}))
-        X, totals = dense_features(named, own, made.settings)
-        longest = max(float(view.codebook.double().abs().max()) for view in named.values())
+    def measure(kernel: Kernel) -> Outcome:
+        scene_splats = splats or cloud(kernel)
+        result, warnings = run(by_name, scene_splats, **(settings or {}))
+        X, totals = dense_features(by_name, scene_splats, result.settings)
+        longest = max(float(view.codebook.double().abs().max()) for view in by_name.values())
         faint = (totals > 0) & (totals < FAINT)
-        errors = np.abs(made.features.double().numpy() - X) / (longest or 1.0)
-        seen = made.seen.numpy()
-        sound = all(bool(part.isfinite().all()) for part in (made.features, made.total_weight, made.agreement))
-        sound &= np.array_equal(seen[~faint], totals[~faint] > 0) and not made.features[~made.seen].any()
-        sound &= survives(run(named, own, **{**(settings or {}), **EVERYTHING})[0], next(iter(named.values())))
-        gives = f"{int(seen.sum())} of {own.count} seen, {str(made.features.dtype).removeprefix('torch.')}"
+        errors = np.abs(result.features.double().numpy() - X) / (longest or 1.0)
+        visible = result.seen.numpy()
+        sound = all(bool(part.isfinite().all()) for part in (result.features, result.total_weight, result.agreement))
+        sound &= np.array_equal(visible[~faint], totals[~faint] > 0) and not result.features[~result.seen].any()
+        sound &= survives(
+            run(by_name, scene_splats, **{**(settings or {}), **ALL_STEPS})[0], next(iter(by_name.values()))
+        )
+        gives = (
+            f"{int(visible.sum())} of {scene_splats.count} seen, {str(result.features.dtype).removeprefix('torch.')}"
+        )
         if faint.any():
             gives += f"; {int(faint.sum())} too faint, off by {errors[faint].max():.2g}"
-        told = tuple(warnings + made.diagnostics["warnings"])
-        return Found(gives, float(errors[~faint].max(initial=0)), told, bool(sound) and claim(made))
+        messages = tuple(warnings + result.diagnostics["warnings"])
+        return Outcome(gives, float(errors[~faint].max(initial=0)), messages, bool(sound) and claim(result))
 
-    return Extreme(name, measure, bound=bound, **more)
+    return Extreme(name, measure, bound=bound, **options)
 
 
-def refused(name: str, work: Callable[[], object], told: str) -> Extreme:
-    """An extreme that no answer could be right for: the input is refused, with ``told`` in the error."""
+def error_of(name: str, work: Callable[[], object], text: str) -> Extreme:
+    """An extreme that no answer could be right for: the input is refused, with ``text`` in the error."""
 
-    def measure(_: Kernel) -> Found:
+    def measure(_: Kernel) -> Outcome:
         try:
             work()
         except lc.SplatliftError as error:
-            return Found("refused", None, (str(error),))
-        return Found("accepted", None, (), holds=False)
+            return Outcome("refused", None, (str(error),))
+        return Outcome("accepted", None, (), holds=False)
 
-    return Extreme(name, measure, GAUSSIAN, told=told)
+    return Extreme(name, measure, GAUSSIAN, text=text)
 
 
 def cloud(kernel: Kernel = Kernel.GAUSSIAN_3D) -> lc.Splats:
@@ -288,9 +294,9 @@ def run(views: Mapping[str, ViewFeatures], splats: lc.Splats, **settings: Any) -
         write_splats(paths[0], splats)
         write_inria_cameras(lc.Cameras(tuple(camera(view) for view in views)), paths[1])
         write_pack(paths[2], views, {"encoder": "by hand", "normalised": "false"})
-        chosen = lc.LiftSettings.of(**{"preset": "row-sum", "dtype": "float32", **settings})
-        made = lift_files(paths[0], paths[1], paths[2:], chosen)
-        return made, describe_packs(read_features(paths[2]))["warnings"]
+        lift_settings = lc.LiftSettings.of(**{"preset": "row-sum", "dtype": "float32", **settings})
+        result = lift_files(paths[0], paths[1], paths[2:], lift_settings)
+        return result, describe_packs(read_features(paths[2]))["warnings"]
 
 
 def dense_features(
@@ -307,16 +313,16 @@ def dense_features(
     return np.divide(X, totals[:, None], out=np.zeros_like(X), where=totals[:, None] > 0), totals
 
 
-def survives(made: lc.LiftResult, view: ViewFeatures) -> bool:
-    """Whether all numbers of a lift are finite, and those of questions to it."""
-    json.dumps(made.diagnostics, allow_nan=False)
-    asked = view.codebook[:1].float()
-    if not asked.any():
-        return bool(made.features.isfinite().all())
-    answers = [made.query(asked, threshold=method) for method in METHODS]
-    parts = [made.features, made.agreement, *(answer.scores for answer in answers)]
-    found = all(not math.isnan(answer.threshold) and not answer.splats[~made.seen].any() for answer in answers)
-    return found and all(bool(part.isfinite().all()) for part in parts)
+def survives(result: lc.LiftResult, view: ViewFeatures) -> bool:
+    """Return True if all numbers of a lift and of queries to it are finite."""
+    json.dumps(result.diagnostics, allow_nan=False)
+    vector = view.codebook[:1].float()
+    if not vector.any():
+        return bool(result.features.isfinite().all())
+    answers = [result.query(vector, threshold=method) for method in METHODS]
+    parts = [result.features, result.agreement, *(answer.scores for answer in answers)]
+    is_finite = all(not math.isnan(answer.threshold) and not answer.splats[~result.seen].any() for answer in answers)
+    return is_finite and all(bool(part.isfinite().all()) for part in parts)
 
 
 # --- many wide scenes ---
@@ -349,36 +355,36 @@ def wide_view(seed: int, kernel: Kernel) -> View:
     logits = np.where(rng.random(count) < 0.2, rng.choice([-1e4, 1e4, 0.0], count), rng.uniform(-12, 12, count))
     quats = np.where(rng.random((count, 1)) < 0.1, IDENTITY, rng.normal(0, 1, (count, 4)))
     splats = splats_at(means, log_scales, logits, quats, kernel, rng.uniform(-6, 4, count))
-    walk = lc.CompositingParams(float(rng.choice(GAINS)), float(rng.choice(CAPS)), float(rng.choice(STOPS)))
-    return View(splats, camera, walk)
+    params = lc.CompositingParams(float(rng.choice(GAINS)), float(rng.choice(CAPS)), float(rng.choice(STOPS)))
+    return View(splats, camera, params)
 
 
 def survey(kernel: Kernel, scenes: int = SCENES) -> dict[str, Any]:
-    """What many wide scenes gave beside the oracle.
+    """Compare many wide scenes with the oracle.
 
-    Of the scenes that can be ``judged``: rays, those of them within 1e-4 of a cut-off (``near``) and those of these
+    Of the comparisons: rays, those of them within 1e-4 of a cut-off (``near``) and those of these
     that float32 decided otherwise (``flips``), and the largest ``error`` of any weight elsewhere.
     """
-    judged, error, finite = [], 0.0, True
+    comparisons, error, finite = [], 0.0, True
     for seed in range(scenes):
         view = wide_view(seed, kernel)
-        got = compare(view.splats, view.camera, view.walk)
+        got = compare(view.splats, view.camera, view.params)
         finite &= got.finite and bool(got.got.min(initial=0) >= 0 and got.got.sum(axis=1).max() <= 1 + 1e-5)
         if judgeable(view):
-            judged.append((got.rays, got.near, got.flips))
+            comparisons.append((got.rays, got.near, got.flips))
             error = max(error, got.error)
-    sums = dict(zip(("rays", "near", "flips"), np.sum(judged, axis=0).tolist(), strict=True))
-    return {"scenes": scenes, "judged": len(judged), **sums, "error": error, "finite": finite}
+    sums = dict(zip(("rays", "near", "flips"), np.sum(comparisons, axis=0).tolist(), strict=True))
+    return {"scenes": scenes, "judged": len(comparisons), **sums, "error": error, "finite": finite}
 
 
 def judgeable(view: View) -> bool:
-    """Whether the float64 oracle has digits enough for every splat before the camera."""
+    """Return True if float64 is precise enough for every splat in front of the camera."""
     splats, camera = view.splats, view.camera
     if splats.kernel is Kernel.GAUSSIAN_2D:
         return True
     z = splats.means.double().numpy() @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
-    ahead = np.flatnonzero(z >= NEAR_PLANE)
-    return all(np.linalg.cond(projected_gaussian(splats, int(j), camera)[1]) < CONDITION for j in ahead)
+    in_front = np.flatnonzero(z >= NEAR_PLANE)
+    return all(np.linalg.cond(projected_gaussian(splats, int(j), camera)[1]) < CONDITION for j in in_front)
 
 
 def _rotation(rng: np.random.Generator) -> np.ndarray:

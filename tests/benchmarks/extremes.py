@@ -1,4 +1,4 @@
-"""What becomes of a lift at the extremes, beside exact arithmetic: one table an aspect.
+"""Lifts of extreme inputs against exact arithmetic: one table an aspect.
 
     python -m tests.benchmarks.extremes [--json]
 
@@ -7,7 +7,7 @@ float64 reference over all weights, their squares, the row sums and the total we
 the kernels that are named; rays that float32 decided otherwise at a cut-off are counted apart. The error of a
 distorted photo is how far from a pixel, in pixels, its ray meets the photo again. The error of features is the
 largest difference from the dense closed form in float64, over the largest value of the codebook. What float32 gives
-is shown for the first kernel named. "Told" are the words of ``splatlift inspect`` and of the lift's own warnings.
+is shown for the first kernel named. "Message" has the words of ``splatlift inspect`` and of the lift's own warnings.
 """
 
 import math
@@ -25,32 +25,32 @@ from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.cameras import MAX_FOCAL, MAX_SIDE, MIN_FOCAL, behind_lens, distortion_warning, drawn_by
 from liftcore.scene.distortion import Brown, Distortion, Fisheye, photo_places
 from liftcore.scene.splats import Kernel
-from tests.benchmarks.base import command_line, tell
+from tests.benchmarks.base import command_line, print_rows
 from tests.benchmarks.extreme_measures import (
     AWAY,
     BETA,
+    DEFAULTS,
     DISC,
     FLOORED,
     GAUSSIAN,
     HEIGHT,
     KERNELS,
-    PLAIN,
     SCENES,
     SUM,
     WIDTH,
     Extreme,
-    Found,
+    Outcome,
     Scene,
     View,
     always,
     at,
     cloud,
-    lifted,
-    refused,
+    error_of,
+    lift_of,
+    messages_of,
     run,
     survey,
-    told_of,
-    walked,
+    view_of,
     weights_of,
 )
 from tests.scenes import ROW, TURNED, camera_at_origin, splats_at
@@ -78,24 +78,24 @@ def _visible(A: np.ndarray) -> bool:
 
 # fmt: off
 OPACITIES: tuple[Extreme, ...] = (
-    walked("opacity logits of +-1e4", at(ROW, logits=[OPAQUE, -OPAQUE, 0.5, OPAQUE, -OPAQUE]), _opaque_or_absent),
-    walked("opacity logits of +-infinity, as converters of quantised splats write them",
+    view_of("opacity logits of +-1e4", at(ROW, logits=[OPAQUE, -OPAQUE, 0.5, OPAQUE, -OPAQUE]), _opaque_or_absent),
+    view_of("opacity logits of +-infinity, as converters of quantised splats write them",
         at(ROW, logits=[math.inf, -math.inf, 0.5, math.inf, -math.inf]), _opaque_or_absent),
-    walked("every splat transparent (logits of -20)", at(ROW, logits=-20.0), lambda A: A.max() == 0, kernels=FLOORED,
-        told="never seen"),
-    walked("the same, DBS, which has no floor", at(ROW, logits=-20.0), lambda A: 1e-9 < A.max() < 3e-9, kernels=BETA,
+    view_of("every splat transparent (logits of -20)", at(ROW, logits=-20.0), lambda A: A.max() == 0, kernels=FLOORED,
+        text="never seen"),
+    view_of("the same, DBS, which has no floor", at(ROW, logits=-20.0), lambda A: 1e-9 < A.max() < 3e-9, kernels=BETA,
         bound=1e-12),
-    walked("every splat opaque (logits of 1e4)", at(MIDDLE * 6, logits=OPAQUE),
+    view_of("every splat opaque (logits of 1e4)", at(MIDDLE * 6, logits=OPAQUE),
         lambda A: (A > 0.5).sum(axis=1).max() == 1 and A[CENTRE, 1:].max() <= 0.0099 + 1e-6),
-    walked("forty opaque splats without a stop", at(MIDDLE * 40, logits=OPAQUE, walk=ENDLESS),
+    view_of("forty opaque splats without a stop", at(MIDDLE * 40, logits=OPAQUE, params=ENDLESS),
         lambda A: A.sum(axis=1).max() <= 1 + 1e-6),
-    walked("the gain lambda at 0.01",
-        at(ROW, logits=[5.0, -5.0, 1.0, 0.0, -1.0], walk=lc.CompositingParams(opacity_logit_scale=0.01)),
+    view_of("the gain lambda at 0.01",
+        at(ROW, logits=[5.0, -5.0, 1.0, 0.0, -1.0], params=lc.CompositingParams(opacity_logit_scale=0.01)),
         lambda A: 0.3 < A[:, 1].max() < 0.6),
-    walked("the gain lambda at 16",
-        at(ROW, logits=[5.0, -5.0, 1.0, 0.0, -1.0], walk=lc.CompositingParams(opacity_logit_scale=16.0)),
+    view_of("the gain lambda at 16",
+        at(ROW, logits=[5.0, -5.0, 1.0, 0.0, -1.0], params=lc.CompositingParams(opacity_logit_scale=16.0)),
         lambda A: A[:, [1, 4]].max() == 0, kernels=FLOORED),
-    walked("a cap of 0.9999999", at(MIDDLE * 3, logits=OPAQUE, walk=replace(ENDLESS, alpha_cap=0.9999999)),
+    view_of("a cap of 0.9999999", at(MIDDLE * 3, logits=OPAQUE, params=replace(ENDLESS, alpha_cap=0.9999999)),
         lambda A: A[CENTRE, 0] > 0.999999),
 )
 # fmt: on
@@ -107,30 +107,30 @@ def _about_x(angle: float) -> tuple[float, float, float, float]:
 
 # fmt: off
 SHAPES: tuple[Extreme, ...] = (
-    walked("a log scale of minus infinity on one axis", at(ROW, [-1.0, -math.inf, -2.0]),
+    view_of("a log scale of minus infinity on one axis", at(ROW, [-1.0, -math.inf, -2.0]),
         like=at(ROW, [-1.0, DUST, -2.0])),
-    walked("scales of 1e-12", at(ROW, DUST), lambda A: A.max() > 1e-3, told="smaller than 1e-07 scene units"),
-    walked("scales of 1e6", at(ROW, math.log(1e6)), lambda A: A.max() > 0.7, told="larger than the scene"),
-    walked("needles and sheets: axes 1e6 apart",
+    view_of("scales of 1e-12", at(ROW, DUST), lambda A: A.max() > 1e-3, text="smaller than 1e-07 scene units"),
+    view_of("scales of 1e6", at(ROW, math.log(1e6)), lambda A: A.max() > 0.7, text="larger than the scene"),
+    view_of("needles and sheets: axes 1e6 apart",
         at(ROW, [[0, -13.8, -13.8], [-13.8, 0, -13.8], [-13.8, -13.8, 0], [0, 0, -13.8], [-13.8, 0, 0]],
             quats=TURNED),
         _visible),
-    walked("discs seen edge-on, to 1e-9 of a radian",
+    view_of("discs seen edge-on, to 1e-9 of a radian",
         at([(0.0, 0.0, 2.0 + 0.1 * k) for k in range(4)], [-0.5, 0.3, -16.0], camera=camera_at_origin(24, 24),
             quats=[_about_x(math.pi / 2 + tilt) for tilt in (0.0, 1e-9, 1e-5, 1e-3)]),
         _visible, kernels=DISC),
-    walked("quaternions of zero", at(ROW, [0.0, -2.0, -3.0], quats=(0.0, 0.0, 0.0, 0.0)),
-        like=at(ROW, [0.0, -2.0, -3.0]), told="zero quaternion"),
-    walked("quaternions of length 1e-18 and 1e18",
+    view_of("quaternions of zero", at(ROW, [0.0, -2.0, -3.0], quats=(0.0, 0.0, 0.0, 0.0)),
+        like=at(ROW, [0.0, -2.0, -3.0]), text="zero quaternion"),
+    view_of("quaternions of length 1e-18 and 1e18",
         at(ROW, [0.0, -2.0, -3.0], quats=[np.multiply(TURNED, 10.0**k) for k in (-18, 18, 0, 9, -9)]),
         like=at(ROW, [0.0, -2.0, -3.0], quats=TURNED)),
-    walked("dust under the mip filter's compensation", at(ROW, DUST, walk=lc.CompositingParams(antialiased=True)),
-        lambda A: A.max() == 0, kernels=GAUSSIAN, told="smaller than 1e-07 scene units"),
+    view_of("dust under the mip filter's compensation", at(ROW, DUST, params=lc.CompositingParams(antialiased=True)),
+        lambda A: A.max() == 0, kernels=GAUSSIAN, text="smaller than 1e-07 scene units"),
     # A cylinder.
-    walked("DBS: b of -30", at(MIDDLE, -0.5, betas=-30.0), lambda A: np.isclose(A[A > 0].max(), ALPHA, atol=1e-5),
+    view_of("DBS: b of -30", at(MIDDLE, -0.5, betas=-30.0), lambda A: np.isclose(A[A > 0].max(), ALPHA, atol=1e-5),
         kernels=BETA),
     # Weight on the ray through the middle only.
-    walked("DBS: b of +30", at(MIDDLE, -0.5, betas=30.0), lambda A: (A > 0).sum() == 1, kernels=BETA),
+    view_of("DBS: b of +30", at(MIDDLE, -0.5, betas=30.0), lambda A: (A > 0).sum() == 1, kernels=BETA),
 )
 # fmt: on
 
@@ -143,7 +143,7 @@ def _far_away(offset: float) -> Scene:
     return at(means, 1.0, camera=_pinhole(16, 12, 16.0, (8.5, 6.5), pose))
 
 
-def _unordered(kernel: Kernel) -> Found:
+def _unordered(kernel: Kernel) -> Outcome:
     """Splats a tenth apart, seen from ten million away, and written far to near."""
     count, distance = 6, 1e7
     z = 0.1 * np.arange(count)[::-1]
@@ -151,48 +151,48 @@ def _unordered(kernel: Kernel) -> Found:
     pose = np.eye(4)
     pose[2, 3] = distance
     camera = _pinhole(1, 1, distance, (0.5, 0.5), pose)
-    got = weights_of(splats, camera, PLAIN)[0][0]
+    got = weights_of(splats, camera, DEFAULTS)[0][0]
     exact = ALPHA * (1 - ALPHA) ** np.arange(count)[::-1]
     gives = "not so: all at one depth, so the order of the file, the farthest first"
     as_in_the_file = bool(np.allclose(got, exact[::-1], atol=1e-6))
-    return Found(gives, float(np.abs(got - exact).max()), told_of(splats, camera), as_in_the_file)
+    return Outcome(gives, float(np.abs(got - exact).max()), messages_of(splats, camera), as_in_the_file)
 
 
-def _crowd(logit: float) -> Callable[[Kernel], Found]:
+def _crowd(logit: float) -> Callable[[Kernel], Outcome]:
     """A million splats behind each other on the one ray of an image, beside the geometric series."""
 
-    def measure(kernel: Kernel) -> Found:
+    def measure(kernel: Kernel) -> Outcome:
         means = np.zeros((1_000_000, 3))
         means[:, 2] = np.linspace(1.0, 1_000.0, len(means))
         camera = camera_at_origin(1, 1)
         splats = splats_at(means, log_scales=-1.0, logits=logit, kernel=kernel)
-        got = weights_of(splats, camera, PLAIN)[0][0]
+        got = weights_of(splats, camera, DEFAULTS)[0][0]
         alpha = 1 / (1 + math.exp(-float(np.float32(logit))))
-        light = np.exp(np.arange(len(means) + 1) * math.log1p(-alpha))
-        exact = np.where(light[1:] > PLAIN.transmittance_stop, alpha * light[:-1], 0.0)
+        transmittance = np.exp(np.arange(len(means) + 1) * math.log1p(-alpha))
+        exact = np.where(transmittance[1:] > DEFAULTS.transmittance_stop, alpha * transmittance[:-1], 0.0)
         error = max(float(np.abs(got - exact).max()), abs(float(got.sum() - exact.sum())))
         gives = f"{int((got > 0).sum())} of {len(means)} met, row sum {got.sum():.7f} for {exact.sum():.7f}"
-        return Found(gives, error, told_of(splats, camera), bool(np.isfinite(got).all()))
+        return Outcome(gives, error, messages_of(splats, camera), bool(np.isfinite(got).all()))
 
     return measure
 
 
 # fmt: off
 PLACES: tuple[Extreme, ...] = (
-    walked("world coordinates of 1e7, the camera beside them", _far_away(1e7), like=_far_away(0.0),
-        told="positions came in float32"),
+    view_of("world coordinates of 1e7, the camera beside them", _far_away(1e7), like=_far_away(0.0),
+        text="positions came in float32"),
     # The order is lost, as the lift tells.
-    Extreme("a camera 1e7 from splats a tenth apart", _unordered, bound=0.75, told="float32 depths cannot order"),
-    walked("depth ties", at(MIDDLE * 6),
+    Extreme("a camera 1e7 from splats a tenth apart", _unordered, bound=0.75, text="float32 depths cannot order"),
+    view_of("depth ties", at(MIDDLE * 6),
         lambda A: np.allclose(A[CENTRE], [ALPHA * (1 - ALPHA) ** k for k in range(6)], atol=1e-6)),
-    walked("splats on the near plane, a rounding before it, at the camera and behind",
+    view_of("splats on the near plane, a rounding before it, at the camera and behind",
         at([(0.0, 0.0, z) for z in (ON_NEAR_PLANE, math.nextafter(0.01, 0), 0.0, -0.01, -5.0)], -4.0),
         lambda A: A[:, 0].max() > 0 and A[:, 1:].max() == 0),
-    walked("a camera inside splats", at([(0.0, 0.0, 0.05), (0.02, 0.01, 0.3), (0.0, 0.0, 3.0)], [0.5, 0.0, -0.5]),
+    view_of("a camera inside splats", at([(0.0, 0.0, 0.05), (0.02, 0.01, 0.3), (0.0, 0.0, 3.0)], [0.5, 0.0, -0.5]),
         _visible),
-    walked("two hundred identical splats", at(MIDDLE * 200, logits=-3.0),
+    view_of("two hundred identical splats", at(MIDDLE * 200, logits=-3.0),
         lambda A: bool((np.diff(A[CENTRE, :150]) < 0).all())),
-    walked("one splat (P = 1)", at(MIDDLE), lambda A: abs(A.max() - ALPHA) < 1e-5),
+    view_of("one splat (P = 1)", at(MIDDLE), lambda A: abs(A.max() - ALPHA) < 1e-5),
     Extreme("a million splats on one ray", _crowd(-5.0), kernels=FLOORED),
     Extreme("a million DBS splats of alpha 1e-6 on one ray", _crowd(math.log(1e-6)), kernels=BETA, bound=1e-4),
 )
@@ -217,31 +217,31 @@ def _looking_back() -> lc.Camera:
 # fmt: off
 VIEWS: tuple[Extreme, ...] = (
     *(
-        walked(f"an image of {width} x {height}", at(ROW, -1.0, camera=camera_at_origin(width, height)), _visible)
+        view_of(f"an image of {width} x {height}", at(ROW, -1.0, camera=camera_at_origin(width, height)), _visible)
         for width, height in ((1, 1), (1, 40), (17, 33))
     ),
-    walked(f"an image of {MAX_SIDE} x 3, the widest allowed",
+    view_of(f"an image of {MAX_SIDE} x 3, the widest allowed",
         at([(0.3 * k - 0.6, 0.0, 2.0) for k in range(5)],
             camera=_pinhole(MAX_SIDE, 3, 3_000.0, (MAX_SIDE / 2, 1.5), np.eye(4))),
         _visible),
-    walked(f"a focal length of {MAX_FOCAL:g} px", at(MIDDLE, camera=camera_at_origin(focal=MAX_FOCAL)),
+    view_of(f"a focal length of {MAX_FOCAL:g} px", at(MIDDLE, camera=camera_at_origin(focal=MAX_FOCAL)),
         lambda A: np.ptp(A[:, 0]) < 1e-5 and A.min() > 0.7),
-    walked(f"a focal length of {MIN_FOCAL:g} px", at(ROW, -1.0, camera=camera_at_origin(focal=MIN_FOCAL)),
+    view_of(f"a focal length of {MIN_FOCAL:g} px", at(ROW, -1.0, camera=camera_at_origin(focal=MIN_FOCAL)),
         lambda A: A[CENTRE].sum() > 0.9),
-    walked("a principal point 1e6 px outside the image",
+    view_of("a principal point 1e6 px outside the image",
         at([*ROW, (-2e6 / 16 + 1.0, 0.0, 2.0)], 0.5, camera=_pinhole(16, 12, 16.0, (1e6, 6.5), np.eye(4))),
-        lambda A: A[:, 5].max() > 0.1, told="principal point far off the centre"),
-    walked("a camera rolled by a right angle", _rolled(math.pi / 2), like=_rolled(0.0),
+        lambda A: A[:, 5].max() > 0.1, text="principal point far off the centre"),
+    view_of("a camera rolled by a right angle", _rolled(math.pi / 2), like=_rolled(0.0),
         of=lambda A: np.rot90(A.reshape(15, 15, -1)).reshape(225, -1)),
-    walked("a camera rolled by 1e-9 of a radian", _rolled(1e-9), like=_rolled(0.0)),
+    view_of("a camera rolled by 1e-9 of a radian", _rolled(1e-9), like=_rolled(0.0)),
     # It meets the last splat first, and so alone.
-    walked("a camera upside down, looking back", at(ROW, -1.0, camera=_looking_back()),
+    view_of("a camera upside down, looking back", at(ROW, -1.0, camera=_looking_back()),
         like=at(ROW[-1:], -1.0, camera=_looking_back()), of=lambda A: A[:, -1:]),
-    walked("a view that sees nothing: all behind, or far aside", at([(0.0, 0.0, -2.0), (1e6, 0.0, 1.0)]),
+    view_of("a view that sees nothing: all behind, or far aside", at([(0.0, 0.0, -2.0), (1e6, 0.0, 1.0)]),
         lambda A: A.max() == 0),
     # Faint dust on the middle of a pixel: its neighbours' alphas are below the floor.
-    walked("a splat on one ray only", at(MIDDLE, -12.0, logits=-5.0), lambda A: (A > 0).sum() == 1, kernels=FLOORED),
-    walked("splats beside the camera plane, at depth 0.0101",
+    view_of("a splat on one ray only", at(MIDDLE, -12.0, logits=-5.0), lambda A: (A > 0).sum() == 1, kernels=FLOORED),
+    view_of("splats beside the camera plane, at depth 0.0101",
         at([(s * x, 0.3 * x, 0.0101) for x in (0.01, 1.0, 100.0) for s in (-1, 1)], [-1, -3, 0]),
         kernels=(*GAUSSIAN, *BETA)),
 )
@@ -272,23 +272,23 @@ def photographed(
         name: of the row. distortion: of the photo. claim: what exact arithmetic says of the camera.
     """
 
-    def measure(_: Kernel) -> Found:
+    def measure(_: Kernel) -> Outcome:
         camera = _behind(distortion, focal)
         lens, pinhole = camera.lens, drawn_by(camera)
         assert lens is not None
         x, y = (axis.astype(np.float64) for axis in photo_places(lens))
-        seen = (x >= 0) & (x <= pinhole.width) & (y >= 0) & (y <= pinhole.height)
+        visible = (x >= 0) & (x <= pinhole.width) & (y >= 0) & (y <= pinhole.height)
         v, u = np.meshgrid(np.arange(lens.height) + 0.5, np.arange(lens.width) + 0.5, indexing="ij")
         back = lens.on_photo((x - pinhole.cx) / pinhole.fx, (y - pinhole.cy) / pinhole.fy)
-        error = float(np.hypot(back[0] - u, back[1] - v)[seen].max())
+        error = float(np.hypot(back[0] - u, back[1] - v)[visible].max())
         gives = f"{camera.width}x{camera.height} lifted, {pinhole.width}x{pinhole.height} drawn"
-        gives += f", {seen.mean():.0%} of it seen"
-        return Found(gives, error, tuple(distortion_warning([camera])), claim(camera))
+        gives += f", {visible.mean():.0%} of it seen"
+        return Outcome(gives, error, tuple(distortion_warning([camera])), claim(camera))
 
     return Extreme(name, measure, GAUSSIAN, PIXELS, "features must be of the photos as they were taken")
 
 
-def _moved(scale: float, digits: type = np.float64) -> Scene:
+def _transformed(scale: float, digits: type = np.float64) -> Scene:
     """A row of splats turned, shifted and scaled, and the camera moved to where they are."""
 
     def scene(kernel: Kernel) -> View:
@@ -298,7 +298,7 @@ def _moved(scale: float, digits: type = np.float64) -> Scene:
         [camera] = similarity.transformed(lc.Cameras((camera_at_origin(),))).values()
         means = np.asarray(ROW, np.float32).astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
         splats = splats_at(means, LENS_SCALES, quats=THIRD_OF_A_TURN, kernel=kernel)
-        return View(replace(splats, log_scales=splats.log_scales + math.log(scale)), camera, PLAIN)
+        return View(replace(splats, log_scales=splats.log_scales + math.log(scale)), camera, DEFAULTS)
 
     return scene
 
@@ -319,13 +319,13 @@ LENSES: tuple[Extreme, ...] = (
     photographed("a fisheye whose corners lie 110 degrees off its axis", Fisheye(),
         lambda camera: camera.width / 2 / camera.fx <= math.tan(math.radians(60)) + 1 / camera.fx,
         focal=CORNER * FOCAL / math.radians(110)),
-    walked("a frame 0.01 times as large", _moved(0.01), like=at(ROW, LENS_SCALES)),
-    walked("a frame 1e+06 times as large", _moved(1e6), like=at(ROW, LENS_SCALES), told="further than"),
-    walked("a frame told in float32", _moved(0.37, digits=np.float32), like=at(ROW, LENS_SCALES)),
-    refused("a barrel that turns back near the axis (k1 = -9)", lambda: _behind(Brown(k1=-9.0)), "of the photo"),
-    refused("a thin prism", lambda: calibration(MODELS_BY_NAME["THIN_PRISM_FISHEYE"], [0.0] * 12, "camera 1"),
+    view_of("a frame 0.01 times as large", _transformed(0.01), like=at(ROW, LENS_SCALES)),
+    view_of("a frame 1e+06 times as large", _transformed(1e6), like=at(ROW, LENS_SCALES), text="further than"),
+    view_of("a frame given in float32", _transformed(0.37, digits=np.float32), like=at(ROW, LENS_SCALES)),
+    error_of("a barrel that turns back near the axis (k1 = -9)", lambda: _behind(Brown(k1=-9.0)), "of the photo"),
+    error_of("a thin prism", lambda: calibration(MODELS_BY_NAME["THIN_PRISM_FISHEYE"], [0.0] * 12, "camera 1"),
         "undistort the photos first"),
-    refused("a frame that mirrors", lambda: Similarity.of(np.diag([1.0, 1.0, -1.0, 1.0]), "transform"),
+    error_of("a frame that mirrors", lambda: Similarity.of(np.diag([1.0, 1.0, -1.0, 1.0]), "transform"),
         "a proper rotation"),
 )
 # fmt: on
@@ -381,17 +381,17 @@ def _random_grid(rows: int, columns: int) -> lc.FeatureGrid:
 
 # fmt: off
 LENGTHS: tuple[Extreme, ...] = (
-    *(lifted(f"F = {channels}", checkerboard(channels=channels)) for channels in (1, 2, 31, 33)),
-    lifted("F = 8192", checkerboard(channels=8_192), kernels=GAUSSIAN),
+    *(lift_of(f"F = {channels}", checkerboard(channels=channels)) for channels in (1, 2, 31, 33)),
+    lift_of("F = 8192", checkerboard(channels=8_192), kernels=GAUSSIAN),
     *(
-        lifted(
+        lift_of(
             f"values to {scale:g}, given in {str(given).removeprefix('torch.')}, to be stored in float16",
             checkerboard(5, 40, scale, given),
-            lambda made, stored=stored: made.features.dtype == stored,
+            lambda lift, stored=stored: lift.features.dtype == stored,
             settings={"dtype": "float16"},
             kernels=GAUSSIAN,
             bound=STEP if stored == torch.float16 else SUM,
-            told="" if stored == torch.float16 else "float16 does not hold",
+            text="" if stored == torch.float16 else "float16 does not hold",
         )
         for scale, given, stored in (
             (65_504.0, torch.float16, torch.float16),
@@ -402,65 +402,65 @@ LENGTHS: tuple[Extreme, ...] = (
             (1e-30, torch.float32, torch.float32),
         )
     ),
-    lifted("values of 1e-40, below the normal numbers of float32", checkerboard(scale=1e-40), bound=1e-3,
+    lift_of("values of 1e-40, below the normal numbers of float32", checkerboard(scale=1e-40), bound=1e-3,
         kernels=GAUSSIAN),
-    lifted("a zero row in the codebook", _zero_row(), told="codebook rows are zero"),
-    lifted("a codebook of zeros", lc.Regions(checkerboard(3).labels, torch.zeros(3, 7)),
-        lambda made: float(made.agreement.max()) == 0, bound=0.0, told="codebook rows are zero"),
-    lifted("vectors that cancel: +1e4 and -9990 in turn", _cancelling(),
-        lambda made: float(made.agreement.min()) < 0.2),
+    lift_of("a zero row in the codebook", _zero_row(), text="codebook rows are zero"),
+    lift_of("a codebook of zeros", lc.Regions(checkerboard(3).labels, torch.zeros(3, 7)),
+        lambda lift: float(lift.agreement.max()) == 0, bound=0.0, text="codebook rows are zero"),
+    lift_of("vectors that cancel: +1e4 and -9990 in turn", _cancelling(),
+        lambda lift: float(lift.agreement.min()) < 0.2),
 )
 # fmt: on
 
 # fmt: off
 MAPS: tuple[Extreme, ...] = (
-    lifted("a mask of one pixel", _one_pixel()),
-    lifted("one label on the whole image", _labelled(np.zeros((HEIGHT, WIDTH)), 1),
-        lambda made: bool((made.features[made.seen] - made.features[made.seen][0]).abs().max() < 1e-6)),
-    lifted("labels of 1 x 1 pixel", _labelled(np.zeros((1, 1)), 1),
-        lambda made: float(made.agreement[made.seen].min()) > 1 - 1e-6),
-    lifted("a region a pixel", _region_a_pixel()),
-    lifted("labels of 32,766 and 32,767, the last of int16",
+    lift_of("a mask of one pixel", _one_pixel()),
+    lift_of("one label on the whole image", _labelled(np.zeros((HEIGHT, WIDTH)), 1),
+        lambda lift: bool((lift.features[lift.seen] - lift.features[lift.seen][0]).abs().max() < 1e-6)),
+    lift_of("labels of 1 x 1 pixel", _labelled(np.zeros((1, 1)), 1),
+        lambda lift: float(lift.agreement[lift.seen].min()) > 1 - 1e-6),
+    lift_of("a region a pixel", _region_a_pixel()),
+    lift_of("labels of 32,766 and 32,767, the last of int16",
         _labelled(LARGEST_I16 - np.indices((HEIGHT, WIDTH)).sum(axis=0) % 2, LARGEST_I16 + 1), kernels=GAUSSIAN,
-        told="are read by no label"),
-    lifted("a label of 32,768, the first beyond int16", _one_pixel(LARGEST_I16 + 1, LARGEST_I16 + 2),
-        kernels=GAUSSIAN, told="are read by no label"),
-    lifted("a view without any label", _labelled(np.full((3, 4), -1), 2),
-        lambda made: not bool(made.seen.any()) and bool((made.total_weight > 0).any()), bound=0.0,
-        told="no labelled ray reached any splat"),
-    lifted("a view that sees nothing beside one that does", {AWAY: checkerboard(), "v0": checkerboard()},
-        lambda made: bool(made.seen.any()), told="1 of 2 views meet no splat: away"),
-    lifted("views that all see nothing", {AWAY: checkerboard()}, lambda made: not bool(made.seen.any()), bound=0.0,
-        told="poses are world to camera"),
-    lifted("a splat that one ray alone meets", _region_a_pixel(),
-        lambda made: abs(float(made.agreement[0]) - 1) < 1e-6,
+        text="are read by no label"),
+    lift_of("a label of 32,768, the first beyond int16", _one_pixel(LARGEST_I16 + 1, LARGEST_I16 + 2),
+        kernels=GAUSSIAN, text="are read by no label"),
+    lift_of("a view without any label", _labelled(np.full((3, 4), -1), 2),
+        lambda lift: not bool(lift.seen.any()) and bool((lift.total_weight > 0).any()), bound=0.0,
+        text="no labelled ray reached any splat"),
+    lift_of("a view that sees nothing beside one that does", {AWAY: checkerboard(), "v0": checkerboard()},
+        lambda lift: bool(lift.seen.any()), text="1 of 2 views meet no splat: away"),
+    lift_of("views that all see nothing", {AWAY: checkerboard()}, lambda lift: not bool(lift.seen.any()), bound=0.0,
+        text="poses are world to camera"),
+    lift_of("a splat that one ray alone meets", _region_a_pixel(),
+        lambda lift: abs(float(lift.agreement[0]) - 1) < 1e-6,
         splats=splats_at([(0.125, 0.125, 0.0)], -12.0, logits=-4.0), kernels=GAUSSIAN),
-    lifted("a grid of 1 x 1 cell", lc.FeatureGrid(torch.ones(1, 1, 6)),
-        lambda made: bool((made.features[made.seen] - 1).abs().max() < 1e-6)),
-    lifted("labels larger than the image", _labelled(np.arange(100 * 130).reshape(100, 130) % 4, 4)),
-    lifted("a grid of one row", _random_grid(1, 9)),
-    lifted("a grid finer than the pixels", _random_grid(50, 70)),
+    lift_of("a grid of 1 x 1 cell", lc.FeatureGrid(torch.ones(1, 1, 6)),
+        lambda lift: bool((lift.features[lift.seen] - 1).abs().max() < 1e-6)),
+    lift_of("labels larger than the image", _labelled(np.arange(100 * 130).reshape(100, 130) % 4, 4)),
+    lift_of("a grid of one row", _random_grid(1, 9)),
+    lift_of("a grid finer than the pixels", _random_grid(50, 70)),
     *(
-        lifted(f"squared weights and a gain of {gain:g}", checkerboard(), settings={"power": 2, "lift_gain": gain})
+        lift_of(f"squared weights and a gain of {gain:g}", checkerboard(), settings={"power": 2, "lift_gain": gain})
         for gain in (0.01, 8.0, 16.0)
     ),
-    lifted("weights of 1e-20, squared (DBS)", checkerboard(), lambda made: float(made.total_weight[0]) < 1e-15,
+    lift_of("weights of 1e-20, squared (DBS)", checkerboard(), lambda lift: float(lift.total_weight[0]) < 1e-15,
         splats=splats_at([(0.0, 0.0, 0.0)], 0.0, logits=-46.0, kernel=Kernel.BETA), settings={"power": 2},
-        told="where float32 loses digits", kernels=BETA),
+        text="where float32 loses digits", kernels=BETA),
 )
 # fmt: on
 
 # fmt: off
 REFUSALS: tuple[Extreme, ...] = (
-    refused("an opacity logit of nan", lambda: splats_at(MIDDLE, logits=math.nan), "finite numbers"),
-    refused("a log scale of inf", lambda: splats_at(MIDDLE, math.inf), "finite numbers"),
-    refused("a place of inf", lambda: splats_at([(0.0, math.inf, 2.0)]), "finite numbers"),
-    refused("no splats (P = 0)", lambda: splats_at(np.zeros((0, 3))), "empty scene"),
-    refused("no views", lambda: lc.Cameras(()), "at least one view"),
-    refused("values of 1e30", lambda: run({"v0": checkerboard(scale=1e30)}, cloud()), "finite values within"),
-    refused("a label beyond the codebook", lambda: run({"v0": _labelled(np.full((2, 2), 4), 4)}, cloud()),
+    error_of("an opacity logit of nan", lambda: splats_at(MIDDLE, logits=math.nan), "finite numbers"),
+    error_of("a log scale of inf", lambda: splats_at(MIDDLE, math.inf), "finite numbers"),
+    error_of("a place of inf", lambda: splats_at([(0.0, math.inf, 2.0)]), "finite numbers"),
+    error_of("no splats (P = 0)", lambda: splats_at(np.zeros((0, 3))), "empty scene"),
+    error_of("no views", lambda: lc.Cameras(()), "at least one view"),
+    error_of("values of 1e30", lambda: run({"v0": checkerboard(scale=1e30)}, cloud()), "finite values within"),
+    error_of("a label beyond the codebook", lambda: run({"v0": _labelled(np.full((2, 2), 4), 4)}, cloud()),
         "rows of its codebook"),
-    refused("a gain of nought", lambda: lc.LiftSettings.of(lift_gain=0), "greater than 0"),
+    error_of("a gain of nought", lambda: lc.LiftSettings.of(lift_gain=0), "greater than 0"),
 )
 # fmt: on
 
@@ -481,16 +481,16 @@ EXTREMES = tuple(extreme for table in TABLES.values() for extreme in table)
 def rows_of(extremes: Iterable[Extreme]) -> Iterator[dict[str, Any]]:
     """The rows of some extremes, measured with each of their kernels."""
     for extreme in extremes:
-        found = [extreme.measure(kernel) for kernel in extreme.kernels]
-        errors = [part.error for part in found if part.error is not None]
-        flips, rays = sum(part.flips for part in found), sum(part.rays for part in found)
+        outcomes = [extreme.measure(kernel) for kernel in extreme.kernels]
+        errors = [part.error for part in outcomes if part.error is not None]
+        flips, rays = sum(part.flips for part in outcomes), sum(part.rays for part in outcomes)
         yield {
             "extreme": extreme.name,
             "kernels": "all" if extreme.kernels == KERNELS else ", ".join(extreme.kernels),
-            "float32 gives": found[0].gives,
+            "float32 gives": outcomes[0].gives,
             "error": max(errors) if errors else None,
             "rays that flip": f"{flips} of {rays}" if flips else None,
-            "told": "; ".join(dict.fromkeys(told for part in found for told in part.told)) or None,
+            "message": "; ".join(dict.fromkeys(message for part in outcomes for message in part.text)) or None,
         }
 
 
@@ -504,7 +504,7 @@ def main() -> None:
     }
     for title, rows in tables.items():
         print("" if options.json else f"\n## {title}\n")
-        tell(rows, as_json=options.json, note=title)
+        print_rows(rows, as_json=options.json, note=title)
 
 
 if __name__ == "__main__":

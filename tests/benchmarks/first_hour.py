@@ -1,10 +1,10 @@
-"""A stranger's first hour: inputs that contradict each other are told, healthy ones are not.
+"""Checks of inputs in a user's first hour: contradictions are reported, healthy inputs are not.
 
     python -m tests.benchmarks.first_hour SHARED [--json]
 
 SHARED holds the folders ``plush`` and ``tabletop``; the still life is generated. Each case is a row: ``done`` or
 ``NOT DONE``, and what was seen. A healthy scene is done where `check` finds nothing wrong with all of its views, 20,
-10 and 6 of them, a broken one where it is told, with photos and without:
+10 and 6 of them, a broken one where it is reported, with photos and without:
 
 - ``positions x 0.3``, ``x 0.5``: the cameras' positions in another scale than the splats;
 - ``foreign cameras``: the other scene's, under the names of its own;
@@ -41,11 +41,11 @@ PACKS = {
 
 
 class Case(NamedTuple):
-    """What was tried, whether it is as it should be, and what was seen."""
+    """A fault, True if the check is right about it, and the message of the check."""
 
-    what: str
-    done: bool
-    seen: str
+    fault: str
+    passed: bool
+    message: str
 
 
 Scene = tuple[lc.Splats, lc.Cameras, Mapping[str, Path] | None]  # as `check` takes it
@@ -59,16 +59,16 @@ def main() -> int:
         for case in _cases(options.shared, Path(scratch)):
             cases.append(case)
             if not options.json:
-                print(f"{'done' if case.done else 'NOT DONE':<9} {case.what}: {case.seen}", flush=True)
-    done = sum(case.done for case in cases)
-    print(json.dumps([case._asdict() for case in cases]) if options.json else f"{done} of {len(cases)} are done")
-    return 0 if done == len(cases) else 1
+                print(f"{'done' if case.passed else 'NOT DONE':<9} {case.fault}: {case.message}", flush=True)
+    passed = sum(case.passed for case in cases)
+    print(json.dumps([case._asdict() for case in cases]) if options.json else f"{passed} of {len(cases)} are done")
+    return 0 if passed == len(cases) else 1
 
 
 def _cases(shared: Path, scratch: Path) -> Iterator[Case]:
     write_still_life(scratch, still_life())
     folders = {"plush": shared / "plush", "tabletop": shared / "tabletop", "still life": scratch}
-    scenes = {name: _opened(folder) for name, folder in folders.items()}
+    scenes = {name: _open_scene(folder) for name, folder in folders.items()}
     for name, scene in scenes.items():
         foreign = scenes["tabletop" if name == "plush" else "plush"][1]
         for pack in PACKS[name]:
@@ -81,36 +81,39 @@ def _cases(shared: Path, scratch: Path) -> Iterator[Case]:
     yield Case(f"check of plush within {MOST_SECONDS:g} s", took <= MOST_SECONDS, f"{took:.1f} s")
 
 
-def _opened(folder: Path) -> Scene:
+def _open_scene(folder: Path) -> Scene:
     photos = folder / "images"
     return *read_scene(folder), find_images([photos]) if photos.is_dir() else None
 
 
 def _healthy(name: str, scene: Scene, views: Views) -> Iterator[Case]:
     for count in (len(views), *(count for count in COUNTS if count < len(views))):
-        some = [views.views[int(k)] for k in np.linspace(0, len(views) - 1, count)]
-        found = check_scene(*scene, as_views({view: views[view] for view in some}))
-        agreement = found.features.get("agreement_of_views", float("nan"))
-        said = found.wrong[0] if found.wrong else f"nothing is told, views agree to {agreement:.2f}"
-        yield Case(f"{name}, healthy, {len(some)} views", not found.wrong, said)
+        sample = [views.views[int(k)] for k in np.linspace(0, len(views) - 1, count)]
+        report = check_scene(*scene, as_views({view: views[view] for view in sample}))
+        agreement = report.features.get("agreement_of_views", float("nan"))
+        message = report.wrong[0] if report.wrong else f"nothing is reported, views agree to {agreement:.2f}"
+        yield Case(f"{name}, healthy, {len(sample)} views", not report.wrong, message)
 
 
 def _broken(name: str, scene: Scene, views: Views, foreign: lc.Cameras) -> Iterator[Case]:
     splats, cameras, photos = scene
-    renamed = [camera.replace(name=own) for own, camera in zip(cameras, cycle(foreign.values()), strict=False)]
+    foreign_cameras = [
+        camera.replace(name=camera_name)
+        for camera_name, camera in zip(cameras, cycle(foreign.values()), strict=False)
+    ]
     broken = {
         "positions x 0.3": (_scaled(cameras, 0.3), views),
         "positions x 0.5": (_scaled(cameras, 0.5), views),
-        "foreign cameras": (lc.Cameras(renamed), views),
+        "foreign cameras": (lc.Cameras(foreign_cameras), views),
     }
     if not views.is_regions(views.views[0]):
-        broken["[F, h, w] under [h, w, F]"] = (cameras, _turned(views))
-    for what, (moved, given) in broken.items():
-        for shown in (photos, None) if photos else (None,):
-            found = check_scene(splats, moved, shown, given)
-            beside = "with photos" if shown else "without photos"
-            said = found.wrong[0] if found.wrong else "nothing is told"
-            yield Case(f"{name}, {what}, {beside}", bool(found.wrong), said)
+        broken["[F, h, w] under [h, w, F]"] = (cameras, _turn_views(views))
+    for fault, (wrong_cameras, wrong_features) in broken.items():
+        for check_photos in (photos, None) if photos else (None,):
+            report = check_scene(splats, wrong_cameras, check_photos, wrong_features)
+            suffix = "with photos" if check_photos else "without photos"
+            message = report.wrong[0] if report.wrong else "nothing is reported"
+            yield Case(f"{name}, {fault}, {suffix}", bool(report.wrong), message)
 
 
 def _scaled(cameras: lc.Cameras, factor: float) -> lc.Cameras:
@@ -119,12 +122,14 @@ def _scaled(cameras: lc.Cameras, factor: float) -> lc.Cameras:
     return lc.Cameras([camera.replace(viewmat=camera.viewmat * scale) for camera in cameras.values()])
 
 
-def _turned(views: Views) -> Views:
-    made = {}
+def _turn_views(views: Views) -> Views:
+    turned_views = {}
     for name, view in views.items():
         assert isinstance(view, lc.FeatureGrid)
-        made[name] = lc.FeatureGrid(torch.clone(view.grid.permute(2, 0, 1).contiguous()).reshape(view.grid.shape))
-    return as_views(made)
+        turned_views[name] = lc.FeatureGrid(
+            torch.clone(view.grid.permute(2, 0, 1).contiguous()).reshape(view.grid.shape)
+        )
+    return as_views(turned_views)
 
 
 if __name__ == "__main__":

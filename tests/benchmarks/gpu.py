@@ -1,4 +1,4 @@
-"""What a card does: speed, agreement with the processor, accuracy, and gsplat beside it. ``make gpu`` runs it.
+"""Measurements of a GPU: speed, agreement with the processor, accuracy, and gsplat beside it. ``make gpu`` runs it.
 
     python -m tests.benchmarks.gpu [--look] [--shared DIR]
 
@@ -31,50 +31,59 @@ from liftcore.lifting.files import lift_files
 from liftcore.runtime.device import CPU, Device, choose_device
 from liftcore.values.lift_file import TENSORS, save_lift
 from tests.benchmarks.base import read_pack, scene_files, table_of
-from tests.benchmarks.peers import Answer, Work, answer_of, at_pixels, dense_target, ours, room, side_by_side
-from tests.benchmarks.scenes import Room, write_bench_room
+from tests.benchmarks.peers import (
+    Answer,
+    Work,
+    answer_of,
+    at_pixels,
+    dense_target,
+    room_work,
+    side_by_side,
+    splatlift_answer,
+)
+from tests.benchmarks.scenes import RoomSpec, write_bench_room
 from tests.benchmarks.tabletop import CASES, tabletop
 
-LARGE = Room(1_000_000, 300, (986, 728), 512)  # docs/results.md has it on an H100
-SMALL = Room(200_000, 8, (640, 480), 512)  # to compare both devices on: the processor lifts it in seconds
+LARGE = RoomSpec(1_000_000, 300, (986, 728), 512)  # docs/results.md has it on an H100
+SMALL = RoomSpec(200_000, 8, (640, 480), 512)  # to compare both devices on: the processor lifts it in seconds
 
 
-def whole_lift(size: Room, device: Device) -> tuple[list[dict[str, Any]], list[str]]:
+def whole_lift(size: RoomSpec, device: Device) -> tuple[list[dict[str, Any]], list[str]]:
     """Seconds of a lift from files to a file by stage, the second of two; the tensors that differ between the two."""
     with tempfile.TemporaryDirectory(prefix="splatlift-room-") as folder:
         files = write_bench_room(Path(folder), size)
-        settings, made = lc.LiftSettings.of(preset="tikhonov", device=device.kind), []
+        settings, lifts = lc.LiftSettings.of(preset="tikhonov", device=device.kind), []
         start = 0.0
         for _ in range(2):  # the first compiles kernels, and leaves the files in the memory of the machine
             if device.place.type == "cuda":
                 torch.cuda.reset_peak_memory_stats(device.place)
             start = time.perf_counter()
-            made.append(lift_files(files[0], files[1], files[2:], settings))
+            lifts.append(lift_files(files[0], files[1], files[2:], settings))
         lifted = time.perf_counter()
-        save_lift(made[1], Path(folder) / "lift.safetensors")
+        save_lift(lifts[1], Path(folder) / "lift.safetensors")
         saved = time.perf_counter()
-    timings = made[1].metadata.timings
+    timings = lifts[1].metadata.timings
     rows = [{"stage": name, "seconds": value} for name, value in timings.items()]
     rows += [{"stage": "save", "seconds": saved - lifted}, {"stage": "total", "seconds": saved - start}]
     rows += [{"stage": "geometry, a view", "seconds": timings["geometry"] / size.views}]
     if device.place.type == "cuda":
         peak = torch.cuda.max_memory_allocated(device.place) / 2**20
         rows.append({"stage": f"peak on the card: {peak:.0f} MiB", "seconds": None})
-    return rows, differing(*made)
+    return rows, differing(*lifts)
 
 
-def differing(one: lc.LiftResult, other: lc.LiftResult) -> list[str]:
+def differing(a: lc.LiftResult, b: lc.LiftResult) -> list[str]:
     """The tensors of two lifts that are not the same to the bit."""
 
     def bits(lifted: lc.LiftResult, name: str) -> Tensor:
         tensor = getattr(lifted, name)
         return torch.empty(0) if tensor is None else tensor.contiguous().view(torch.uint8)
 
-    return [name for name in TENSORS if not torch.equal(bits(one, name), bits(other, name))]
+    return [name for name in TENSORS if not torch.equal(bits(a, name), bits(b, name))]
 
 
 def views_of(device: Device, shared: Path) -> Iterator[dict[str, Any]]:
-    """What ``splatlift bench --device cuda`` says of the room and of plush."""
+    """Run ``splatlift bench`` on the device for the room and for plush."""
     for scene in (None, shared / "plush"):
         if scene is None or scene.is_dir():
             size: dict[str, Any] = {
@@ -82,25 +91,25 @@ def views_of(device: Device, shared: Path) -> Iterator[dict[str, Any]]:
                 "size": "x".join(map(str, LARGE.size)),
                 "channels": LARGE.channels,
             }
-            found = run_bench(scene, device=device.kind, views=12, **size)
-            for preset, row in found["presets"].items():
-                head = {"scene": found["workload"], "splats": found["splats"], "preset": preset}
+            figures = run_bench(scene, device=device.kind, views=12, **size)
+            for preset, row in figures["presets"].items():
+                head = {"scene": figures["workload"], "splats": figures["splats"], "preset": preset}
                 yield head | {f"{key}, ms a view": 1e3 * row[f"{key}_s_per_view"] for key in ("geometry", "solve")}
 
 
 def beside_processor(files: Sequence[Path], device: Device) -> dict[str, Any]:
     """The same lift on both, over splats with total weight over a half. A ray at a cut-off may fall either way."""
     settings = (lc.LiftSettings.of(diagnostic_rays=0, device=kind) for kind in ("cpu", device.kind))
-    one, other = (lift_files(files[0], files[1], files[2:], each).to(CPU.place) for each in settings)
-    counted = one.total_weight > 0.5
-    first, second = one.features[counted].float(), other.features[counted].float()
-    total_weight = one.total_weight[counted]
+    a, b = (lift_files(files[0], files[1], files[2:], each).to(CPU.place) for each in settings)
+    has_weight = a.total_weight > 0.5
+    first, second = a.features[has_weight].float(), b.features[has_weight].float()
+    total_weight = a.total_weight[has_weight]
     return {
-        "splats": int(counted.sum()),
+        "splats": int(has_weight.sum()),
         "least cosine": f"{float(cosine_similarity(first, second, dim=1).min()):.6f}",
         "largest difference / largest value": float((first - second).abs().max() / first.abs().max()),
-        "total weight, relative": float(((total_weight - other.total_weight[counted]).abs() / total_weight).max()),
-        "seen by one": int((one.seen != other.seen).sum()),
+        "total weight, relative": float(((total_weight - b.total_weight[has_weight]).abs() / total_weight).max()),
+        "seen by one": int((a.seen != b.seen).sum()),
     }
 
 
@@ -108,20 +117,25 @@ def tabletop_rows(folder: Path, device: Device) -> Iterator[dict[str, Any]]:
     """Accuracy of all of the scene's features, lifted on the device and judged on the processor."""
     scene = tabletop(folder)
     for case in CASES:
-        found = scene.judge(scene.lift(read_pack(folder, case.pack), **case.values, device=device.kind))
+        figures = scene.evaluate(scene.lift(read_pack(folder, case.pack), **case.values, device=device.kind))
         base = {"README accuracy": case.accuracy, "README mIoU": case.miou}
-        yield {"features, weights": case.name, "accuracy": found.accuracy, "mIoU": found.miou, **base}
+        yield {"features, weights": case.name, "accuracy": figures.accuracy, "mIoU": figures.miou, **base}
 
 
-def beside_gsplat(size: Room, device: Device) -> dict[str, Any]:
+def beside_gsplat(size: RoomSpec, device: Device) -> dict[str, Any]:
     """Both lifts of the room in turns, from tensors to X: medians of three rounds after one that does not count."""
-    rasterization, made = import_module("gsplat").rasterization, room(size)
-    work = replace(made, views=tuple((camera, at_pixels(regions, camera)) for camera, regions in made.views))
-    peers = {"splatlift": partial(ours, device=device), "gsplat": partial(gsplat, rasterization, device.place)}
+    rasterization, work_room = import_module("gsplat").rasterization, room_work(size)
+    work = replace(
+        work_room, views=tuple((camera, at_pixels(regions, camera)) for camera, regions in work_room.views)
+    )
+    peers = {
+        "splatlift": partial(splatlift_answer, device=device),
+        "gsplat": partial(gsplat, rasterization, device.place),
+    }
     for rounds in (1, 3):
-        one, other = side_by_side(size, work, peers, rounds)
-    seconds = {"splatlift s": one["seconds"], "gsplat s": other["seconds"]}
-    return seconds | {"times": other["times ours"], "cosine": other["cosine"]}
+        a, b = side_by_side(size, work, peers, rounds)
+    seconds = {"splatlift s": a["seconds"], "gsplat s": b["seconds"]}
+    return seconds | {"times": b["times ours"], "cosine": b["cosine"]}
 
 
 def gsplat(rasterization: Any, place: torch.device, work: Work) -> Answer:
@@ -144,8 +158,8 @@ def gsplat(rasterization: Any, place: torch.device, work: Work) -> Answer:
 
 def main() -> int:
     """Print every table; the exit status."""
-    named = {"prog": "python -m tests.benchmarks.gpu", "description": __doc__}
-    parser = ArgumentParser(**named, formatter_class=RawTextHelpFormatter)
+    names = {"prog": "python -m tests.benchmarks.gpu", "description": __doc__}
+    parser = ArgumentParser(**names, formatter_class=RawTextHelpFormatter)
     parser.add_argument("--look", action="store_true", help="only say whether there is a card")
     parser.add_argument("--shared", type=Path, default=Path("../shared/data"), help="of plush and tabletop")
     options = parser.parse_args()

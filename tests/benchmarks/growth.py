@@ -1,4 +1,4 @@
-"""How seconds and memory of a lift by ``default`` grow with its views, splats, levels, regions and channels.
+"""Growth of seconds and memory of a lift by ``default`` with its views, splats, levels, regions and channels.
 
     python -m tests.benchmarks.growth [--of NAME...] [--views N --splats P --channels F --size WxH] [--json]
 
@@ -25,10 +25,10 @@ from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.runtime.device import give_back_memory
 from liftcore.runtime.progress import Timings
 from liftcore.values.views import ViewFeatures
-from tests.benchmarks.base import command_line, tell
-from tests.benchmarks.scenes import Room, observed_views
+from tests.benchmarks.base import command_line, print_rows
+from tests.benchmarks.scenes import RoomSpec, observed_views
 
-LEAST = 0.05  # processor seconds that are told from nothing
+LEAST = 0.05  # CPU seconds that are measurable
 MIB = 2**20
 GROWING: dict[str, Sequence[float]] = {  # times the usual; of levels their number, of regions that of a view
     "views": (0.5, 1, 2, 4),
@@ -65,20 +65,22 @@ def blocks(camera: lc.Camera, regions: int, channels: int, seed: int) -> lc.Regi
     return lc.Regions(torch.stack(maps).int(), torch.nn.functional.normalize(vectors, dim=1).half())
 
 
-def cost(room: Room, levels: int, regions: int | None) -> dict[str, Any]:
+def cost(scene: RoomSpec, levels: int, regions: int | None) -> dict[str, Any]:
     """Lift a room; a row of the table.
 
     Args:
         levels: of the labels. regions: of a map of blocks; None: what parts of the room are seen.
     """
-    splats, cameras = room_splats(room.splats), room_cameras(room.views, *room.size)
+    splats, cameras = room_splats(scene.splats), room_cameras(scene.views, *scene.size)
     views: dict[str, ViewFeatures] = {}
     if regions is None:
-        for name, seen in observed_views(CpuRaster(splats), cameras, room):
-            assert isinstance(seen, lc.Regions)
-            views[name] = lc.Regions(seen.labels[:levels].contiguous(), seen.codebook)
+        for name, observed in observed_views(CpuRaster(splats), cameras, scene):
+            assert isinstance(observed, lc.Regions)
+            views[name] = lc.Regions(observed.labels[:levels].contiguous(), observed.codebook)
     else:
-        views = {one.name: blocks(one, regions, room.channels, number) for number, one in enumerate(cameras)}
+        views = {
+            camera.name: blocks(camera, regions, scene.channels, number) for number, camera in enumerate(cameras)
+        }
     give_back_memory()  # of the rows before
     Path("/proc/self/clear_refs").write_text("5")
     before = peak_memory() or 0
@@ -87,23 +89,23 @@ def cost(room: Room, levels: int, regions: int | None) -> dict[str, Any]:
         patch("liftcore.lifting.pipeline.Timings", StageCosts),
         patch("liftcore.runtime.progress.time.perf_counter", time.process_time),
     ):
-        made = lc.lift(splats, {one.name: one for one in cameras}, views, threads=2, progress=False)
-    seconds = {name: took for name, took in made.metadata.timings.items() if name != "compile"}
+        result = lc.lift(splats, {camera.name: camera for camera in cameras}, views, threads=2, progress=False)
+    seconds = {name: took for name, took in result.metadata.timings.items() if name != "compile"}
     memory = {f"{name} MiB": (peak - before) / MIB for name, peak in StageCosts.peaks.items() if name in seconds}
-    entries = made.diagnostics["weights_entries"] / 1e6
+    entries = result.diagnostics["weights_entries"] / 1e6
     return {"million entries": entries, **seconds, "all": sum(seconds.values()), **memory}
 
 
 def exponents(rows: Sequence[Mapping[str, Any]], name: str) -> dict[str, Any]:
-    """How each column grows with that of the name, from the first row to the last."""
+    """Compute the exponent of each column over that of the name, from the first row to the last."""
     first, last = rows[0], rows[-1]
     factor = math.log(last[name] / first[name])
-    grown: dict[str, Any] = {name: "exponent"}
+    growth: dict[str, Any] = {name: "exponent"}
     for column in list(last)[1:]:
         least = 1 if column.endswith("MiB") else LEAST
-        known = first.get(column, 0) > 0 and last[column] >= least
-        grown[column] = f"{math.log(last[column] / first[column]) / factor:.2f}" if known else None
-    return grown
+        is_known = first.get(column, 0) > 0 and last[column] >= least
+        growth[column] = f"{math.log(last[column] / first[column]) / factor:.2f}" if is_known else None
+    return growth
 
 
 def main() -> None:
@@ -119,19 +121,19 @@ def main() -> None:
     )
     options = parser.parse_args()
     width, height = map(int, options.size.split("x"))
-    cost(Room(2_000, 4, (64, 48), 8), 4, None)  # compiles
+    cost(RoomSpec(2_000, 4, (64, 48), 8), 4, None)  # compiles
     for name in options.of:
         rows = []
         for value in GROWING[name]:
-            usual = {"views": options.views, "splats": options.splats, "channels": options.channels}
-            given = round(value * usual[name]) if name in usual else int(value)
-            usual |= {name: given} if name in usual else {}
-            room = Room(size=(width, height), alike=0.6, **usual)
-            levels, regions = given if name == "levels" else 4, given if name == "regions" else None
-            shown = given * options.views if regions else given
-            rows.append({name: shown} | cost(room, levels, regions))
+            defaults = {"views": options.views, "splats": options.splats, "channels": options.channels}
+            setting = round(value * defaults[name]) if name in defaults else int(value)
+            defaults |= {name: setting} if name in defaults else {}
+            scene = RoomSpec(size=(width, height), cosine=0.6, **defaults)
+            levels, regions = setting if name == "levels" else 4, setting if name == "regions" else None
+            label = setting * options.views if regions else setting
+            rows.append({name: label} | cost(scene, levels, regions))
         columns = max(rows, key=len)
-        tell([*rows, exponents(rows, name)], as_json=options.json, columns=list(columns))
+        print_rows([*rows, exponents(rows, name)], as_json=options.json, columns=list(columns))
 
 
 if __name__ == "__main__":

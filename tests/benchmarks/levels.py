@@ -27,8 +27,8 @@ from liftcore.evaluate.synthetic import room_cameras, room_parts, room_splats
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.solve.reweight import Reweighting, reweighting_factors
 from liftcore.values.views import NO_LABEL, ViewFeatures
-from tests.benchmarks.base import command_line, tell
-from tests.benchmarks.tabletop import Truth, counted
+from tests.benchmarks.base import command_line, print_rows
+from tests.benchmarks.tabletop import Truth, evaluated_splats
 from tests.still_life import surfaces
 from tests.still_life.masks import Mistakes, mistaken_regions
 from tests.still_life.objects import Piece, still_life_pieces
@@ -43,12 +43,12 @@ SCENES = ("heap", "still life", "room")
 
 @dataclass(frozen=True)
 class Kind:
-    """What is generated."""
+    """The parameters of a generated scene."""
 
     scene: str = "heap"  # or "still life", "room"
     views: int = 22  # of which every fifth is held out
     wrong: float = 0.3  # of the masks
-    alike: float = 0.0  # cosine of parts and wholes
+    cosine: float = 0.0  # cosine of parts and wholes
     levels: str = "named"  # or "unnamed", "mixed"
     partly: bool = False
     seed: int = 7
@@ -57,14 +57,14 @@ class Kind:
     @property
     def name(self) -> str:
         """As the table prints it."""
-        parts = f"{self.views} views", f"{self.wrong:.0%} wrong", f"alike {self.alike:g}", self.levels
+        parts = f"{self.views} views", f"{self.wrong:.0%} wrong", f"alike {self.cosine:g}", self.levels
         return ", ".join([self.scene, *parts, *(["partly"] if self.partly else [])])
 
 
 KINDS = (
     *(Kind(scene, wrong=wrong) for scene in SCENES for wrong in (0.0, 0.1, 0.3)),
     *(Kind(scene, views=views) for scene in SCENES for views in (8, 50)),
-    *(Kind(scene, alike=alike) for scene in SCENES for alike in (0.5, 1.0)),
+    *(Kind(scene, cosine=cosine) for scene in SCENES for cosine in (0.5, 1.0)),
     *(Kind(scene, partly=True) for scene in SCENES),
     *(Kind(scene, wrong=wrong, levels="unnamed") for scene in SCENES for wrong in (0.1, 0.3)),
     *(Kind(scene, wrong=wrong, levels="mixed") for scene in SCENES for wrong in (0.0, 0.3)),
@@ -81,7 +81,7 @@ class Generated:
     def miou(self, **settings: Any) -> list[float]:
         """The mIoU of each level after a lift."""
         lifted = self.truths[0].lift(self.views, progress=False, **settings)
-        return [truth.judge(lifted).miou for truth in self.truths]
+        return [truth.evaluate(lifted).miou for truth in self.truths]
 
 
 @dataclass(frozen=True)
@@ -103,8 +103,8 @@ class Scene:
     def labels(self, camera: lc.Camera) -> np.ndarray:
         """[L, H, W]: what each ray shows on each level, -1 for nothing."""
         finest = torch.from_numpy(self.owners[:, -1].astype(np.int32))
-        shown = self.raster.strongest_labels(camera, finest, lc.CompositingParams()).numpy()
-        return np.where(shown >= 0, self.above[shown].transpose(2, 0, 1), NO_LABEL)
+        strongest = self.raster.strongest_labels(camera, finest, lc.CompositingParams()).numpy()
+        return np.where(strongest >= 0, self.above[strongest].transpose(2, 0, 1), NO_LABEL)
 
 
 def scene_of(kind: Kind) -> Scene:
@@ -116,10 +116,10 @@ def scene_of(kind: Kind) -> Scene:
         held_out = frozenset(camera.name for camera in cameras[2::5])
         return Scene(CpuRaster(splats), lc.Cameras(tuple(cameras)), held_out, owners)
     pieces = still_life_pieces() if kind.scene == "still life" else heap(kind.seed)
-    made = still_life(kind.seed, kind.views, kind.density, pieces)
-    owners = np.stack([made.splat_things, made.splat_parts], axis=1)
-    cameras = lc.Cameras(tuple(halved(camera) for camera in made.cameras.values()))
-    return Scene(CpuRaster(made.splats), cameras, frozenset(made.held_out), owners)
+    scene = still_life(kind.seed, kind.views, kind.density, pieces)
+    owners = np.stack([scene.splat_things, scene.splat_parts], axis=1)
+    cameras = lc.Cameras(tuple(halved(camera) for camera in scene.cameras.values()))
+    return Scene(CpuRaster(scene.splats), cameras, frozenset(scene.held_out), owners)
 
 
 def heap(seed: int) -> list[Piece]:
@@ -144,19 +144,22 @@ def heap(seed: int) -> list[Piece]:
 def generate(kind: Kind) -> Generated:
     """The scene of a kind with its masks."""
     scene, rng = scene_of(kind), np.random.default_rng((kind.seed, 5))
-    vectors, share = vectors_of(scene.owners, kind.alike, rng), kind.wrong
+    vectors, share = vectors_of(scene.owners, kind.cosine, rng), kind.wrong
     book, count = torch.from_numpy(np.concatenate(vectors)).float(), [len(part) for part in vectors]
     mistakes = Mistakes(0.5 * share, 0.25 * share, 0.25 * share, 0.03, 1.0 if share else 0.0, 0.35)
-    hidden = rng.random(count[-1]) < (0.5 if kind.partly else 0.0)
-    views, shown = dict[str, ViewFeatures](), {view: scene.labels(scene.cameras[view]) for view in scene.held_out}
+    unlabelled = rng.random(count[-1]) < (0.5 if kind.partly else 0.0)
+    views, pixel_labels = (
+        dict[str, ViewFeatures](),
+        {view: scene.labels(scene.cameras[view]) for view in scene.held_out},
+    )
     for name, camera in scene.cameras.items():
         if name in scene.held_out:
             continue
         labels = scene.labels(camera)
-        labels[-1][(labels[-1] >= 0) & hidden[labels[-1]]] = NO_LABEL
+        labels[-1][(labels[-1] >= 0) & unlabelled[labels[-1]]] = NO_LABEL
         if kind.levels == "mixed":
-            whole = rng.random(count[0]) < 0.5
-            labels = one_level(labels, whole, count)
+            has_whole = rng.random(count[0]) < 0.5
+            labels = one_level(labels, has_whole, count)
             exact = lc.Regions(torch.from_numpy(labels.astype(np.int32)), book)
         else:
             starts = np.cumsum([0, *count[:-1]])[:, None, None]
@@ -165,11 +168,11 @@ def generate(kind: Kind) -> Generated:
             )
         regions = mistaken_regions(exact, mistakes, rng)
         views[name] = without_levels(regions) if kind.levels == "unnamed" else regions
-    counts = counted(scene.raster.splats, scene.cameras, views)
+    counts = evaluated_splats(scene.raster.splats, scene.cameras, views)
     truths = []
     for level, classes in enumerate(vectors):
         words = tuple(f"{level}.{number}" for number in range(count[level]))
-        held_out = {view: torch.from_numpy(labels[level]) for view, labels in shown.items()}
+        held_out = {view: torch.from_numpy(labels[level]) for view, labels in pixel_labels.items()}
         owners = torch.from_numpy(scene.owners[:, level])
         truths.append(
             Truth(scene.raster, scene.cameras, words, torch.from_numpy(classes).float(), owners, counts, held_out)
@@ -183,33 +186,33 @@ def halved(camera: lc.Camera) -> lc.Camera:
     return camera.replace(**sizes, **{name: getattr(camera, name) / 2 for name in ("fx", "fy", "cx", "cy")})
 
 
-def one_level(labels: np.ndarray, whole: np.ndarray, count: Sequence[int]) -> np.ndarray:
-    """[1, H, W] rows of the codebook: a thing is shown whole, or by its finest parts, as ``whole`` [K] bool says."""
-    things, parts = labels[0], labels[-1]
-    as_whole = (things >= 0) & (whole[things] | (parts < 0))
-    return np.where(as_whole, things, np.where(parts >= 0, parts + sum(count[:-1]), NO_LABEL))[None]
+def one_level(labels: np.ndarray, has_whole: np.ndarray, count: Sequence[int]) -> np.ndarray:
+    """[1, H, W] rows of the codebook: one region an object if ``has_whole`` [K] bool, else its finest parts are."""
+    objects, parts = labels[0], labels[-1]
+    as_whole = (objects >= 0) & (has_whole[objects] | (parts < 0))
+    return np.where(as_whole, objects, np.where(parts >= 0, parts + sum(count[:-1]), NO_LABEL))[None]
 
 
 def without_levels(regions: lc.Regions) -> lc.Regions:
     """The masks of all levels, whose levels nobody names."""
     planes = regions.labels.numpy()
-    found = [(level == row, int(row)) for level in planes for row in np.unique(level[level >= 0])]
-    masks, rows = [mask for mask, _ in found], [row for _, row in found]
+    planes_of = [(level == row, int(row)) for level in planes for row in np.unique(level[level >= 0])]
+    masks, rows = [mask for mask, _ in planes_of], [row for _, row in planes_of]
     return lc.Regions.from_masks(torch.from_numpy(np.stack(masks)), regions.codebook[rows])
 
 
-def vectors_of(owners: np.ndarray, alike: float, rng: np.random.Generator) -> list[np.ndarray]:
-    """[K, CHANNELS] of each level; of parts with the cosine ``alike`` to their wholes, but for what all share."""
-    common, found = unit(rng.standard_normal((1, CHANNELS))), list[np.ndarray]()
+def vectors_of(owners: np.ndarray, cosine: float, rng: np.random.Generator) -> list[np.ndarray]:
+    """[K, CHANNELS] of each level; of parts with the cosine ``cosine`` to their wholes, but for what all share."""
+    common, vectors = unit(rng.standard_normal((1, CHANNELS))), list[np.ndarray]()
     for level in range(owners.shape[1]):
-        own = unit(rng.standard_normal((owners[:, level].max() + 1, CHANNELS)))
+        unit_rows = unit(rng.standard_normal((owners[:, level].max() + 1, CHANNELS)))
         if level:
-            above = np.empty_like(own)
-            above[owners[:, level]] = found[-1][owners[:, level - 1]]
-            own = unit(own - (own * above).sum(axis=1, keepdims=True) * above)
-            own = alike * above + (1 - alike**2) ** 0.5 * own
-        found.append(own)
-    return [unit(part + COMMON * common) for part in found]
+            above = np.empty_like(unit_rows)
+            above[owners[:, level]] = vectors[-1][owners[:, level - 1]]
+            unit_rows = unit(unit_rows - (unit_rows * above).sum(axis=1, keepdims=True) * above)
+            unit_rows = cosine * above + (1 - cosine**2) ** 0.5 * unit_rows
+        vectors.append(unit_rows)
+    return [unit(part + COMMON * common) for part in vectors]
 
 
 def unit(rows: np.ndarray) -> np.ndarray:
@@ -224,22 +227,22 @@ def levels_together() -> Iterator[None]:
         yield
 
 
-def without_level_numbers(*arguments: Any, **named: Any) -> Reweighting:
+def without_level_numbers(*arguments: Any, **keywords: Any) -> Reweighting:
     """`reweighting_factors` without levels."""
-    return reweighting_factors(*arguments, **named | {"levels": None})
+    return reweighting_factors(*arguments, **keywords | {"levels": None})
 
 
 def measured(kind: Kind) -> dict[str, Any]:
     """The row of a kind."""
-    made = generate(kind)
-    plain = made.miou(preset="row-sum")
+    scene = generate(kind)
+    row_sum = scene.miou(preset="row-sum")
     with levels_together():
-        together = made.miou()
-    found = made.miou()
-    gains = np.array(found) - plain
-    cells = {"row-sum": plain, "together": together, "default": found}
-    shown = {name: " / ".join(f"{value:.3f}" for value in values) for name, values in cells.items()}
-    return {"scene": f"{kind.name}, seed {kind.seed}", **shown, "gain": gains.mean(), "least": gains.min()}
+        combined = scene.miou()
+    default = scene.miou()
+    gains = np.array(default) - row_sum
+    cells = {"row-sum": row_sum, "together": combined, "default": default}
+    cells_text = {name: " / ".join(f"{value:.3f}" for value in values) for name, values in cells.items()}
+    return {"scene": f"{kind.name}, seed {kind.seed}", **cells_text, "gain": gains.mean(), "least": gains.min()}
 
 
 def main() -> None:
@@ -250,9 +253,9 @@ def main() -> None:
         ("--kinds", {"default": "", "metavar": "TEXT", "help": "rows whose name has it, as 'heap, 22 views'"}),
         ("--seeds", {"nargs": "*", "type": int, "default": (7, 8)}),
     )
-    chosen = parser.parse_args()
-    kinds = [replace(kind, seed=seed) for kind in KINDS if chosen.kinds in kind.name for seed in chosen.seeds]
-    tell((measured(kind) for kind in kinds), as_json=chosen.json)
+    options = parser.parse_args()
+    kinds = [replace(kind, seed=seed) for kind in KINDS if options.kinds in kind.name for seed in options.seeds]
+    print_rows((measured(kind) for kind in kinds), as_json=options.json)
 
 
 if __name__ == "__main__":

@@ -37,11 +37,11 @@ from safetensors.torch import save_file
 from liftcore.raster.cpu.warm_up import warm_up
 from service.commands.demo import Client, serving
 from tests.benchmarks.base import machine
-from tests.benchmarks.scenes import Room, write_bench_room
+from tests.benchmarks.scenes import RoomSpec, write_bench_room
 
 T = TypeVar("T")
 HEALTH_MS, QUERY_SECONDS = 50.0, 2.0  # the most that is promised of an otherwise idle machine
-OTHER = Room(200_000, 60, (640, 480), 32)  # what is lifted meanwhile; it takes a minute or more
+OTHER = RoomSpec(200_000, 60, (640, 480), 32)  # what is lifted meanwhile; it takes a minute or more
 QUESTIONS = 16  # at the same moment
 PAUSE = 0.5  # seconds of a slow client
 HEAD = " HTTP/1.1\r\nHost: 127.0.0.1\r\n"
@@ -62,28 +62,28 @@ def measure(seconds: float, rounds: int, splats: int) -> dict[str, Any]:
         words = iter(_write_words(folder / "words.safetensors", 2 * rounds * QUESTIONS + 1))
         with serving(folder / "data", f"table:{folder / 'words.safetensors'}", folder / "log") as url:
             client = Client(url)
-            large = _upload(client, folder / "large", Room(splats, 4, (640, 480), 512))
+            large = _upload(client, folder / "large", RoomSpec(splats, 4, (640, 480), 512))
             job, _ = client.lift(large, lambda _: None)
             other = _upload(client, folder / "other", OTHER)
             client.get("/query", lift=job["id"], text=next(words))
-            alone = _questions(url, job["id"], words, rounds)
+            idle = _questions(url, job["id"], words, rounds)
             quiet = probe(url, after(seconds / 4))
             stop = threading.Event()
             lifts = threading.Thread(target=_keep_lifting, args=(url, other, stop))
             lifts.start()
             while not any(job["state"] == "running" and job["plan"] for job in client.get("/jobs")["jobs"]):
                 time.sleep(0.05)
-            with slow_clients(url, f"/assets/{large['splats']}/content") as told:
+            with slow_clients(url, f"/assets/{large['splats']}/content") as replies:
                 slow = probe(url, after(seconds))
-            beside = _questions(url, job["id"], words, rounds)
+            loaded = _questions(url, job["id"], words, rounds)
             ran = lifts.is_alive()
             stop.set()
             lifts.join()
             client.close()
         return {
             "healthz_ms": {"quiet": quiet, "beside_slow_clients_and_a_lift": slow},
-            "slow_clients": told,
-            "questions_s": {"splats": splats, "alone": alone, "beside_a_lift": beside},
+            "slow_clients": replies,
+            "questions_s": {"splats": splats, "alone": idle, "beside_a_lift": loaded},
             "lifts_ran": ran,
             "drafts_left": len(list((folder / "data" / "tmp").iterdir())),
         }
@@ -96,7 +96,7 @@ def _write_words(path: Path, number: int) -> list[str]:
     return words
 
 
-def _upload(client: Client, folder: Path, size: Room) -> dict[str, Any]:
+def _upload(client: Client, folder: Path, size: RoomSpec) -> dict[str, Any]:
     """Write a room and upload it; the body of an order of its lift."""
     folder.mkdir()
     splats, cameras, features = (
@@ -118,7 +118,7 @@ def _keep_lifting(url: str, body: dict[str, Any], stop: threading.Event) -> None
 
 def _questions(url: str, lift: str, words: Iterator[str], rounds: int) -> dict[str, Any]:
     """Ask rounds of different questions, those of a round at the same moment; how long they took."""
-    slowest, every, load = [], [], []
+    slowest, seconds, load = [], [], []
     clients = [Client(url) for _ in range(QUESTIONS)]
 
     def ask(client: Client, word: str) -> float:
@@ -130,19 +130,19 @@ def _questions(url: str, lift: str, words: Iterator[str], rounds: int) -> dict[s
         load.append(round(os.getloadavg()[0], 1))
         times = at_once([partial(ask, client, next(words)) for client in clients])
         slowest.append(round(max(times), 2))
-        every += times
+        seconds += times
     for client in clients:
         client.close()
-    return {"median": round(float(np.median(every)), 2), "slowest_of_each_round": slowest, "load": load}
+    return {"median": round(float(np.median(seconds)), 2), "slowest_of_each_round": slowest, "load": load}
 
 
 def at_once(work: Sequence[Callable[[], T]]) -> list[T]:
-    """What each gives, all begun at the same moment in threads of their own."""
+    """Call all functions at the same moment, in threads of their own; return their results."""
     gate = threading.Barrier(len(work))
 
-    def begin(one: Callable[[], T]) -> T:
+    def begin(call: Callable[[], T]) -> T:
         gate.wait()
-        return one()
+        return call()
 
     with ThreadPoolExecutor(len(work)) as pool:
         return list(pool.map(begin, work))
@@ -151,25 +151,25 @@ def at_once(work: Sequence[Callable[[], T]]) -> list[T]:
 def probe(url: str, over: Callable[[], bool]) -> dict[str, Any]:
     """Milliseconds of ``/healthz`` until that is over: of new connections, and (``kept_...``) of one that is kept."""
     times: dict[str, list[float]] = {"": [], "kept_": []}
-    wrong, kept = 0, HTTPConnection("127.0.0.1", urlsplit(url).port, timeout=60)
+    wrong, connection = 0, HTTPConnection("127.0.0.1", urlsplit(url).port, timeout=60)
     while not times[""] or not over():
         fresh = HTTPConnection("127.0.0.1", urlsplit(url).port, timeout=60)
-        for name, client, headers in (("", fresh, {"Connection": "close"}), ("kept_", kept, {})):
-            begun = time.perf_counter()
+        for name, client, headers in (("", fresh, {"Connection": "close"}), ("kept_", connection, {})):
+            start = time.perf_counter()
             client.request("GET", "/healthz", headers=headers)
             answer = client.getresponse()
             answer.read()
             wrong += answer.status != HTTPStatus.OK
-            times[name].append(1e3 * (time.perf_counter() - begun))
+            times[name].append(1e3 * (time.perf_counter() - start))
         fresh.close()
         time.sleep(0.02)
-    kept.close()
-    shown = {
+    connection.close()
+    figures = {
         f"{name}p{rank}": round(float(np.percentile(values, rank)), 1)
         for name, values in times.items()
         for rank in (50, 99)
     }
-    return {"probes": len(times[""]), "wrong": wrong, **shown}
+    return {"probes": len(times[""]), "wrong": wrong, **figures}
 
 
 def after(seconds: float) -> Callable[[], bool]:
@@ -182,12 +182,12 @@ def slow_clients(url: str, path: str, sockets: int = 200, readers: int = 20) -> 
     """Run them in a process of their own; what they tell at their end is in the dict then."""
     command = [sys.executable, "-m", "tests.benchmarks.load", "--slow", str(urlsplit(url).port), path]
     command += [str(sockets), str(readers)]
-    told: dict[str, Any] = {}
+    replies: dict[str, Any] = {}
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None and process.stdout.readline().strip() == "all have come"
-            yield told
-            told.update(json.loads(process.communicate("")[0]))
+            yield replies
+            replies.update(json.loads(process.communicate("")[0]))
         finally:
             process.kill()
 
@@ -235,18 +235,20 @@ def main() -> int:
     parser.add_argument("--rounds", type=int, default=5, help="of 16 questions at once")
     parser.add_argument("--splats", type=int, default=1_000_000, help="of the lift that is asked")
     parser.add_argument("--slow", nargs=4, metavar="N", help="be the slow clients: PORT PATH SOCKETS READERS")
-    given = parser.parse_args()
-    if given.slow:
-        port, path, sockets, readers = given.slow
+    options = parser.parse_args()
+    if options.slow:
+        port, path, sockets, readers = options.slow
         asyncio.run(_be_slow(int(port), path, int(sockets), int(readers)))
         return 0
     warm_up()
     head = machine() | {"load_before": [round(load, 1) for load in os.getloadavg()]}
-    found = measure(given.seconds, given.rounds, given.splats)
-    print(json.dumps(head | found, indent=2))
-    health, asked = found["healthz_ms"]["beside_slow_clients_and_a_lift"], found["questions_s"]["beside_a_lift"]
-    quick = max(health["p99"], health["kept_p99"]) < HEALTH_MS and max(asked["slowest_of_each_round"]) < QUERY_SECONDS
-    return 0 if quick and health["wrong"] == found["drafts_left"] == 0 and found["lifts_ran"] else 1
+    figures = measure(options.seconds, options.rounds, options.splats)
+    print(json.dumps(head | figures, indent=2))
+    health, queries = figures["healthz_ms"]["beside_slow_clients_and_a_lift"], figures["questions_s"]["beside_a_lift"]
+    quick = (
+        max(health["p99"], health["kept_p99"]) < HEALTH_MS and max(queries["slowest_of_each_round"]) < QUERY_SECONDS
+    )
+    return 0 if quick and health["wrong"] == figures["drafts_left"] == 0 and figures["lifts_ran"] else 1
 
 
 if __name__ == "__main__":

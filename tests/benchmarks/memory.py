@@ -1,4 +1,4 @@
-"""What the HTTP process holds in memory, and how soon it answers, under loads that are made to fill it.
+"""Memory and latency of the HTTP process under loads that are made to fill it.
 
     python -m tests.benchmarks.memory [--names N] [--jobs N]
 
@@ -48,12 +48,12 @@ def fill(data: Path, names: int, jobs: int) -> tuple[str, str]:
     ids = {kind: add(store, kind, long) for kind in (AssetKind.SPLATS, AssetKind.CAMERAS, AssetKind.FEATURES)}
     order = JobOrder(ids[AssetKind.SPLATS], ids[AssetKind.CAMERAS], (ids[AssetKind.FEATURES],), {"preset": "row-sum"})
     lift = store.jobs.submit(SERVICE, order)[0]
-    claimed = store.jobs.claim()
-    assert claimed is not None
-    known = {"version": "0", "settings": {}, "encoder": "e", "text_space": "t", "diagnostics": {}, "timings": {}}
+    job = store.jobs.claim()
+    assert job is not None
+    metadata = {"version": "0", "settings": {}, "encoder": "e", "text_space": "t", "diagnostics": {}, "timings": {}}
     with store.files.draft(".safetensors") as draft:
         draft.write_bytes(b"lift")
-        store.lifts.finish(lift, claimed.attempt, FinishedLift(draft, "0" * 64, 1, 1, known | {"views": long}))
+        store.lifts.finish(lift, job.attempt, FinishedLift(draft, "0" * 64, 1, 1, metadata | {"views": long}))
     with store.database.write() as connection:
         connection.execute(
             "INSERT INTO jobs (id, kind, state, attempt, splats, cameras, settings, created, ended)"
@@ -74,12 +74,12 @@ def add(store: Store, kind: AssetKind, names: list[str]) -> str:
         return store.assets.add(SERVICE, upload)[0].id
 
 
-def many(count: int, ask: Callable[[httpx.Client, int], object]) -> Load:
+def parallel_load(count: int, ask: Callable[[httpx.Client, int], object]) -> Load:
     """So many clients that ask and read at the same moment, each twice."""
 
     def run(url: str) -> None:
-        with ExitStack() as opened:
-            clients = [opened.enter_context(httpx.Client(base_url=url, timeout=600)) for _ in range(count)]
+        with ExitStack() as stack:
+            clients = [stack.enter_context(httpx.Client(base_url=url, timeout=600)) for _ in range(count)]
 
             def twice(number: int) -> None:
                 for _ in range(2):
@@ -94,9 +94,9 @@ def never_read(paths: tuple[str, ...], count: int = 80, seconds: float = 20.0, p
     """So many clients that ask again and again over their connection and read nothing."""
 
     def run(url: str) -> None:
-        with ExitStack() as opened:
+        with ExitStack() as stack:
             for number in range(count):
-                client = opened.enter_context(socket.socket())
+                client = stack.enter_context(socket.socket())
                 client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
                 client.connect(("127.0.0.1", urlsplit(url).port or 80))
                 path = paths[number % len(paths)]
@@ -132,14 +132,16 @@ def loads(asset: str, lift: str) -> dict[str, Load]:
     scores = f"/query/scores?like=splat:0&lift={lift.removeprefix('/lifts/')}"
     return {
         "nothing": lambda url: time.sleep(5),
-        "40 at once: GET /assets/ID": many(40, lambda client, _: client.get(asset)),
-        "40 at once: pages of its names": many(40, lambda client, n: client.get(f"{asset}/names?cursor={n}000")),
-        "40 at once: GET /lifts/ID and /lifts": many(40, lambda ask, _: (ask.get(lift), ask.get("/lifts"))),
+        "40 at once: GET /assets/ID": parallel_load(40, lambda client, _: client.get(asset)),
+        "40 at once: pages of its names": parallel_load(
+            40, lambda client, n: client.get(f"{asset}/names?cursor={n}000")
+        ),
+        "40 at once: GET /lifts/ID and /lifts": parallel_load(40, lambda ask, _: (ask.get(lift), ask.get("/lifts"))),
         "80 clients that do not read": never_read(("/jobs", asset, f"{asset}/names", lift, "/lifts")),
         "80 that do not read 32 MB of scores": never_read((scores,), pipelined=1),
-        "32 orders with settings of 1 MB": many(32, of_a_megabyte),
-        "8 at once: wrong and large bodies": many(8, wrong_and_large),
-        "8 at once: GET /jobs whole": many(8, lambda client, _: client.get("/jobs")),
+        "32 orders with settings of 1 MB": parallel_load(32, of_a_megabyte),
+        "8 at once: wrong and large bodies": parallel_load(8, wrong_and_large),
+        "8 at once: GET /jobs whole": parallel_load(8, lambda client, _: client.get("/jobs")),
     }
 
 
@@ -149,9 +151,9 @@ def measure(data: Path, load: Load) -> tuple[float, dict[str, float]]:
         url = str(service.client.base_url)
         clients = multiprocessing.get_context("fork").Process(target=load, args=(url,))  # beside who probes
         clients.start()
-        found = probe(url, lambda: not clients.is_alive())
+        latencies = probe(url, lambda: not clients.is_alive())
         clients.join()
-        return high_water(service.pid), found
+        return high_water(service.pid), latencies
 
 
 def high_water(pid: int) -> float:
@@ -165,17 +167,17 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.memory", description=__doc__)
     parser.add_argument("--names", type=int, default=99_999, help="long names of views")
     parser.add_argument("--jobs", type=int, default=50_000, help="that have ended")
-    given = parser.parse_args()
+    options = parser.parse_args()
     print(f"{', '.join(machine().values())}, load {os.getloadavg()[0]:.1f}\n")
     print("| load | MB at most | /healthz p50 ms | p99 ms | probes |\n|---|---|---|---|---|")
-    kept = True
+    passed = True
     with tempfile.TemporaryDirectory() as folder:
         data = Path(folder) / "data"
-        for name, load in loads(*fill(data, given.names, given.jobs)).items():
-            held, found = measure(data, load)
-            print(f"| {name} | {held:.0f} | {found['p50']} | {found['p99']} | {found['probes']} |", flush=True)
-            kept = kept and held < LIMIT_MB and found["p99"] < HEALTH_MS and not found["wrong"]
-    return 0 if kept else 1
+        for name, load in loads(*fill(data, options.names, options.jobs)).items():
+            peak, figures = measure(data, load)
+            print(f"| {name} | {peak:.0f} | {figures['p50']} | {figures['p99']} | {figures['probes']} |", flush=True)
+            passed = passed and peak < LIMIT_MB and figures["p99"] < HEALTH_MS and not figures["wrong"]
+    return 0 if passed else 1
 
 
 if __name__ == "__main__":

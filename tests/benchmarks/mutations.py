@@ -74,12 +74,12 @@ class Server:
     @property
     def python(self) -> str:
         """The interpreter that has the checkout's packages."""
-        own = self.root / ".venv/bin/python"
-        return str(own) if own.exists() else sys.executable
+        interpreter = self.root / ".venv/bin/python"
+        return str(interpreter) if interpreter.exists() else sys.executable
 
     @property
     def log(self) -> Path:
-        """What it says on its standard error."""
+        """Return the text of its standard error."""
         return self.data.with_name(f"{self.data.name}.log")
 
     def client(self, **headers: str) -> httpx.Client:
@@ -87,7 +87,7 @@ class Server:
         return httpx.Client(base_url=self.url, timeout=600, headers=headers)
 
     def tracebacks(self) -> int:
-        """How many the log has."""
+        """Count the tracebacks in the log."""
         return self.log.read_text(errors="replace").count("Traceback (most recent call last)")
 
     def left_over(self) -> list[str]:
@@ -95,37 +95,37 @@ class Server:
         return sorted(path.name for path in (self.data / "tmp").iterdir())
 
 
-def mutated(content: bytes, chance: random.Random, others: list[bytes]) -> bytes:
+def mutate_bytes(content: bytes, chance: random.Random, donors: list[bytes]) -> bytes:
     """Bytes changed in one to three places: flipped, overwritten, cut, doubled, cut off, spliced, or a number in
     digits put in place of another."""
-    changed = bytearray(content)
+    output = bytearray(content)
     for _ in range(chance.randint(1, 3)):
-        place = chance.randrange(len(changed) // chance.choice((1, 8)) + 1)  # headers are at the beginning
+        place = chance.randrange(len(output) // chance.choice((1, 8)) + 1)  # headers are at the beginning
         length = chance.choice((1, 4, 8, 64, 1024))
         match chance.randrange(8):
             case 0:
                 for _ in range(chance.choice((1, 8, 64))):
-                    at = chance.randrange(max(1, len(changed)))
-                    changed[at : at + 1] = bytes([chance.randrange(256)])
+                    at = chance.randrange(max(1, len(output)))
+                    output[at : at + 1] = bytes([chance.randrange(256)])
             case 1:
-                changed[place : place + length] = bytes([chance.choice((0, 255, 127, 128))]) * length
+                output[place : place + length] = bytes([chance.choice((0, 255, 127, 128))]) * length
             case 2:
-                del changed[place : place + length]
+                del output[place : place + length]
             case 3:
-                changed[place:place] = changed[place : place + length]
+                output[place:place] = output[place : place + length]
             case 4:
-                del changed[place:]
+                del output[place:]
             case 5:
-                other = chance.choice(others)
-                changed[place : place + length] = other[place : place + length]
+                other = chance.choice(donors)
+                output[place : place + length] = other[place : place + length]
             case 6:
-                changed += chance.randbytes(length)
+                output += chance.randbytes(length)
             case 7:
-                digits = [at for at, byte in enumerate(changed[:65536]) if 48 <= byte < 58]
+                digits = [at for at, byte in enumerate(output[:65536]) if 48 <= byte < 58]
                 if digits:
                     at = chance.choice(digits)
-                    changed[at : at + 1] = chance.choice(EXTREMES)
-    return bytes(changed)
+                    output[at : at + 1] = chance.choice(EXTREMES)
+    return bytes(output)
 
 
 def valid_files() -> list[tuple[str, bytes]]:
@@ -143,26 +143,26 @@ def valid_files() -> list[tuple[str, bytes]]:
 
 def upload_loop(root: Path, count: int, seed: int) -> dict[str, Any]:
     """Upload changed files of every kind; what was answered."""
-    files, found, slowest = valid_files(), Tally(), 0.0
+    files, tally, slowest = valid_files(), Tally(), 0.0
     with tempfile.TemporaryDirectory() as folder, Server(root, Path(folder) / "data").running() as server:
 
         def send(number: int) -> float:
             chance = random.Random(f"upload {seed} {number}")
             kind, content = files[number % len(files)]
-            body = mutated(content, chance, [other for _, other in files])
-            begun = time.monotonic()
+            body = mutate_bytes(content, chance, [other for _, other in files])
+            start = time.monotonic()
             reply = client.put(f"/assets/{kind}", content=body)
-            found.add(f"{kind} {number}", reply)
-            return time.monotonic() - begun
+            tally.add(f"{kind} {number}", reply)
+            return time.monotonic() - start
 
         with server.client() as client, ThreadPoolExecutor(CLIENTS) as pool:
             slowest = max(pool.map(send, range(count)))
             ready = client.get("/readyz").status_code
-        left = server.left_over()
-        return found.figures() | {
+        remaining = server.left_over()
+        return tally.figures() | {
             "slowest_seconds": round(slowest, 1),
             "ready": ready,
-            "left_over": left,
+            "left_over": remaining,
             "tracebacks": server.tracebacks(),
         }
 
@@ -174,15 +174,15 @@ class Tally:
     statuses: Counter[str] = field(default_factory=Counter)
     broken: list[str] = field(default_factory=list)
 
-    def add(self, what: str, reply: Any) -> None:
+    def add(self, label: str, reply: Any) -> None:
         """Count an answer of httpx, or the raw one of `exchange`."""
         status, kind = reply.status_code, reply.headers.get("content-type", "")
         self.statuses[str(status)] += 1
         framed = status == HTTPStatus.BAD_REQUEST and kind.startswith("text/plain")  # uvicorn's, for what is no HTTP
         if status >= HTTPStatus.INTERNAL_SERVER_ERROR:
-            self.broken.append(f"{what}: {status} {reply.text[:300]}")
+            self.broken.append(f"{label}: {status} {reply.text[:300]}")
         elif status >= HTTPStatus.BAD_REQUEST and kind != "application/problem+json" and not framed:
-            self.broken.append(f"{what}: {status} as {kind}")
+            self.broken.append(f"{label}: {status} as {kind}")
 
     def figures(self) -> dict[str, Any]:
         """Both."""
@@ -201,16 +201,16 @@ class Request:
 
 
 def valid_requests(lift: str, assets: dict[str, Any]) -> list[Request]:
-    """What a client of a lift asks; nothing of it takes anything away that is asked later."""
-    asked = {"lift": lift, "text": "apple"}
+    """List requests of a client of a lift; none deletes what a later one needs."""
+    query = {"lift": lift, "text": "apple"}
     order = assets | {"settings": {"preset": "row-sum", "seed": 3, "objects": True}}
     camera = {"width": 16, "height": 12, "fx": 12.0, "fy": 12.0, "cx": 8.0, "cy": 6.0, "viewmat": tiny_scene.POSE}
     words = {"lift": lift, "words": ["apple", "book"]}
     reads = [
-        ("/query", asked | {"top": 3, "threshold": "auto"}), ("/query/objects", asked | {"like": "middle:16,12"}),
-        ("/query/mask", asked | {"view": "left"}), ("/query/scores", asked), ("/query/selection", asked),
-        ("/query/attention", asked | {"view": "left", "unlike": "splat:1"}),
-        ("/query/splats", asked | {"what": "scores"}),
+        ("/query", query | {"top": 3, "threshold": "auto"}), ("/query/objects", query | {"like": "middle:16,12"}),
+        ("/query/mask", query | {"view": "left"}), ("/query/scores", query), ("/query/selection", query),
+        ("/query/attention", query | {"view": "left", "unlike": "splat:1"}),
+        ("/query/splats", query | {"what": "scores"}),
         ("/render", {"lift": lift, "view": "left", "what": "rgb"}), ("/lifts", {"limit": 2}), (f"/lifts/{lift}", {}),
         (f"/lifts/{lift}/features", {}), (f"/lifts/{lift}/splats", {}), (f"/lifts/{lift}/colours", {"what": "pca"}),
         (f"/lifts/{lift}/views", {}), (f"/lifts/{lift}/regions", {"view": "left", "x": 3, "y": 4}),
@@ -220,9 +220,9 @@ def valid_requests(lift: str, assets: dict[str, Any]) -> list[Request]:
         (f"/jobs/{lift}/events", {}), ("/healthz", {}), ("/version", {}), ("/openapi.json", {}), ("/", {}),
     ]  # fmt: skip
     bodies = [
-        ("/query", asked | {"text": ["apple"], "like": [[1.0] + [0.0] * 7]}),
-        ("/query/mask", asked | {"text": ["apple"], "camera": camera}),
-        ("/query/objects", asked | {"text": ["apple", "book"]}), ("/query/segment", words),
+        ("/query", query | {"text": ["apple"], "like": [[1.0] + [0.0] * 7]}),
+        ("/query/mask", query | {"text": ["apple"], "camera": camera}),
+        ("/query/objects", query | {"text": ["apple", "book"]}), ("/query/segment", words),
         ("/query/segment/labels", words), ("/query/segment/map", words | {"view": "left"}),
         ("/query/what", {"lift": lift, "example": "middle:16,12", "top": 2}),
         ("/render", {"lift": lift, "camera": camera, "what": "depth"}),
@@ -231,7 +231,9 @@ def valid_requests(lift: str, assets: dict[str, Any]) -> list[Request]:
     requests = [Request("GET", path, parameters) for path, parameters in reads]
     requests += [Request("POST", path, body=body) for path, body in bodies]
     requests += [replace(requests[10], headers={"Range": "bytes=0-9", "If-None-Match": '"x"'})]
-    requests += [replace(one, headers={"Idempotency-Key": one.path, "Last-Event-ID": "1"}) for one in requests[-4:-1]]
+    requests += [
+        replace(item, headers={"Idempotency-Key": item.path, "Last-Event-ID": "1"}) for item in requests[-4:-1]
+    ]
     return [
         *requests,
         Request("PATCH", f"/lifts/{lift}", body={"name": "a name"}),
@@ -241,7 +243,7 @@ def valid_requests(lift: str, assets: dict[str, Any]) -> list[Request]:
     ]  # fmt: skip
 
 
-def changed(request: Request, chance: random.Random) -> Request:
+def change_request(request: Request, chance: random.Random) -> Request:
     """A request with something odd in one of its parts, mostly in what it asks."""
     parts = ["headers", "path", *["parameter", "parameter", "names"] * bool(request.parameters)]
     parts += ["body"] * 4 if request.body is not None else []
@@ -254,9 +256,9 @@ def changed(request: Request, chance: random.Random) -> Request:
             odd = chance.choice((value[:at] + chance.choice(CHARACTERS) + value[at:], chance.choice(CHARACTERS)))
             return replace(request, parameters=request.parameters | {name: odd})
         case "names":
-            gone = chance.choice(names)
-            kept = {name: request.parameters[name] for name in names if name != gone}
-            return replace(request, parameters=kept | {chance.choice(["odd", "lift", "view", "q"]): "1"})
+            removed_name = chance.choice(names)
+            parameters = {name: request.parameters[name] for name in names if name != removed_name}
+            return replace(request, parameters=parameters | {chance.choice(["odd", "lift", "view", "q"]): "1"})
         case "body":
             return replace(request, body=_odd_somewhere(request.body, chance))
         case "headers":
@@ -270,7 +272,7 @@ def _odd_somewhere(value: Any, chance: random.Random) -> Any:
     if isinstance(value, dict) and value and chance.random() < 0.9:
         name = chance.choice([*value])
         if chance.random() < 0.15:
-            return {key: one for key, one in value.items() if key != name}
+            return {key: item for key, item in value.items() if key != name}
         if chance.random() < 0.15:
             return value | {chance.choice(["odd", name.upper(), "settings"]): chance.choice(ODD)}
         return value | {name: _odd_somewhere(value[name], chance)}
@@ -287,7 +289,7 @@ class RawReply:
         body = b"" if request.body is None else json.dumps(request.body).encode()
         headers = {"Content-Type": "application/json"} | request.headers if body else dict(request.headers)
         if body and chance.random() < 0.1:
-            body = mutated(body, chance, [body])
+            body = mutate_bytes(body, chance, [body])
         target = request.path + (f"?{urlencode(request.parameters, errors='replace')}" if request.parameters else "")
         connection = http.client.HTTPConnection(url.host, url.port or 80, timeout=600)
         lines = [f"{request.method} {target} HTTP/1.1", f"Host: {url.host}", "Connection: close"]
@@ -295,7 +297,7 @@ class RawReply:
         lines += [f"{name}: {value}" for name, value in headers.items()]
         head = "\r\n".join(lines).encode("utf-8", "replace")
         if waits := chance.random() < 0.05:
-            head = mutated(head, chance, [head])
+            head = mutate_bytes(head, chance, [head])
         connection.connect()
         connection.sock.sendall(head + b"\r\n\r\n" + body)
         connection.sock.settimeout(WAITING_SECONDS if waits else 600)
@@ -321,14 +323,14 @@ def lifted(client: httpx.Client) -> tuple[str, dict[str, Any]]:
 
 def until_ended(client: httpx.Client, job: str) -> dict[str, Any]:
     """The job once it has ended."""
-    while (found := client.get(f"/jobs/{job}").json())["state"] not in FINAL_STATES:
+    while (state := client.get(f"/jobs/{job}").json())["state"] not in FINAL_STATES:
         time.sleep(0.02)
-    return found
+    return state
 
 
 def request_loop(root: Path, count: int, seed: int) -> dict[str, Any]:
     """Send changed requests of every route; what was answered. Jobs that come of it are canceled."""
-    found = Tally()
+    tally = Tally()
     with tempfile.TemporaryDirectory() as folder:
         table = Path(folder) / "table.safetensors"
         table.write_bytes(tiny_scene.make_scene().table)
@@ -345,14 +347,14 @@ def request_loop(root: Path, count: int, seed: int) -> dict[str, Any]:
                     chance = random.Random(f"request {seed} {number}")
                     request = requests[number % len(requests)]
                     for _ in range(chance.randint(1, 2)):
-                        request = changed(request, chance)
-                    what = f"{number}: {request.method} {request.path[:80]} {str(request.parameters)[:120]}"
+                        request = change_request(request, chance)
+                    label = f"{number}: {request.method} {request.path[:80]} {str(request.parameters)[:120]}"
                     try:
-                        found.add(what, RawReply(client.base_url, request, chance))
+                        tally.add(label, RawReply(client.base_url, request, chance))
                     except TimeoutError:
-                        found.statuses["waits for the rest"] += 1
+                        tally.statuses["waits for the rest"] += 1
                     except (OSError, http.client.HTTPException) as error:
-                        found.broken.append(f"{what}: {error!r}")
+                        tally.broken.append(f"{label}: {error!r}")
                     if number % 50 == 0:
                         _cancel_all(client)
 
@@ -361,7 +363,7 @@ def request_loop(root: Path, count: int, seed: int) -> dict[str, Any]:
                 ready = client.get("/readyz").status_code
             tracebacks = server.tracebacks()
     unchanged = {"unchanged": dict(valid.statuses), "broken_unchanged": valid.broken}
-    return found.figures() | unchanged | {"ready": ready, "tracebacks": tracebacks}
+    return tally.figures() | unchanged | {"ready": ready, "tracebacks": tracebacks}
 
 
 class _Never(random.Random):
@@ -385,7 +387,7 @@ def key_loop(root: Path, count: int, seed: int) -> dict[str, Any]:
         ("PUT", "/assets/table", "write"), ("DELETE", f"/jobs/{'0' * 32}", "write"), ("GET", "/metrics", "metrics"),
         ("PATCH", f"/lifts/{'0' * 32}", "write"), ("GET", "/nowhere", "read"), ("POST", "/query", "read"),
     )  # fmt: skip
-    found, wrong = Tally(), []
+    tally, wrong = Tally(), []
     with tempfile.TemporaryDirectory() as folder:
         server = Server(root, Path(folder) / "data")
         keys = {scope: _new_key(server, scope) for scope in ("read", "write", "metrics", "admin")}
@@ -399,15 +401,15 @@ def key_loop(root: Path, count: int, seed: int) -> dict[str, Any]:
 
             def send(number: int) -> None:
                 chance = random.Random(f"key {seed} {number}")
-                method, path, needed = routes[number % len(routes)]
+                method, path, required_scope = routes[number % len(routes)]
                 headers, scope = _credentials(chance, keys, [revoked["key"], rotated["key"], expired["key"]])
                 if chance.random() < 0.1:
                     path += f"{'&' if '?' in path else '?'}key={keys['admin']['key']}"
                 reply = client.request(method, path, headers=headers, content=b"" if method != "GET" else None)
-                found.add(f"{method} {path}", reply)
-                allowed = scope in (needed, "admin")
+                tally.add(f"{method} {path}", reply)
+                is_allowed = scope in (required_scope, "admin")
                 as_promised = (
-                    reply.status_code not in (401, 403) if allowed
+                    reply.status_code not in (401, 403) if is_allowed
                     else reply.status_code == (401 if scope is None else 403)
                 )  # fmt: skip
                 if not as_promised:
@@ -416,16 +418,16 @@ def key_loop(root: Path, count: int, seed: int) -> dict[str, Any]:
             with ThreadPoolExecutor(CLIENTS) as pool:
                 list(pool.map(send, range(count)))
             with server.client(Authorization=f"Bearer {keys['admin']['key']}") as boss:
-                made = sum(len(boss.get(f"/{name}").json()[name]) for name in ("jobs", "assets"))
+                row_count = sum(len(boss.get(f"/{name}").json()[name]) for name in ("jobs", "assets"))
         secrets = [key["key"] for key in (*keys.values(), revoked, rotated, expired)]
         files = [server.log, *(path for path in server.data.rglob("*") if path.is_file())]
         leaked = sum(secret.encode() in path.read_bytes() for path in files for secret in secrets)
         tracebacks = server.tracebacks()
-    return found.figures() | {"wrong": wrong, "made": made, "secrets_in_files": leaked, "tracebacks": tracebacks}
+    return tally.figures() | {"wrong": wrong, "made": row_count, "secrets_in_files": leaked, "tracebacks": tracebacks}
 
 
 def _credentials(
-    chance: random.Random, keys: dict[str, dict[str, str]], ended: list[str]
+    chance: random.Random, keys: dict[str, dict[str, str]], final: list[str]
 ) -> tuple[list[tuple[str, str]], str | None]:
     """Headers, and the scope that they bring; None where they bring none."""
     scope = chance.choice([*keys])
@@ -434,7 +436,7 @@ def _credentials(
     other = chr((ord(secret[at]) - 32) % 90 + 33)
     bad: list[Callable[[], list[str]]] = [
         list, lambda: [f"Bearer {secret[:at]}{other}{secret[at + 1:]}"], lambda: [f"Bearer {secret[:at]}"],
-        lambda: [f"Bearer {chance.choice(ended)}"], lambda: [f"Basic {secret}"], lambda: [secret], lambda: ["Bearer"],
+        lambda: [f"Bearer {chance.choice(final)}"], lambda: [f"Basic {secret}"], lambda: [secret], lambda: ["Bearer"],
         lambda: [f"Bearer {secret} {secret}"], lambda: [f"Bearer {secret}", f"Bearer {secret}"],
         lambda: [f"Bearer {chance.randbytes(32).hex()}"], lambda: [f"Bearer {secret.swapcase()}"],
         lambda: [f"Bearer {secret}{other}"], lambda: ["Bearer " + "a" * 5000],
@@ -444,13 +446,13 @@ def _credentials(
     return [("Authorization", value) for value in chance.choice(bad)()], None
 
 
-def _command(server: Server, action: str, *more: str) -> dict[str, Any]:
-    command = [server.python, "-m", "liftcore.cli", "keys", action, "--json", "--data", str(server.data), *more]
+def _command(server: Server, action: str, *options: str) -> dict[str, Any]:
+    command = [server.python, "-m", "liftcore.cli", "keys", action, "--json", "--data", str(server.data), *options]
     return json.loads(subprocess.run(command, cwd=server.root, capture_output=True, check=True).stdout)
 
 
-def _new_key(server: Server, scopes: str, *more: str) -> dict[str, Any]:
-    return _command(server, "create", "--name", f"{scopes}-{time.monotonic_ns()}", "--scopes", scopes, *more)
+def _new_key(server: Server, scopes: str, *options: str) -> dict[str, Any]:
+    return _command(server, "create", "--name", f"{scopes}-{time.monotonic_ns()}", "--scopes", scopes, *options)
 
 
 def cancel_loop(root: Path, count: int, seed: int) -> dict[str, Any]:
@@ -462,38 +464,38 @@ def cancel_loop(root: Path, count: int, seed: int) -> dict[str, Any]:
         with Server(root, Path(folder) / "data").running() as server, server.client() as client:
             ids = {kind: client.put(f"/assets/{kind}", content=body).json()["id"] for kind, body in files.items()}
             body = ids | {"features": [ids["features"]]}
-            begun = time.monotonic()
+            start = time.monotonic()
             until_ended(client, client.post("/lift", json=body | {"settings": {"seed": 1}}).json()["id"])
-            whole = time.monotonic() - begun
+            total = time.monotonic() - start
             jobs = []
             while len(seconds) < count:
                 number = len(jobs) + 2
                 jobs.append(
                     client.post("/lift", json=body | {"settings": {"seed": number}}).raise_for_status().json()["id"]
                 )
-                time.sleep(chance.uniform(0, whole))
+                time.sleep(chance.uniform(0, total))
                 now = client.get(f"/jobs/{jobs[-1]}").json()
                 stage = now["state"] if now["progress"] is None else now["progress"]["stage"]
-                begun = time.monotonic()
+                start = time.monotonic()
                 reply = client.post(f"/jobs/{jobs[-1]}/cancel")
-                ended = until_ended(client, jobs[-1])
-                if ended["state"] == "succeeded":  # before the cancel, which was refused then, or had nothing to end
+                final = until_ended(client, jobs[-1])
+                if final["state"] == "succeeded":  # before the cancel, which was refused then, or had nothing to end
                     figures["succeeded"] += 1
                     continue
                 assert reply.is_success, reply.text
-                seconds.append(time.monotonic() - begun)
+                seconds.append(time.monotonic() - start)
                 figures["processes_left"] += len(processes_of(jobs[-1]))
-                figures[ended["state"]] += 1
+                figures[final["state"]] += 1
                 figures["late"] += seconds[-1] > CANCEL_SECONDS
                 stages[stage] += 1
             figures["changed_later"] = sum(
                 client.get(f"/lifts/{job}").is_success != (client.get(f"/jobs/{job}").json()["state"] == "succeeded")
                 for job in jobs
             )
-            left = server.left_over()
+            remaining = server.left_over()
         tracebacks = server.tracebacks()
-    taken = {"median_seconds": round(float(np.median(seconds)), 2), "longest_seconds": round(max(seconds), 2)}
-    return {"canceled_while": stages, **figures, **taken, "left_over": left, "tracebacks": tracebacks}
+    durations = {"median_seconds": round(float(np.median(seconds)), 2), "longest_seconds": round(max(seconds), 2)}
+    return {"canceled_while": stages, **figures, **durations, "left_over": remaining, "tracebacks": tracebacks}
 
 
 LOOPS: dict[str, tuple[int, Callable[[Path, int, int], dict[str, Any]]]] = {
@@ -517,11 +519,11 @@ def main() -> int:
     figures: dict[str, Any] = {**machine()}
     for name, (_, loop) in LOOPS.items():
         if count := getattr(options, name):
-            begun = time.monotonic()
+            start = time.monotonic()
             figures[name] = loop(options.root, count, options.seed)
-            figures[name]["seconds"] = round(time.monotonic() - begun)
+            figures[name]["seconds"] = round(time.monotonic() - start)
     print(json.dumps(figures, indent=2))
-    return int(any(figures[name].get(what) for name in LOOPS if name in figures for what in BROKEN))
+    return int(any(figures[name].get(fault) for name in LOOPS if name in figures for fault in BROKEN))
 
 
 if __name__ == "__main__":

@@ -28,75 +28,80 @@ from liftcore.query.question import Answer
 from liftcore.query.scene import Scene
 from liftcore.solve.clusters import cluster_splats
 from liftcore.text import open_encoder
-from tests.benchmarks.base import PACKS, PRESETS, box_iou, command_line, read_pack, tell
+from tests.benchmarks.base import PACKS, PRESETS, box_iou, command_line, print_rows, read_pack
 from tests.benchmarks.tabletop import Truth, tabletop
 
-FOUND = 0.75  # IoU of splats
+FOUND_IOU = 0.75  # IoU of splats
 CLOTHS = ("tablecloth", "curtain")  # what the things stand on and before
 
 
 def measure_lift(scene: Scene, answers: dict[int, Answer], owners: np.ndarray) -> dict[str, Any]:
     """The figures of one lift: answers by a thing's number, owners [P] int, the thing of each splat."""
     boxes, pairs = measure_boxes(scene, answers, owners), list(combinations(answers, 2))
-    apart = sum(_are_two(scene, {thing: answers[thing] for thing in pair}, owners) for pair in pairs)
-    return {**boxes, "pairs": len(pairs), "apart": apart}
+    separate = sum(_are_two(scene, {number: answers[number] for number in pair}, owners) for pair in pairs)
+    return {**boxes, "pairs": len(pairs), "apart": separate}
 
 
 def measure_boxes(scene: Scene, answers: dict[int, Answer], owners: np.ndarray) -> dict[str, Any]:
     """The same without pairs."""
-    means, ious, of_all, middles, alone = scene.splats.means.numpy(), [], [], [], 0
-    for thing, answer in answers.items():
-        true = _bounds(means[owners == thing])
-        found = objects(scene, answer).found
-        alone += len(found) == 1
-        box = np.array(found[0].box) if found else np.zeros((2, 3))
+    means, ious, of_all, middles, single_count = scene.splats.means.numpy(), [], [], [], 0
+    for number, answer in answers.items():
+        true = _bounds(means[owners == number])
+        selected_objects = objects(scene, answer).found
+        single_count += len(selected_objects) == 1
+        box = np.array(selected_objects[0].box) if selected_objects else np.zeros((2, 3))
         ious.append(box_iou(box, true))
-        of_all.append(box_iou(_bounds(means[answer.selected]), true) if found else 0.0)
+        of_all.append(box_iou(_bounds(means[answer.selected]), true) if selected_objects else 0.0)
         middles.append(np.linalg.norm(box.mean(axis=0) - true.mean(axis=0)) / np.linalg.norm(true[1] - true[0]))
     return {
-        "things": len(answers), "one": alone, "box": float(np.mean(ious)), "worst": float(np.min(ious)),
+        "things": len(answers), "one": single_count, "box": float(np.mean(ious)), "worst": float(np.min(ious)),
         "all": float(np.mean(of_all)), "middle": float(np.mean(middles)),
     }  # fmt: skip
 
 
 def _are_two(scene: Scene, answers: dict[int, Answer], owners: np.ndarray) -> bool:
-    """Whether the splats of two answers make exactly two objects, most of one's splats of each thing."""
+    """Return True if the splats of two answers form exactly two objects, one for each labelled object."""
     first, second = answers.values()
-    either, told = first.selected | second.selected, first.model_dump(exclude={"text", "like", "count", "top", "box"})
-    both = objects(scene, Answer.of(first.query, first.scores, first.seen, either, **told))
-    most = {int(np.bincount(owners[both.numbers == number]).argmax()) for number in range(len(both.found))}
-    return len(both.found) == 2 and most == set(answers)
+    union, fields = (
+        first.selected | second.selected,
+        first.model_dump(exclude={"text", "like", "count", "top", "box"}),
+    )
+    grouped = objects(scene, Answer.of(first.query, first.scores, first.seen, union, **fields))
+    majorities = {
+        int(np.bincount(owners[grouped.numbers == number]).argmax()) for number in range(len(grouped.found))
+    }
+    return len(grouped.found) == 2 and majorities == set(answers)
 
 
 def _bounds(means: np.ndarray) -> np.ndarray:
     return np.stack([means.min(axis=0), means.max(axis=0)]).astype(np.float64)
 
 
-def best_ious(labels: np.ndarray, owners: np.ndarray, things: Iterable[int]) -> np.ndarray:
+def best_ious(labels: np.ndarray, owners: np.ndarray, object_numbers: Iterable[int]) -> np.ndarray:
     """Of each thing the best IoU of its splats with those of one label: labels, owners [n] int, -1 for none."""
     table = np.zeros((owners.max() + 1, labels.max() + 2))
     np.add.at(table, (owners, labels + 1), 1)
     unions = table.sum(axis=1, keepdims=True) + table.sum(axis=0) - table
-    return (table / np.maximum(unions, 1))[list(things), 1:].max(axis=1, initial=0.0)
+    return (table / np.maximum(unions, 1))[list(object_numbers), 1:].max(axis=1, initial=0.0)
 
 
 def rows_without_words(folder: Path, packs: Iterable[str], strides: Iterable[int]) -> Iterator[dict[str, Any]]:
     """Two rows a lift of the preset default: the objects that it holds, and HDBSCAN's clusters of its features."""
     truth = tabletop(folder)
-    things, owners = things_of(truth), truth.objects.numpy()[truth.counted.numpy()].astype(np.int64)
+    object_numbers, owners = things_of(truth), truth.objects.numpy()[truth.evaluated.numpy()].astype(np.int64)
     for pack, stride in product(packs, strides):
-        made = truth.lift(read_pack(folder, pack, stride), preset="default")
-        assert made.object is not None
+        lifted = truth.lift(read_pack(folder, pack, stride), preset="default")
+        assert lifted.object is not None
         start = time.perf_counter()
-        clusters = cluster_splats(made.features, made.total_weight.numpy(), made.settings).labels
-        spent = {"objects": made.metadata.timings["objects"], "HDBSCAN": time.perf_counter() - start}
-        for by, labels in (("objects", made.object), ("HDBSCAN", clusters)):
-            own = labels.numpy()[truth.counted.numpy()]
-            ious = best_ious(own, owners, things)
+        clusters = cluster_splats(lifted.features, lifted.total_weight.numpy(), lifted.settings).labels
+        seconds_by_method = {"objects": lifted.metadata.timings["objects"], "HDBSCAN": time.perf_counter() - start}
+        for by, labels in (("objects", lifted.object), ("HDBSCAN", clusters)):
+            truth_labels = labels.numpy()[truth.evaluated.numpy()]
+            ious = best_ious(truth_labels, owners, object_numbers)
             yield {
-                "features": pack, "views": len(made.views), "by": by, "found": int((ious > FOUND).sum()),
+                "features": pack, "views": len(lifted.views), "by": by, "found": int((ious > FOUND_IOU).sum()),
                 "mean": float(ious.mean()), "worst": float(ious.min()), "all": int(labels.max()) + 1,
-                "seconds": spent[by], "of": sum(made.metadata.timings.values()),
+                "seconds": seconds_by_method[by], "of": sum(lifted.metadata.timings.values()),
             }  # fmt: skip
 
 
@@ -104,8 +109,8 @@ def rows_of(folder: Path, packs: Iterable[str], presets: Iterable[str]) -> Itera
     """One row a lift of the tabletop scene."""
     truth, encoder = tabletop(folder), open_encoder(f"table:{folder / 'text_table.safetensors'}")
     for pack, preset in product(packs, presets):
-        scene = truth.opened(truth.lift(read_pack(folder, pack), preset=preset))
-        answers = {thing: ask(scene, truth.words[thing], encoder) for thing in things_of(truth)}
+        scene = truth.open_scene(truth.lift(read_pack(folder, pack), preset=preset))
+        answers = {number: ask(scene, truth.words[number], encoder) for number in things_of(truth)}
         yield {"features": pack, "preset": preset, **measure_lift(scene, answers, truth.objects.numpy())}
 
 
@@ -131,7 +136,7 @@ def main() -> None:
         rows = rows_without_words(options.folder, packs, options.strides)
     else:
         rows = rows_of(options.folder, options.features, options.presets)
-    tell(rows, as_json=options.json)
+    print_rows(rows, as_json=options.json)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What a browser waits for on the page: the first picture, the script of moving the cut, and the whole journey.
+"""Waiting times of a browser on the page: the first picture, the script of moving the cut, and the whole journey.
 
 ``python -m tests.benchmarks.page [--shared DIR]`` prints seconds until the first picture, which the service makes,
 and until the splats are drawn, by software here: of the tiny scene and of a room of 180,000 splats (plush of the
@@ -24,12 +24,12 @@ from tests.api.tiny_scene import PROPERTIES, cameras_json, make_scene, ply
 from tests.browser.conftest import browsing, serving
 from tests.browser.looking import READY
 
-ROOM = 180_000  # splats
+ROOM_SPLATS = 180_000  # splats
 OPENINGS = 3  # of each scene: the first meets a service that just began
 LATER = 10  # seconds within which a service has loaded its kernels
-DRAWN = f"{READY} && document.querySelector('#stage').classList.contains('ready')"
+STAGE_READY = f"{READY} && document.querySelector('#stage').classList.contains('ready')"
 POSTER = "document.querySelector('#poster')?.naturalWidth && !document.querySelector('#poster').hidden"
-PICTURE = f"({POSTER}) || ({DRAWN})"  # the service's, which stands there until the splats are drawn
+PICTURE = f"({POSTER}) || ({STAGE_READY})"  # the service's, which stands there until the splats are drawn
 MARKS = """(() => {
   const [page] = performance.getEntriesByType('navigation');
   const [splats] = performance.getEntriesByType('resource').filter(({ name }) => name.endsWith('/splats'));
@@ -71,10 +71,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--shared", type=Path, default=Path("../shared/data"), help="where plush is")
     options = parser.parse_args()
-    tiny, room = make_scene(), room_of(options.shared / "plush")
+    tiny, room_scene = make_scene(), room_of(options.shared / "plush")
     with tempfile.TemporaryDirectory() as folder:
         first_pictures("the tiny scene", (tiny.splats, tiny.cameras, tiny.features), Path(folder) / "tiny")
-        first_pictures("a room", room, Path(folder) / "room")
+        first_pictures("a room", room_scene, Path(folder) / "room")
         moves_of_the_cut(Path(folder) / "cut")
 
 
@@ -84,9 +84,9 @@ def room_of(plush: Path) -> tuple[bytes, bytes, bytes]:
         splats, cameras = (plush / "point_cloud.ply").read_bytes(), (plush / "cameras.json").read_bytes()
         views = [record["img_name"].rsplit(".", 1)[0] for record in json.loads(cameras)[:2]]
     else:
-        rng, rows = np.random.default_rng(0), np.zeros((ROOM, len(PROPERTIES)), np.float32)
-        rows[:, :3] = rng.normal(0, [1, 0.8, 0.5], (ROOM, 3)) - [0, 0, 4]
-        rows[:, 3:6], rows[:, 7:10], rows[:, 10] = rng.normal(0, 1, (ROOM, 3)), np.log(0.02), 1
+        rng, rows = np.random.default_rng(0), np.zeros((ROOM_SPLATS, len(PROPERTIES)), np.float32)
+        rows[:, :3] = rng.normal(0, [1, 0.8, 0.5], (ROOM_SPLATS, 3)) - [0, 0, 4]
+        rows[:, 3:6], rows[:, 7:10], rows[:, 10] = rng.normal(0, 1, (ROOM_SPLATS, 3)), np.log(0.02), 1
         splats, cameras, views = ply(rows), cameras_json(), ["left", "right"]
     grid = np.eye(8, dtype=np.float32)[np.arange(12) % 8].reshape(3, 4, 8)
     pack = save({f"{view}/grid": grid for view in views}, metadata={"encoder": "by hand", "text_space": "none"})
@@ -104,12 +104,12 @@ def first_pictures(name: str, files: tuple[bytes, bytes, bytes], folder: Path) -
                 page.open(address)
                 page.until(PICTURE)
                 seconds = time.monotonic() - began
-                page.until(DRAWN)
-                drawn, marks = time.monotonic() - began, page.value(MARKS)
-            when = "at once" if opening == 0 else "again"
+                page.until(STAGE_READY)
+                stage, marks = time.monotonic() - began, page.value(MARKS)
+            label = "at once" if opening == 0 else "again"
             print(
-                f"first picture of {name}, {splats} splats, {when}: {seconds:.2f} s,"
-                f" its splats {drawn:.2f} s (asked for after {marks['asked'] / 1000:.2f}, {marks['megabytes']:.1f} MB"
+                f"first picture of {name}, {splats} splats, {label}: {seconds:.2f} s,"
+                f" its splats {stage:.2f} s (asked for after {marks['asked'] / 1000:.2f}, {marks['megabytes']:.1f} MB"
                 f" from {marks['first'] / 1000:.2f} to {marks['last'] / 1000:.2f})",
                 flush=True,
             )
@@ -131,11 +131,11 @@ def moves_of_the_cut(folder: Path) -> None:
             page.press("#query button.main")
             page.until("splatlift.ask.now?.answer")
             for size in SIZES:
-                told = page.value(f"{SCENE}({size})")
+                costs = page.value(f"{SCENE}({size})")
                 print(
-                    f"{told['of']} splats, {told['drawn']} drawn: unpacked in {told['loaded']:.0f} ms, new scores"
-                    f" {told['first']:.1f} ms, a move of the cut {statistics.median(told['moves']):.1f} ms"
-                    f" (worst of {MOVES}: {max(told['moves']):.1f})",
+                    f"{costs['of']} splats, {costs['drawn']} drawn: unpacked in {costs['loaded']:.0f} ms, new scores"
+                    f" {costs['first']:.1f} ms, a move of the cut {statistics.median(costs['moves']):.1f} ms"
+                    f" (worst of {MOVES}: {max(costs['moves']):.1f})",
                     flush=True,
                 )
 
@@ -143,8 +143,8 @@ def moves_of_the_cut(folder: Path) -> None:
 def lift_at(address: str, files: tuple[bytes, bytes, bytes]) -> int:
     """Lift a scene there; the number of its splats."""
     with httpx.Client(base_url=address, timeout=600) as client:
-        put = dict(zip(("splats", "cameras", "features"), files, strict=True))
-        ids = {kind: client.put(f"/assets/{kind}", content=body).json()["id"] for kind, body in put.items()}
+        uploads = dict(zip(("splats", "cameras", "features"), files, strict=True))
+        ids = {kind: client.put(f"/assets/{kind}", content=body).json()["id"] for kind, body in uploads.items()}
         order = ids | {"features": [ids["features"]], "settings": {"preset": "row-sum"}}
         job = wait_for_end(client, client.post("/lift", json=order).headers["location"])
         return client.get(f"/lifts/{job['id']}").json()["count"]

@@ -45,7 +45,7 @@ from liftcore.query.candidates import candidates
 from liftcore.query.question import Query
 from liftcore.query.scene import Scene
 from liftcore.values.views import ViewFeatures
-from tests.benchmarks.base import command_line, mask_iou, read_pack, read_scene, tell
+from tests.benchmarks.base import command_line, mask_iou, print_rows, read_pack, read_scene
 from tests.benchmarks.consensus import still_life_scene
 from tests.benchmarks.tabletop import Truth, tabletop
 from tests.still_life.scene import still_life
@@ -85,51 +85,59 @@ def innermost(mask: np.ndarray) -> tuple[int, int]:
 
 def best_nodes(scene: Scene, truth: Truth, owners: np.ndarray) -> np.ndarray:
     """The IoU of the best node of each owner, over the splats that count."""
-    counted, own = truth.counted.numpy(), owners[truth.counted.numpy()]
+    has_weight, part_of = truth.evaluated.numpy(), owners[truth.evaluated.numpy()]
     assert scene.node_parents is not None
-    nodes = np.stack([scene.members(node)[counted] for node in range(len(scene.node_parents))])
-    things = [row for row, word in enumerate(truth.words) if word not in CLOTHS]
-    wanted = [one for one in np.unique(own) if (one // PARTS if owners.max() >= len(truth.words) else one) in things]
-    tables = [(nodes & (own == one)).sum(axis=1) / (nodes | (own == one)).sum(axis=1) for one in wanted]
+    nodes = np.stack([scene.members(node)[has_weight] for node in range(len(scene.node_parents))])
+    object_rows = [row for row, word in enumerate(truth.words) if word not in CLOTHS]
+    parts = [
+        number
+        for number in np.unique(part_of)
+        if (number // PARTS if owners.max() >= len(truth.words) else number) in object_rows
+    ]
+    tables = [
+        (nodes & (part_of == number)).sum(axis=1) / (nodes | (part_of == number)).sum(axis=1) for number in parts
+    ]
     return np.array([table.max() for table in tables])
 
 
 def click_ious(scene: Scene, truth: Truth, owners: np.ndarray) -> dict[str, list[float]]:
-    """What one click a part and held-out view finds."""
-    found: dict[str, list[float]] = {"best": [], "best thing": [], "alone": []}
+    """Measure the masks of one click a part and held-out view."""
+    results: dict[str, list[float]] = {"best": [], "best thing": [], "alone": []}
     assert scene.node_parents is not None
     parts, nodes = int(owners.max()) + 1, range(len(scene.node_parents))
-    of_parts = np.stack([owners == one for one in range(parts)], axis=1)
+    of_parts = np.stack([owners == number for number in range(parts)], axis=1)
     of_nodes = np.stack([scene.members(node) for node in nodes], axis=1)
     for view, classes in truth.held_out.items():
-        seen = masks(scene, np.concatenate([of_parts, of_nodes], axis=1), view)
-        true, meant, shown = seen[..., :parts], seen[..., parts:], classes.numpy()
+        image_masks = masks(scene, np.concatenate([of_parts, of_nodes], axis=1), view)
+        true, node_masks, shown_classes = image_masks[..., :parts], image_masks[..., parts:], classes.numpy()
         clicked = [
-            one
-            for one in range(parts)
-            if truth.words[one // PARTS] not in CLOTHS and true[..., one].sum() >= LEAST_PIXELS
+            number
+            for number in range(parts)
+            if truth.words[number // PARTS] not in CLOTHS and true[..., number].sum() >= LEAST_PIXELS
         ]
-        clicks = [Query(like=["{}:{},{}".format(view, *innermost(true[..., one]))], top=0) for one in clicked]
-        alone = masks(scene, np.stack([ask(scene, query).selected for query in clicks], axis=1), view)
-        for place, (one, query) in enumerate(zip(clicked, clicks, strict=True)):
+        clicks = [Query(like=["{}:{},{}".format(view, *innermost(true[..., number]))], top=0) for number in clicked]
+        single_masks = masks(scene, np.stack([ask(scene, query).selected for query in clicks], axis=1), view)
+        for place, (number, query) in enumerate(zip(clicked, clicks, strict=True)):
             sets = [node.id for node in candidates(scene, query)]
-            ious = [mask_iou(meant[..., node], true[..., one]) for node in sets]
-            things = [mask_iou(meant[..., node], shown == one // PARTS) for node in sets]
-            found["best"].append(max(ious, default=0.0))
-            found["best thing"].append(max(things, default=0.0))
-            found["alone"].append(mask_iou(alone[..., place], true[..., one]))
-    return found
+            ious = [mask_iou(node_masks[..., node], true[..., number]) for node in sets]
+            object_ious = [mask_iou(node_masks[..., node], shown_classes == number // PARTS) for node in sets]
+            results["best"].append(max(ious, default=0.0))
+            results["best thing"].append(max(object_ious, default=0.0))
+            results["alone"].append(mask_iou(single_masks[..., place], true[..., number]))
+    return results
 
 
-def rows_of(folder: Path, packs: list[str], every: list[int]) -> Iterator[dict[str, Any]]:
+def rows_of(folder: Path, packs: list[str], strides: list[int]) -> Iterator[dict[str, Any]]:
     """One row a lift of the tabletop scene by `default`."""
-    truth, known = tabletop(folder), load_file(folder / "truth.safetensors")
-    owners = (PARTS * known["splat_object"].long() + known["splat_part"].long()).numpy()
+    truth, tensors = tabletop(folder), load_file(folder / "truth.safetensors")
+    owners = (PARTS * tensors["splat_object"].long() + tensors["splat_part"].long()).numpy()
     for pack in packs:
-        for step in every:
+        for step in strides:
             with processor_time():
                 lifted = truth.lift(read_pack(folder, pack), preset="default", view_stride=step)
-            yield {"features": f"{pack}, {len(lifted.views)} views"} | measured(truth.opened(lifted), truth, owners)
+            yield {"features": f"{pack}, {len(lifted.views)} views"} | measured(
+                truth.open_scene(lifted), truth, owners
+            )
 
 
 def measured(scene: Scene, truth: Truth, owners: np.ndarray) -> dict[str, Any]:
@@ -162,7 +170,7 @@ def unit(rows: np.ndarray) -> np.ndarray:
     return rows.astype(np.float32) / np.where(lengths > 0, lengths, 1)
 
 
-def level_scores(levels: Sequence[np.ndarray], words: np.ndarray, counted: np.ndarray) -> np.ndarray:
+def level_scores(levels: Sequence[np.ndarray], words: np.ndarray, has_weight: np.ndarray) -> np.ndarray:
     """[P, n] f32: how near splats are to each word in the level of its own that answers it best.
 
     Args:
@@ -170,12 +178,12 @@ def level_scores(levels: Sequence[np.ndarray], words: np.ndarray, counted: np.nd
     """
     tables, margins = [features @ words.T for features in levels], []
     for table in tables:
-        near = table[counted]
+        near = table[has_weight]
         ranked = np.sort(near, axis=1)
-        beside = np.where(near == ranked[:, -1:], ranked[:, -2:-1], ranked[:, -1:])  # the nearest other word
-        margins.append(np.sort(near - beside, axis=0)[-BEST_SPLATS:].mean(axis=0))
-    chosen = np.argmax(margins, axis=0)
-    return np.stack([tables[level][:, word] for word, level in enumerate(chosen)], axis=1)
+        second = np.where(near == ranked[:, -1:], ranked[:, -2:-1], ranked[:, -1:])  # the nearest other word
+        margins.append(np.sort(near - second, axis=0)[-BEST_SPLATS:].mean(axis=0))
+    best_level = np.argmax(margins, axis=0)
+    return np.stack([tables[level][:, word] for word, level in enumerate(best_level)], axis=1)
 
 
 def node_scores(scene: Scene, words: np.ndarray) -> np.ndarray:
@@ -183,91 +191,96 @@ def node_scores(scene: Scene, words: np.ndarray) -> np.ndarray:
     assert scene.node is not None and scene.node_parents is not None and scene.node_features is not None
     scores = scene.node_features.astype(np.float32) @ words.T
     for node in np.argsort([len(scene.node_path(node)) for node in range(len(scores))], kind="stable"):
-        if (whole := scene.node_parents[node]) >= 0:
-            scores[node] = np.maximum(scores[node], scores[whole])
+        if (parent := scene.node_parents[node]) >= 0:
+            scores[node] = np.maximum(scores[node], scores[parent])
     return np.concatenate([scores, np.full((1, len(words)), -1, np.float32)])[scene.node]
 
 
-def word_iou(scores: np.ndarray, owners: np.ndarray, counted: np.ndarray) -> float:
+def word_iou(scores: np.ndarray, owners: np.ndarray, has_weight: np.ndarray) -> float:
     """Mean IoU of words, each at its best threshold.
 
     Args:
         scores: [P, n]. owners: [P] int, the word of each splat. counted: [P] bool, the splats that count.
     """
-    ious, taken = [], np.arange(1, counted.sum() + 1)
-    for word, column in enumerate(scores[counted].T):
-        right = owners[counted] == word
+    ious, counts = [], np.arange(1, has_weight.sum() + 1)
+    for word, column in enumerate(scores[has_weight].T):
+        right = owners[has_weight] == word
         hits = np.cumsum(right[np.argsort(-column, kind="stable")])
         ranked = np.sort(-column)
         ends = np.append(ranked[1:] > ranked[:-1], True)  # equal scores are taken together
-        ious.append(float((hits / (taken + right.sum() - hits))[ends].max()))
+        ious.append(float((hits / (counts + right.sum() - hits))[ends].max()))
     return float(np.mean(ious))
 
 
-def words_of(folder: Path, packs: Sequence[str], every: Sequence[int]) -> Iterator[dict[str, Any]]:
+def words_of(folder: Path, packs: Sequence[str], strides: Sequence[int]) -> Iterator[dict[str, Any]]:
     """One row a set of words: IoU by sum, best level and best node."""
     truth, encoder = tabletop(folder), UnrelatedWords()
-    for pack, step in product(packs, every):
+    for pack, step in product(packs, strides):
         views = read_pack(folder, pack, step)
-        things = truth.classes.numpy(), truth.objects.numpy()
-        yield from compared(truth, views, {f"{pack}, {len(views)} views: things": things})
-    made, (other, views) = still_life(STILL_LIFE_SEED), still_life_scene("hard", STILL_LIFE_SEED, encoder=encoder)
-    asked = {"things": (made.things, made.splat_things), "parts": (made.parts, made.splat_parts)}
+        labels = truth.classes.numpy(), truth.objects.numpy()
+        yield from compare_levels(truth, views, {f"{pack}, {len(views)} views: things": labels})
+    scene, (other, views) = still_life(STILL_LIFE_SEED), still_life_scene("hard", STILL_LIFE_SEED, encoder=encoder)
+    queries = {"things": (scene.things, scene.splat_things), "parts": (scene.parts, scene.splat_parts)}
     name = f"still life, {len(views)} views"
-    yield from compared(other, views, {f"{name}: {of}": (encoder.encode(a), b) for of, (a, b) in asked.items()})
+    yield from compare_levels(
+        other, views, {f"{name}: {of}": (encoder.encode(a), b) for of, (a, b) in queries.items()}
+    )
 
 
-def compared(
-    truth: Truth, views: Mapping[str, ViewFeatures], asked: Mapping[str, tuple[np.ndarray, np.ndarray]]
+def compare_levels(
+    truth: Truth, views: Mapping[str, ViewFeatures], queries: Mapping[str, tuple[np.ndarray, np.ndarray]]
 ) -> Iterator[dict[str, Any]]:
     """One row a set of words [n, F] with the word of each splat [P]."""
-    scene, counted = truth.opened(truth.lift(views, preset="default")), truth.counted.numpy()
-    alone = [unit(truth.lift(views, preset="default", levels=level).features.numpy()) for level in (0, 1)]
-    for name, (words, owners) in asked.items():
-        found = {
+    scene, has_weight = truth.open_scene(truth.lift(views, preset="default")), truth.evaluated.numpy()
+    single_level = [unit(truth.lift(views, preset="default", levels=level).features.numpy()) for level in (0, 1)]
+    for name, (words, owners) in queries.items():
+        results = {
             "sum": unit(scene.features) @ words.T,
-            "level": level_scores(alone, words, counted),
+            "level": level_scores(single_level, words, has_weight),
             "node": node_scores(scene, words),
         }
         facts = scene.metadata.diagnostics["objects"]
         yield {"words": name, "agreement": facts["level_agreement"]} | {
-            way: word_iou(scores, owners, counted) for way, scores in found.items()
+            way: word_iou(scores, owners, has_weight) for way, scores in results.items()
         }
 
 
-def seconds_of(folder: Path, packs: list[str], every: list[int]) -> Iterator[dict[str, Any]]:
+def seconds_of(folder: Path, packs: list[str], strides: list[int]) -> Iterator[dict[str, Any]]:
     """The processor time of one lift by `default` a pack and step."""
     splats, cameras = read_scene(folder)
     for pack in packs:
-        for step in every:
+        for step in strides:
             with processor_time():
                 lifted = lc.lift(splats, cameras, read_pack(folder, pack, step), preset="default", threads=2)
-            spent = seconds(lifted.metadata.timings)
+            stages = seconds(lifted.metadata.timings)
             name = f"{pack}, {len(lifted.views)} views"
-            yield {"features": name} | spent | {"share": spent["seconds"] / spent["of"]}
+            yield {"features": name} | stages | {"share": stages["seconds"] / stages["of"]}
 
 
 def named_miou(scene: Scene, truth: Truth) -> dict[str, float]:
     """The mIoU of each splat's nearest class, and of the classes that `Scene.segment` gives."""
     labels = torch.from_numpy(scene.segment(truth.words, truth.classes).labels)
     scores = torch.nn.functional.one_hot(labels.long() + 1, len(truth.words) + 1)[:, 1:].float()
-    plain, params = torch.from_numpy(scene.features).float() @ truth.classes.T, scene.compositing
-    return {"argmax": truth.judge_scores(plain, params).miou, "segment": truth.judge_scores(scores, params).miou}
+    products, params = torch.from_numpy(scene.features).float() @ truth.classes.T, scene.compositing
+    return {
+        "argmax": truth.evaluate_scores(products, params).miou,
+        "segment": truth.evaluate_scores(scores, params).miou,
+    }
 
 
-def look(folder: Path, clicks: list[str]) -> None:
+def print_clicks(folder: Path, clicks: list[str]) -> None:
     """Draw the candidates of clicks: VIEW X,Y OUT.png each, on a lift of the folder's regions by `default`."""
     splats, cameras = read_scene(folder)
     lifted = lc.lift(splats, cameras, read_pack(folder, "regions"), preset="default").cpu()
     scene = Scene(lifted, splats, cameras)
     for view, place, out in zip(clicks[::3], clicks[1::3], clicks[2::3], strict=True):
-        drawn = scene.render(view)
-        meant = candidates(scene, Query(like=[f"{view}:{place}"]))
-        print(view, place, [(one.set, one.kind, one.splats) for one in meant])
-        tiles = [drawn]
-        for one in meant:
-            (mask,) = np.moveaxis(masks(scene, scene.members(one.id)[:, None], view), 2, 0)
-            tiles.append(np.where(mask[..., None], drawn, drawn // 4))
+        image = scene.render(view)
+        clicked = candidates(scene, Query(like=[f"{view}:{place}"]))
+        print(view, place, [(candidate.set, candidate.kind, candidate.splats) for candidate in clicked])
+        tiles = [image]
+        for candidate in clicked:
+            (mask,) = np.moveaxis(masks(scene, scene.members(candidate.id)[:, None], view), 2, 0)
+            tiles.append(np.where(mask[..., None], image, image // 4))
         Image.fromarray(np.concatenate(tiles, axis=1)).save(out)
 
 
@@ -278,7 +291,7 @@ def main() -> None:
         parser.add_argument("--look", type=Path)
         parser.add_argument("clicks", nargs="+")
         options = parser.parse_args()
-        look(options.look, options.clicks)
+        print_clicks(options.print_clicks, options.clicks)
         return
     parser = command_line(
         "tests.benchmarks.parts",
@@ -291,12 +304,12 @@ def main() -> None:
     )
     options = parser.parse_args()
     if options.seconds:
-        tell(seconds_of(options.folder, options.features, options.every), as_json=options.json)
+        print_rows(seconds_of(options.folder, options.features, options.every), as_json=options.json)
         return
     if options.words:
-        tell(words_of(options.folder, options.features, options.every), as_json=options.json)
+        print_rows(words_of(options.folder, options.features, options.every), as_json=options.json)
         return
-    tell(rows_of(options.folder, options.features, options.every), as_json=options.json)
+    print_rows(rows_of(options.folder, options.features, options.every), as_json=options.json)
 
 
 if __name__ == "__main__":

@@ -40,17 +40,17 @@ from liftcore.runtime.one_thread import one_thread
 from liftcore.scene.compositing import ALPHA_FLOOR, TILE, Weighting
 from liftcore.solve.closed_form import solve
 from liftcore.values.views import cells_under
-from tests.benchmarks.base import command_line, tell
-from tests.benchmarks.scenes import Room
+from tests.benchmarks.base import command_line, print_rows
+from tests.benchmarks.scenes import RoomSpec
 
 LONG = 60.0  # seconds
 THREADS = cores()
 
 
-TINY = Room(500, 1, (64, 48), 4)  # to load kernels and start threads
+TINY = RoomSpec(500, 1, (64, 48), 4)  # to load kernels and start threads
 SIZES = {
-    "large": [Room(200_000, 2, (640, 480), 512)],
-    "channels": [Room(20_000, 4, (200, 150), channels) for channels in (4, 16, 64, 256, 1024)],
+    "large": [RoomSpec(200_000, 2, (640, 480), 512)],
+    "channels": [RoomSpec(20_000, 4, (200, 150), channels) for channels in (4, 16, 64, 256, 1024)],
 }
 
 
@@ -71,7 +71,7 @@ class Work:
 Answer = tuple[Tensor, Tensor]  # X [P, F] f32, zero where no ray met the splat; A^T n [P] f64 over all views
 
 
-def room(size: Room) -> Work:
+def room_work(size: RoomSpec) -> Work:
     """The synthetic room of ``splatlift bench`` at a size, always the same."""
     cameras = room_cameras(size.views, *size.size)
     views = tuple((camera, room_regions(camera, k, 4, size.channels)) for k, camera in enumerate(cameras))
@@ -103,7 +103,7 @@ def answer_of(sums: Tensor) -> Answer:
     return torch.where(totals > 0, sums[:, :-1] / totals, 0.0), totals[:, 0].double()
 
 
-def ours(work: Work, device: Device = CPU) -> Answer:
+def splatlift_answer(work: Work, device: Device = CPU) -> Answer:
     """As ``splatlift lift --preset row-sum --set dtype=float32`` has it."""
     raster, looking = open_raster(work.splats, device), (work.params, Weighting())
     W, codebook = weigh_regions(raster, work.views, looking, work.splats.count)
@@ -119,39 +119,41 @@ SHARES = 32  # of the tiles, dealt out to the threads in turn
 def dense_numba(work: Work) -> Answer:
     """Tile by tile, splat by splat, pixel by pixel, channel by channel; each thread has sums of its own."""
     raster = CpuRaster(work.splats, THREADS)
-    own = np.zeros((THREADS, work.splats.count, work.channels + 1), np.float32)
+    partial_sums = np.zeros((THREADS, work.splats.count, work.channels + 1), np.float32)
     with ThreadPoolExecutor(THREADS) as pool:
         for camera, regions in work.views:
             (frame,) = raster._bands(camera, work.params)
             target = dense_target(at_pixels(regions, camera)).numpy()
             marks = np.linspace(0, frame.starts[-1], SHARES + 1)  # about as many list items a share
             edges = np.searchsorted(frame.starts, marks).clip(0, frame.columns * frame.rows)
-            parts = [pool.submit(_add_shares, k, THREADS, edges, frame, target, own[k]) for k in range(THREADS)]
+            parts = [
+                pool.submit(_add_shares, k, THREADS, edges, frame, target, partial_sums[k]) for k in range(THREADS)
+            ]
             for part in parts:
                 part.result()
-    return answer_of(torch.from_numpy(own.sum(axis=0)))
+    return answer_of(torch.from_numpy(partial_sums.sum(axis=0)))
 
 
 @njit(nogil=True, cache=True)
 def _add_shares(thread, threads, edges, frame, target, sums):
     """``A^T [B n]`` of every ``threads``-th share of the tiles; target [H, W, F + 1], sums [P, F + 1] f32, grows."""
-    light = np.empty((TILE, TILE), np.float32)
+    transmittance = np.empty((TILE, TILE), np.float32)
     for share in range(thread, edges.shape[0] - 1, threads):
         for tile in range(edges[share], edges[share + 1]):
             x0, y0 = tile % frame.columns * TILE, tile // frame.columns * TILE
             width, height = min(TILE, frame.width - x0), min(TILE, frame.height - y0)
-            light[:] = 0
-            light[:height, :width] = 1
+            transmittance[:] = 0
+            transmittance[:height, :width] = 1
             for step in range(frame.starts[tile], frame.starts[tile + 1]):
-                if (step - frame.starts[tile]) % 16 == 0 and light.max() <= 0:
+                if (step - frame.starts[tile]) % 16 == 0 and transmittance.max() <= 0:
                     break
                 place = frame.items[step]
                 box = x0, y0, width, height
-                _add_splat(frame, frame.projected[place], box, light, target, sums[frame.ids[place]])
+                _add_splat(frame, frame.projected[place], box, transmittance, target, sums[frame.ids[place]])
 
 
 @njit(nogil=True, cache=True)
-def _add_splat(frame, record, box, light, target, row):
+def _add_splat(frame, record, box, transmittance, target, row):
     """One splat's weights on one tile, times the pixels, onto its row of sums [F + 1]; light ends at 0."""
     x0, y0, width, height = box
     opacity, kx, cap = np.float32(record[OPACITY]), np.float32(record[SQRT_A] ** 2), np.float32(frame.alpha_cap)
@@ -163,7 +165,7 @@ def _add_splat(frame, record, box, light, target, row):
         centre = record[MX] + record[SLOPE] * dy - x0 - 0.5
         half = math.sqrt(record[CUTOFF] - base) / record[SQRT_A]
         for x in range(max(0, math.ceil(centre - half)), min(width - 1, math.floor(centre + half)) + 1):
-            before = light[y, x]
+            before = transmittance[y, x]
             if before <= 0:
                 continue
             dx = np.float32(x - centre)
@@ -173,9 +175,9 @@ def _add_splat(frame, record, box, light, target, row):
             alpha = min(alpha, cap)
             after = before * (np.float32(1) - alpha)
             if after <= np.float32(frame.transmittance_stop):
-                light[y, x] = 0
+                transmittance[y, x] = 0
                 continue
-            light[y, x] = after
+            transmittance[y, x] = after
             _add_scaled(row, alpha * before, target[y0 + y, x0 + x])
 
 
@@ -196,64 +198,69 @@ CHANNELS = 128  # a chunk
 def torch_autograd(work: Work) -> Answer:
     """View by view, slab by slab, chunk by chunk of channels; each thread has tiles and sums of its own."""
     raster = CpuRaster(work.splats, THREADS)
-    own = torch.zeros(THREADS, work.splats.count, work.channels + 1)
+    partial_sums = torch.zeros(THREADS, work.splats.count, work.channels + 1)
     one_each = {"initializer": torch.set_num_threads, "initargs": (1,)}
     with one_thread(), ThreadPoolExecutor(THREADS, **one_each) as pool:
         for camera, regions in work.views:
             (frame,) = raster._bands(camera, work.params)
             target = by_tile(dense_target(at_pixels(regions, camera)))
             tiles = torch.arange(len(target))
-            parts = [pool.submit(_add_view, frame, target, tiles[k::THREADS], sums) for k, sums in enumerate(own)]
+            parts = [
+                pool.submit(_add_view, frame, target, tiles[k::THREADS], sums) for k, sums in enumerate(partial_sums)
+            ]
             for part in parts:
                 part.result()
-    return answer_of(own.sum(dim=0))
+    return answer_of(partial_sums.sum(dim=0))
 
 
-def _add_view(frame: Frame, target: Tensor, own: Tensor, sums: Tensor) -> None:
-    """``A^T [B n]`` of the tiles ``own`` [n], a slab of splats on a batch of tiles at a time, onto sums [P, F + 1].
+def _add_view(frame: Frame, target: Tensor, own_tiles: Tensor, sums: Tensor) -> None:
+    """Add ``A^T [B n]`` of the tiles ``own_tiles`` [n], in batches, to sums [P, F + 1].
 
     Args:
         target: [tiles, TILE^2, F + 1] f32.
     """
     starts, items = torch.from_numpy(frame.starts), torch.from_numpy(frame.items)
     ids, lengths = torch.from_numpy(frame.ids), starts.diff()
-    light = by_tile(torch.ones(frame.height, frame.width, 1))[:, :, 0]
+    transmittance = by_tile(torch.ones(frame.height, frame.width, 1))[:, :, 0]
     depth = 0
     while True:
-        left = own[(lengths[own] > depth) & (light[own].amax(dim=1) > frame.transmittance_stop)]
-        if len(left) == 0:
+        is_open = transmittance[own_tiles].amax(dim=1) > frame.transmittance_stop
+        remaining = own_tiles[(lengths[own_tiles] > depth) & is_open]
+        if len(remaining) == 0:
             return
-        left = left[torch.argsort(lengths[left], descending=True)]  # so that few slabs of a batch are padded
-        for tiles in left.split(max(1, WEIGHTS // (SLAB * TILE * TILE))):
+        remaining = remaining[torch.argsort(lengths[remaining], descending=True)]  # little padding in a batch
+        for tiles in remaining.split(max(1, WEIGHTS // (SLAB * TILE * TILE))):
             offsets = torch.arange(depth, min(depth + SLAB, int(lengths[tiles[0]])))
             members = items[(starts[tiles, None] + offsets).clamp(max=len(items) - 1)].long()
             alphas = _alphas(frame, members, offsets < lengths[tiles, None], tiles)
-            weights, light[tiles] = _composite(alphas.clamp_(max=frame.alpha_cap), light[tiles], frame)
+            weights, transmittance[tiles] = _composite(
+                alphas.clamp_(max=frame.alpha_cap), transmittance[tiles], frame
+            )
             _add_gradient(weights, ids[members], target[tiles], sums)
         depth += SLAB
 
 
-def _alphas(frame: Frame, members: Tensor, there: Tensor, tiles: Tensor) -> Tensor:
-    """[t, TILE^2, k] f32, the alphas of projected splats ``members`` [t, k] on tiles [t]; there: no padding."""
-    own = torch.from_numpy(frame.projected)[members]  # [t, k, COLUMNS] f64
+def _alphas(frame: Frame, members: Tensor, present: Tensor, tiles: Tensor) -> Tensor:
+    """Compute the alphas [t, TILE^2, k] f32 of splats ``members`` [t, k] on tiles [t]; present [t, k]: no padding."""
+    projected = torch.from_numpy(frame.projected)[members]  # [t, k, COLUMNS] f64
     x, y = (
-        (corner[:, None] * TILE + torch.arange(TILE) + 0.5)[:, :, None] - own[:, None, :, centre]
+        (corner[:, None] * TILE + torch.arange(TILE) + 0.5)[:, :, None] - projected[:, None, :, centre]
         for corner, centre in ((tiles % frame.columns, MX), (tiles // frame.columns, MY))
     )
-    root = own[:, None, :, SQRT_A]
-    across = (root * x).float()[:, None] - (root * own[:, None, :, SLOPE] * y).float()[:, :, None]
-    exponents = across.square_().add_((own[:, None, :, C] * y * y).float()[:, :, None])
-    opacity = torch.where(there, own[:, :, OPACITY], 0.0).float()
+    root = projected[:, None, :, SQRT_A]
+    across = (root * x).float()[:, None] - (root * projected[:, None, :, SLOPE] * y).float()[:, :, None]
+    exponents = across.square_().add_((projected[:, None, :, C] * y * y).float()[:, :, None])
+    opacity = torch.where(present, projected[:, :, OPACITY], 0.0).float()
     return threshold(exponents.neg_().exp2_() * opacity[:, None, None], ALPHA_FLOOR, 0.0).flatten(1, 2)
 
 
-def _composite(alphas: Tensor, light: Tensor, frame: Frame) -> tuple[Tensor, Tensor]:
-    """Weights [t, TILE^2, k] f32, made in place of the alphas, and the light [t, TILE^2] behind them."""
+def _composite(alphas: Tensor, transmittance: Tensor, frame: Frame) -> tuple[Tensor, Tensor]:
+    """Weights [t, TILE^2, k] f32, made in place of the alphas, and the transmittance [t, TILE^2] behind them."""
     after = 1 - alphas
-    after[:, :, 0] *= light
+    after[:, :, 0] *= transmittance
     torch.cumprod(after, dim=2, out=after)
     alphas[:, :, 1:] *= after[:, :, :-1]
-    alphas[:, :, 0] *= light
+    alphas[:, :, 0] *= transmittance
     if after[:, :, -1].amin() <= frame.transmittance_stop:
         alphas *= after > frame.transmittance_stop
     return alphas, after[:, :, -1]
@@ -282,12 +289,12 @@ def by_tile(image: Tensor) -> Tensor:
 # --- side by side ---
 
 PEERS: dict[str, Callable[[Work], Answer]] = {
-    "splatlift": ours, "dense numba": dense_numba, "torch autograd": torch_autograd,
+    "splatlift": splatlift_answer, "dense numba": dense_numba, "torch autograd": torch_autograd,
 }  # fmt: skip
 
 
 def side_by_side(
-    size: Room, work: Work, peers: Mapping[str, Callable[[Work], Answer]], rounds: int
+    size: RoomSpec, work: Work, peers: Mapping[str, Callable[[Work], Answer]], rounds: int
 ) -> Iterator[dict[str, Any]]:
     """A row a peer: all lift the work in turns, a round of all, then the next; each is held to the first's X."""
     seconds: dict[str, list[float]] = {name: [] for name in peers}
@@ -299,14 +306,14 @@ def side_by_side(
                 answers[name] = lift(work)
                 seconds[name].append(time.perf_counter() - start)
     features, total_weight = answers["splatlift"]
-    usual = statistics.median(seconds["splatlift"])
-    for name, (theirs, _) in answers.items():
+    baseline = statistics.median(seconds["splatlift"])
+    for name, (peer_answer, _) in answers.items():
         median = statistics.median(seconds[name])
-        cosines = cosine_similarity(features, theirs, dim=1).double()
+        cosines = cosine_similarity(features, peer_answer, dim=1).double()
         yield {
             "splats": size.splats, "image": "x".join(map(str, size.size)), "views": size.views,
             "channels": size.channels, "peer": name, "seconds": median, "fastest": min(seconds[name]),
-            "times ours": median / usual, "cosine": float((cosines * total_weight).sum() / total_weight.sum()),
+            "times ours": median / baseline, "cosine": float((cosines * total_weight).sum() / total_weight.sum()),
         }  # fmt: skip
 
 
@@ -320,10 +327,10 @@ def main() -> None:
     )
     options = parser.parse_args()
     for lift in PEERS.values():
-        lift(room(TINY))
+        lift(room_work(TINY))
     sizes = [size for name in options.sizes for size in SIZES[name]]
-    rows = [row for size in sizes for row in side_by_side(size, room(size), PEERS, options.rounds)]
-    tell(rows, as_json=options.json)
+    rows = [row for size in sizes for row in side_by_side(size, room_work(size), PEERS, options.rounds)]
+    print_rows(rows, as_json=options.json)
 
 
 if __name__ == "__main__":

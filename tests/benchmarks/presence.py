@@ -1,4 +1,4 @@
-"""Whether a thing is there: what is said of words of things that are in a scene, and of words of things that are not.
+"""Presence of objects: the answers for words of objects in a scene, and for words of absent objects.
 
     python -m tests.benchmarks.presence DIR [--features NAME ...] [--presets NAME ...] [--strides N ...] [--json]
 
@@ -21,45 +21,47 @@ from liftcore.query.scene import Scene
 from liftcore.query.scores import cosines
 from liftcore.text import open_encoder
 from liftcore.text.table import TableEncoder
-from tests.benchmarks.base import PACKS, command_line, read_pack, tell
+from tests.benchmarks.base import PACKS, command_line, print_rows, read_pack
 from tests.benchmarks.consensus import still_life_scene
 from tests.benchmarks.tabletop import tabletop
 
 PRESETS = ("default", "row-sum", "tikhonov")
 ABSENT = 200
-THERE = ("the mug", "a cup", "something to drink coffee from", "fresh fruit", "an apple", "a banana", "reading light",
-         "a novel", "a plant", "tableware")  # fmt: skip
+PRESENT = ("the mug", "a cup", "something to drink coffee from", "fresh fruit", "an apple", "a banana",
+           "reading light", "a novel", "a plant", "tableware")  # fmt: skip
 NOT_THERE = ("a sofa", "a dog", "a car", "a guitar", "a bicycle", "a shoe", "an elephant", "an airplane", "a laptop",
              "a hammer", "a person", "a television", "a newspaper", "a knife", "a musical instrument", "a pet",
              "something to wear", "a place to sleep", "a penguin", "a bus")  # fmt: skip
 
 
-def told(scene: Scene, vectors: np.ndarray, references: References) -> np.ndarray:
+def presences(scene: Scene, vectors: np.ndarray, references: References) -> np.ndarray:
     """[n] f64, the presence of words with these vectors [n, F]."""
     scores = np.ascontiguousarray(cosines(scene.features, scene.norms, vectors).T)
-    found = (
+    answers = (
         estimate_presence(scene, "", vector, row, references) for vector, row in zip(vectors, scores, strict=True)
     )
-    return np.array([one.presence for one in found])
+    return np.array([answer.presence for answer in answers])
 
 
 def figures(present: np.ndarray, absent: np.ndarray) -> dict[str, Any]:
     """Of the presence of things that are there, and of others."""
-    missed, nothing = int((present < 0.5).sum()), float((absent < 0.5).mean())
-    return {"missed": missed, "lowest": float(present.min()), "nothing": nothing}
+    false_absent, true_absent = int((present < 0.5).sum()), float((absent < 0.5).mean())
+    return {"missed": false_absent, "lowest": float(present.min()), "nothing": true_absent}
 
 
 def measured(scene: Scene, table: TableEncoder, present: Sequence[int]) -> dict[str, Any]:
     """A row, of the table's words at these rows."""
-    others = np.setdiff1d(np.arange(len(table.words)), present)
-    absent = np.random.default_rng(0).choice(others, ABSENT, replace=False)
-    asked = table.embeddings[[*present, *absent]]
+    other_rows = np.setdiff1d(np.arange(len(table.words)), present)
+    absent = np.random.default_rng(0).choice(other_rows, ABSENT, replace=False)
+    vectors = table.embeddings[[*present, *absent]]
     row: dict[str, Any] = {}
-    every = np.arange(len(table.words))
-    for name, rows in (("", every), (" without", np.setdiff1d(every[::4], [*present, *absent]))):
+    all_rows = np.arange(len(table.words))
+    for name, rows in (("", all_rows), (" without", np.setdiff1d(all_rows[::4], [*present, *absent]))):
         references = References(tuple(table.words[k] for k in rows), table.embeddings[rows])
-        found = told(scene, asked, references)
-        row |= {key + name: value for key, value in figures(found[: len(present)], found[len(present) :]).items()}
+        presence = presences(scene, vectors, references)
+        row |= {
+            key + name: value for key, value in figures(presence[: len(present)], presence[len(present) :]).items()
+        }
     return row
 
 
@@ -73,7 +75,7 @@ def tabletop_rows(
         for stride, preset in product(strides if pack != "grids" else (1,), presets):
             lifted = truth.lift(read_pack(folder, pack, stride), preset=preset)
             head = {"scene": f"{pack}, {len(lifted.views)} views", "preset": preset}
-            yield head | measured(truth.opened(lifted), table, present)
+            yield head | measured(truth.open_scene(lifted), table, present)
 
 
 def still_life_rows(presets: Iterable[str]) -> Iterator[dict[str, Any]]:
@@ -84,10 +86,10 @@ def still_life_rows(presets: Iterable[str]) -> Iterator[dict[str, Any]]:
     for seed, kind in enumerate(("usual", "hard"), start=7):
         truth, views = still_life_scene(kind, seed)
         for preset in presets:
-            scene = truth.opened(truth.lift(views, preset=preset))
-            present, absent = (told(scene, encoder.encode(words), references) for words in (THERE, NOT_THERE))
-            wrong = [word for word, one in zip(THERE, present, strict=True) if one < 0.5]
-            wrong += [word for word, one in zip(NOT_THERE, absent, strict=True) if one >= 0.5]
+            scene = truth.open_scene(truth.lift(views, preset=preset))
+            present, absent = (presences(scene, encoder.encode(words), references) for words in (PRESENT, NOT_THERE))
+            wrong = [word for word, presence in zip(PRESENT, present, strict=True) if presence < 0.5]
+            wrong += [word for word, presence in zip(NOT_THERE, absent, strict=True) if presence >= 0.5]
             head = {"scene": f"still life, {kind}", "preset": preset}
             yield head | figures(present, absent) | {"wrong": ", ".join(wrong)}
 
@@ -106,7 +108,7 @@ def main() -> None:
     options = parser.parse_args()
     rows = list(tabletop_rows(options.folder, options.features, options.presets, options.strides))
     rows += still_life_rows(options.presets) if options.still_life else []
-    tell(rows, as_json=options.json)
+    print_rows(rows, as_json=options.json)
 
 
 if __name__ == "__main__":

@@ -41,17 +41,17 @@ SPLAT_BYTES = 68  # of a .ply with colours of degree 0
 
 def free_port() -> int:
     """A port that nobody listens on."""
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return found.getsockname()[1]
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return listener.getsockname()[1]
 
 
 @contextmanager
 def proxied(caddy: str, url: str, folder: Path) -> Iterator[str]:
     """Run the proxy before a service while the block runs; its address. It writes to the folder alone."""
     address = f"http://127.0.0.1:{free_port()}"
-    told = {"SITE": address, "UPSTREAM": urlsplit(url).netloc, "HOME": str(folder), "XDG_DATA_HOME": str(folder)}
-    environment = os.environ | told | {"XDG_CONFIG_HOME": str(folder)}
+    variables = {"SITE": address, "UPSTREAM": urlsplit(url).netloc, "HOME": str(folder), "XDG_DATA_HOME": str(folder)}
+    environment = os.environ | variables | {"XDG_CONFIG_HOME": str(folder)}
     adapt = [caddy, "adapt", "--config", str(CADDYFILE), "--adapter", "caddyfile"]
     config = json.loads(subprocess.run(adapt, env=environment, capture_output=True, check=True).stdout)
     file = folder / "caddy.json"
@@ -88,31 +88,33 @@ def upload(client: httpx.Client, folder: Path, megabytes: float) -> dict[str, An
     """Upload a scene of so many megabytes; its id, and how long it took."""
     path = folder / "large.ply"
     write_splats(path, random_splats(1, int(megabytes * 1e6 / SPLAT_BYTES)))
-    begun = time.monotonic()
+    start = time.monotonic()
     with path.open("rb") as file:
         reply = client.put("/assets/splats", content=file)
     asset = reply.raise_for_status().json()
-    return {"bytes": asset["bytes"], "status": reply.status_code, "seconds": round(time.monotonic() - begun, 1)} | {
+    return {"bytes": asset["bytes"], "status": reply.status_code, "seconds": round(time.monotonic() - start, 1)} | {
         "id": asset["id"], "whole": asset["bytes"] == path.stat().st_size
     }  # fmt: skip
 
 
 def ranges(client: httpx.Client, asset: str, path: Path) -> dict[str, Any]:
-    """Parts of an asset, against the file that it was, and what a client that has it already is told."""
+    """Compare parts of an asset with its file, and check the status for a client that has it already."""
     content = path.read_bytes()
-    wanted = {
+    expected = {
         "bytes=0-99": slice(0, 100),
         "bytes=-50": slice(-50, None),
         "bytes=1000000-2000000": slice(10**6, 2 * 10**6 + 1),
     }
     right = {}
-    for header, part in wanted.items():
+    for header, part in expected.items():
         reply = client.get(f"/assets/{asset}/content", headers={"Range": header})
         right[header] = reply.status_code == 206 and reply.content == content[part]
-    whole = client.get(f"/assets/{asset}/content")
-    known = client.get(f"/assets/{asset}/content", headers={"If-None-Match": whole.headers["etag"]}).status_code
+    full = client.get(f"/assets/{asset}/content")
+    conditional_status = client.get(
+        f"/assets/{asset}/content", headers={"If-None-Match": full.headers["etag"]}
+    ).status_code
     beyond = client.get(f"/assets/{asset}/content", headers={"Range": f"bytes={len(content)}-"}).status_code
-    return {"parts": right, "whole": whole.content == content, "if_none_match": known, "beyond": beyond}
+    return {"parts": right, "whole": full.content == content, "if_none_match": conditional_status, "beyond": beyond}
 
 
 def events(client: httpx.Client, direct: httpx.Client) -> dict[str, Any]:
@@ -135,7 +137,7 @@ def events(client: httpx.Client, direct: httpx.Client) -> dict[str, Any]:
         return times
 
     through, straight = at_once([lambda: arrivals(client), lambda: arrivals(direct)])
-    late = [through[one] - straight[one] for one in through.keys() & straight.keys()]
+    late = [through[event] - straight[event] for event in through.keys() & straight.keys()]
     return {
         "events": len(through), "same": through.keys() == straight.keys(),
         "later_ms_p50": round(1e3 * float(np.median(late)), 1), "later_ms_most": round(1e3 * max(late), 1),
@@ -190,31 +192,33 @@ def main() -> int:
             httpx.Client(base_url=url, timeout=600, trust_env=False) as direct,
         ):
             version = subprocess.run([options.caddy, "version"], capture_output=True, text=True, check=True).stdout
-            sent = upload(client, folder, options.megabytes)
-            figures = {**machine(), "caddy": version.split()[0], "upload": sent}
-            figures["ranges"] = ranges(client, sent["id"], folder / "large.ply")
+            asset = upload(client, folder, options.megabytes)
+            figures = {**machine(), "caddy": version.split()[0], "upload": asset}
+            figures["ranges"] = ranges(client, asset["id"], folder / "large.ply")
             figures["events"], figures["bounds"] = events(client, direct), bounds(client)
             figures["kept_connections"] = kept_connections(client, url, PAUSE_SECONDS)
             quiet = {
                 "through": probe(address, after(options.seconds / 4)),
                 "straight": probe(url, after(options.seconds / 4)),
             }
-            with slow_clients(address, f"/assets/{sent['id']}/content") as told:
+            with slow_clients(address, f"/assets/{asset['id']}/content") as replies:
                 slow = {
                     "straight": probe(url, after(options.seconds / 2)),
                     "through": probe(address, after(options.seconds)),
                 }
                 slow["connections"] = {"of the proxy": connections_of(address), "of the service": connections_of(url)}
             figures["load"] = round(os.getloadavg()[0], 1)
-            figures["healthz_ms"], figures["slow_clients"] = {"quiet": quiet, "beside_slow_clients": slow}, told
+            figures["healthz_ms"], figures["slow_clients"] = {"quiet": quiet, "beside_slow_clients": slow}, replies
             figures["errors"] = (folder / "log").read_text().count("Traceback")
     print(json.dumps(figures, indent=2))
-    reached = max(slow[way]["p99"] for way in ("through", "straight")) < HEALTH_MS
+    within_limit = max(slow[way]["p99"] for way in ("through", "straight")) < HEALTH_MS
     parts = figures["ranges"]
-    whole = sent["whole"] and parts["whole"] and all(parts["parts"].values()) and parts["if_none_match"] == 304
+    is_complete = asset["whole"] and parts["whole"] and all(parts["parts"].values()) and parts["if_none_match"] == 304
     pool = figures["kept_connections"]
     is_closed = pool["left"] <= 1 < pool["before"] and pool["statuses"] == [404]  # of the health checks
-    return 0 if reached and whole and is_closed and figures["events"]["same"] and not figures["errors"] else 1
+    return (
+        0 if within_limit and is_complete and is_closed and figures["events"]["same"] and not figures["errors"] else 1
+    )
 
 
 if __name__ == "__main__":

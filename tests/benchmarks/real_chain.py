@@ -51,7 +51,7 @@ from liftcore.query.terms import Pixel
 from liftcore.runtime.folders import cache_folder
 from liftcore.text.table import TableEncoder
 from liftcore.values.pack import read_features
-from tests.benchmarks.base import box_iou, command_line, scene_files, tell
+from tests.benchmarks.base import box_iou, command_line, print_rows, scene_files
 
 Box = tuple[int, int, int, int]
 Question = tuple[
@@ -93,12 +93,12 @@ BOXES: Mapping[str, Mapping[str, Sequence[Box]]] = {
     "20240212_004138": {"teddy bear": [(246, 42, 698, 614)], "bed": [(0, 430, 889, 742)]},
 }
 _PLACES = {"face": (500, 350), "hair": (450, 220), "fleece": (690, 520), "dress": (520, 460), "quilt": (250, 690)}
-_SHOWN = {place: Pixel("20240212_003921", *pixel) for place, pixel in _PLACES.items()}
+_PIXELS = {place: Pixel("20240212_003921", *pixel) for place, pixel in _PLACES.items()}
 BY_WORD: tuple[Question, ...] = tuple((word, word, (word,)) for word in WORDS)
 BY_EXAMPLE: tuple[Question, ...] = (
-    ("a pixel of its face", "teddy bear", (_SHOWN["face"],)),
-    ("pixels of face, hair, fleece, dress", "teddy bear", (*_SHOWN.values(),)[:4]),
-    ("a pixel of the quilt", "bed", (_SHOWN["quilt"],)),
+    ("a pixel of its face", "teddy bear", (_PIXELS["face"],)),
+    ("pixels of face, hair, fleece, dress", "teddy bear", (*_PIXELS.values(),)[:4]),
+    ("a pixel of the quilt", "bed", (_PIXELS["quilt"],)),
 )
 
 
@@ -146,7 +146,7 @@ def _splatlift(*arguments: object) -> None:
 
 
 def hed(weights: Path, image: Image.Image) -> Tensor:
-    """How likely each pixel is an edge, [h, w] f32.
+    """Compute the probability of an edge at each pixel, [h, w] f32.
 
     Holistically-nested edge detection (Xie and Tu, ICCV 2015): VGG16 with an edge map of each scale, fused.
     """
@@ -173,31 +173,31 @@ def basins(edges: Tensor) -> np.ndarray:
     heights = np.rint(ndimage.gaussian_filter(edges.numpy(), 1) * 255).astype(np.int32)
     levels = []
     for depth in DEPTHS:
-        filled = _fill(heights, depth)
+        flooded = _fill(heights, depth)
         markers = np.empty(heights.shape, np.int32)
-        ndimage.label(_fill(filled, 1) > filled, np.ones((3, 3)), output=markers)
+        ndimage.label(_fill(flooded, 1) > flooded, np.ones((3, 3)), output=markers)
         levels.append(ndimage.watershed_ift(heights.astype(np.uint8), markers) - 1)
     return np.stack(levels).astype(np.int32)
 
 
 def _fill(heights: np.ndarray, depth: int) -> np.ndarray:
     """Heights with each basin filled by ``depth``, or to its rim: reconstruction by erosion."""
-    filled = heights + depth
+    flooded = heights + depth
     while True:
-        lower = np.maximum(ndimage.minimum_filter(filled, 3), heights)
-        if np.array_equal(lower, filled):
-            return filled
-        filled = lower
+        lower = np.maximum(ndimage.minimum_filter(flooded, 3), heights)
+        if np.array_equal(lower, flooded):
+            return flooded
+        flooded = lower
 
 
-class Seen(NamedTuple):
-    """What CenterNet sees in a photo."""
+class Detections(NamedTuple):
+    """The detections of CenterNet in a photo."""
 
     maps: Tensor  # [128, 128, 80] f32, the score of each class around the middles of its things
     boxes: np.ndarray  # [100, 6] f32: x0 y0 x1 y1 in 512ths of the photo, score, class
 
 
-def centernet(networks: Path, photos: Mapping[str, Path]) -> dict[str, Seen]:
+def centernet(networks: Path, photos: Mapping[str, Path]) -> dict[str, Detections]:
     """View -> what CenterNet sees in its photo, squeezed into a square."""
     with tempfile.TemporaryDirectory() as scratch:
         pixels, maps = Path(scratch, "photos"), Path(scratch, "maps")
@@ -209,7 +209,7 @@ def centernet(networks: Path, photos: Mapping[str, Path]) -> dict[str, Seen]:
         rows = np.fromfile(maps, np.float32).reshape(len(photos), -1)
     cut = CELLS * CELLS * len(COCO)
     return {
-        view: Seen(torch.from_numpy(row[:cut].reshape(CELLS, CELLS, -1)), row[cut:].reshape(-1, 6))
+        view: Detections(torch.from_numpy(row[:cut].reshape(CELLS, CELLS, -1)), row[cut:].reshape(-1, 6))
         for view, row in zip(photos, rows, strict=True)
     }
 
@@ -226,7 +226,7 @@ def means(labels: np.ndarray, dense: Tensor) -> np.ndarray:
     return (sums / areas[:, None]).numpy()
 
 
-def make_packs(networks: Path, photos: Mapping[str, Path], seen: Mapping[str, Seen], out: Path) -> None:
+def make_packs(networks: Path, photos: Mapping[str, Path], detections: Mapping[str, Detections], out: Path) -> None:
     """Write ``words``, ``look`` and ``dense``: regions with scores of words, regions with a look, and its grids."""
     _splatlift("encode", *photos.values(), "-o", _pack(out, "dense"), *LITE2, _weights(networks))
     grids = read_features(_pack(out, "dense"))
@@ -239,14 +239,14 @@ def make_packs(networks: Path, photos: Mapping[str, Path], seen: Mapping[str, Se
         labels += starts[:, None, None].astype(np.int32)
         observed = grids[view]
         assert isinstance(observed, lc.FeatureGrid)
-        for name, dense in (("words", seen[view].maps), ("look", torch.as_tensor(observed.grid))):
+        for name, dense in (("words", detections[view].maps), ("look", torch.as_tensor(observed.grid))):
             folder = out / "regions" / name
             folder.mkdir(parents=True, exist_ok=True)
             np.save(folder / f"{view}_masks.npy", labels)
             np.save(folder / f"{view}.npy", means(labels, dense))
     for name, encoder in (("words", "HED, CenterNet's 80 classes of COCO"), ("look", "HED, EfficientNet-Lite2")):
-        told = ("--encoder-name", encoder, "--text-space", "none", "--no-normalised")
-        _splatlift("pack", "masks", out / "regions" / name, "-o", _pack(out, name), *told)
+        arguments = ("--encoder-name", encoder, "--text-space", "none", "--no-normalised")
+        _splatlift("pack", "masks", out / "regions" / name, "-o", _pack(out, name), *arguments)
 
 
 def _weights(networks: Path) -> Path:
@@ -263,7 +263,7 @@ def _photo(path: Path) -> Image.Image:
         return photo.convert("RGB")
 
 
-def judged(mask: np.ndarray, peak: tuple[int, int], boxes: Sequence[Box]) -> tuple[float, float, bool]:
+def compare_mask(mask: np.ndarray, peak: tuple[int, int], boxes: Sequence[Box]) -> tuple[float, float, bool]:
     """``box``, ``inside`` and ``points`` of a mask [H, W] bool and the x and y of the highest score."""
     rows, columns = np.nonzero(mask)
     points = any(_within(*peak, box) for box in boxes)
@@ -274,30 +274,30 @@ def judged(mask: np.ndarray, peak: tuple[int, int], boxes: Sequence[Box]) -> tup
     return overlap((x0, y0, x1, y1), boxes[0]), float(inside.mean()), points
 
 
-def overlap(one: Sequence[float], other: Sequence[float]) -> float:
+def overlap(a: Sequence[float], b: Sequence[float]) -> float:
     """Intersection over union of two boxes x0 y0 x1 y1."""
-    return box_iou(np.reshape(one, (2, 2)), np.reshape(other, (2, 2)))
+    return box_iou(np.reshape(a, (2, 2)), np.reshape(b, (2, 2)))
 
 
 def _within(x: Any, y: Any, box: Box) -> Any:
     return (x >= box[0]) & (x < box[2]) & (y >= box[1]) & (y < box[3])
 
 
-def of_photos(seen: Mapping[str, Seen], photos: Mapping[str, Path]) -> Iterator[dict[str, Any]]:
+def of_photos(detections: Mapping[str, Detections], photos: Mapping[str, Path]) -> Iterator[dict[str, Any]]:
     """A row a word: the best box that CenterNet finds for it in each judged photo alone."""
     for word in WORDS:
-        found = []
+        rows = []
         for view, boxes in BOXES.items():
-            own = seen[view].boxes
-            best = max(own[own[:, 5] == COCO.index(word)], key=lambda box: box[4], default=None)
+            view_boxes = detections[view].boxes
+            best = max(view_boxes[view_boxes[:, 5] == COCO.index(word)], key=lambda box: box[4], default=None)
             if best is None:
-                found.append((0.0, False))
+                rows.append((0.0, False))
                 continue
             scale = np.tile(_photo(photos[view]).size, 2) / SIDE
             x0, y0, x1, y1 = best[:4] * scale
             middle = (x0 + x1) / 2, (y0 + y1) / 2
-            found.append((overlap((x0, y0, x1, y1), boxes[word][0]), any(_within(*middle, b) for b in boxes[word])))
-        box, points = np.mean(found, axis=0)
+            rows.append((overlap((x0, y0, x1, y1), boxes[word][0]), any(_within(*middle, b) for b in boxes[word])))
+        box, points = np.mean(rows, axis=0)
         row = {"features": "the photo alone", "asked": word, "box": box}
         yield row | {"points": f"{points * len(BOXES):.0f}"}
 
@@ -308,20 +308,20 @@ def of_lift(
     """A row a question to a lift; its masks and a picture of them are written."""
     scene = Scene(out / f"{name}.lift.safetensors")
     sheet: list[np.ndarray] = []
-    for number, (asked, word, terms) in enumerate(questions):
+    for number, (query, word, terms) in enumerate(questions):
         answer = ask(scene, Query.of(terms), words)
-        found, shown = [], []
+        results, pictures = [], []
         for view, boxes in BOXES.items():
-            seen = view_mask(scene, answer, view)
-            scores = np.where(seen.row_sums >= MINIMUM_ROW_SUM, seen.attention, -np.inf)
+            answer_mask = view_mask(scene, answer, view)
+            scores = np.where(answer_mask.row_sums >= MINIMUM_ROW_SUM, answer_mask.attention, -np.inf)
             y, x = (int(part) for part in np.unravel_index(scores.argmax(), scores.shape))
-            found.append(judged(seen.mask, (x, y), boxes[word]))
-            Image.fromarray(seen.mask).save(out / "masks" / f"{name}_{number}_{view}.png")
-            shown.append(_picture(photos[view], seen.mask, (x, y), boxes[word]))
-        sheet.append(np.concatenate(shown, axis=1))
-        box, inside, points = np.mean(found, axis=0)
-        least = min(one[0] for one in found)
-        row = {"features": name, "asked": asked, "box": box, "least": least, "inside": inside}
+            results.append(compare_mask(answer_mask.mask, (x, y), boxes[word]))
+            Image.fromarray(answer_mask.mask).save(out / "masks" / f"{name}_{number}_{view}.png")
+            pictures.append(_picture(photos[view], answer_mask.mask, (x, y), boxes[word]))
+        sheet.append(np.concatenate(pictures, axis=1))
+        box, inside, points = np.mean(results, axis=0)
+        least = min(score[0] for score in results)
+        row = {"features": name, "asked": query, "box": box, "least": least, "inside": inside}
         yield row | {"points": f"{points * len(BOXES):.0f}"}
     Image.fromarray(np.concatenate(sheet)).save(out / f"{name}.png")
 
@@ -338,30 +338,32 @@ def _picture(photo: Path, mask: np.ndarray, peak: tuple[int, int], boxes: Sequen
 
 def main() -> None:
     """Bring the networks, make the packs, lift them, ask, judge and print the table."""
-    every = {"type": int, "default": 3, "metavar": "N", "help": "lift every Nth photo that is not held out"}
+    stride_option = {"type": int, "default": 3, "metavar": "N", "help": "lift every Nth photo that is not held out"}
     strengths = {"nargs": "+", "default": ["0"], "metavar": "L", "help": "of smooth features: numbers or auto"}
     places = (("folder", {"type": Path}), ("out", {"type": Path}))
-    given = *places, ("--every", every), ("--smoothness", strengths)
-    options = command_line("tests.benchmarks.real_chain", __doc__, *given).parse_args()
+    arguments = *places, ("--every", stride_option), ("--smoothness", strengths)
+    options = command_line("tests.benchmarks.real_chain", __doc__, *arguments).parse_args()
     folder, out = options.folder, options.out
     (out / "masks").mkdir(parents=True, exist_ok=True)
     networks = environment()
     photos = find_images([folder / "images"])
     held_out = (folder / "test_views.txt").read_text().split()
     lifted = [view for view in photos if view not in held_out][:: options.every]
-    seen = centernet(networks, {view: photos[view] for view in (*lifted, *BOXES)})
-    make_packs(networks, {view: photos[view] for view in lifted}, seen, out)
+    detections = centernet(networks, {view: photos[view] for view in (*lifted, *BOXES)})
+    make_packs(networks, {view: photos[view] for view in lifted}, detections, out)
     table = {"embeddings": np.eye(len(COCO), dtype=np.float32)}
     save_file(table, out / "coco_words.safetensors", metadata={"words": json.dumps(COCO)})
     words = TableEncoder.open(out / "coco_words.safetensors")
-    rows = [*of_photos(seen, photos)]
+    rows = [*of_photos(detections, photos)]
     for pack, strength in product(PACKS, options.smoothness):
         name = pack if strength == "0" else f"{pack}-smooth-{strength}"
         lifted_to = "-o", out / f"{name}.lift.safetensors", "--set", f"smoothness={strength}"
         _splatlift("lift", *scene_files(folder)[:2], _pack(out, pack), *lifted_to)
         rows += of_lift(name, BY_WORD if pack == "words" else BY_EXAMPLE, words, photos, out)
     note = f"A closed vocabulary: the 80 words of COCO. {len(lifted)} photos lifted, {len(BOXES)} others judged."
-    tell(rows, as_json=options.json, note=note, columns=("features", "asked", "box", "least", "inside", "points"))
+    print_rows(
+        rows, as_json=options.json, note=note, columns=("features", "asked", "box", "least", "inside", "points")
+    )
 
 
 if __name__ == "__main__":

@@ -25,62 +25,67 @@ from liftcore.values.pack import as_views, write_pack
 from liftcore.values.views import NO_LABEL, ViewFeatures
 
 NOISE = 0.45
-WRONG, MIXED = 0.1, 0.3  # shares of a view's regions
+WRONG, MERGED = 0.1, 0.3  # shares of a view's regions
 SHRUNK = 2  # label maps have every other pixel
 
 
 @dataclass(frozen=True)
-class Room:
-    """What to make."""
+class RoomSpec:
+    """The parameters of a room."""
 
     splats: int
     views: int
     size: tuple[int, int]  # width and height of the views, pixels
     channels: int
-    alike: float = 0.0  # cosine of two parts' vectors, in the mean
+    cosine: float = 0.0  # cosine of two parts' vectors, in the mean
     seed: int = 0
 
 
-def write_room(folder: Path, room: Room) -> None:
+def write_room(folder: Path, spec: RoomSpec) -> None:
     """Write ``point_cloud.ply``, ``cameras.json`` and ``features.safetensors``."""
     folder.mkdir(parents=True, exist_ok=True)
-    splats, cameras = room_splats(room.splats, room.seed), room_cameras(room.views, *room.size)
+    splats, cameras = room_splats(spec.splats, spec.seed), room_cameras(spec.views, *spec.size)
     write_splats(folder / "point_cloud.ply", splats)
     write_inria_cameras(lc.Cameras(tuple(cameras)), folder / "cameras.json")
-    views = as_views(observed_views(CpuRaster(splats), cameras, room))
+    views = as_views(observed_views(CpuRaster(splats), cameras, spec))
     write_pack(folder / "features.safetensors", views, {"encoder": "random parts", "normalised": "true"})
 
 
-def observed_views(raster: CpuRaster, cameras: Sequence[lc.Camera], room: Room) -> Iterator[tuple[str, ViewFeatures]]:
-    """What each view observes, by its name."""
-    parts = room_parts(room.splats, room.seed)  # [P, PART_LEVELS], numbers of parts on each level
+def observed_views(
+    raster: CpuRaster, cameras: Sequence[lc.Camera], spec: RoomSpec
+) -> Iterator[tuple[str, ViewFeatures]]:
+    """Iterate over views by name, with their observed features."""
+    parts = room_parts(spec.splats, spec.seed)  # [P, PART_LEVELS], numbers of parts on each level
     fine, counts = parts[:, -1], parts.max(axis=0) + 1
-    vectors = _vectors(int(counts.sum()), room)  # level by level
+    vectors = _vectors(int(counts.sum()), spec)  # level by level
     rows = np.full((PART_LEVELS, fine.max() + 2), NO_LABEL)  # of a finest part its vector on each level; none is last
     rows[:, fine] = (np.cumsum(counts) - counts + parts).T
     for number, camera in enumerate(cameras):
-        rng = np.random.default_rng((room.seed, number))
+        rng = np.random.default_rng((spec.seed, number))
         labels = torch.from_numpy(fine.astype(np.int32))
-        seen = raster.strongest_labels(_shrunk(camera), labels, lc.CompositingParams()).numpy()
-        shown, labels = np.unique(rows[:, seen], return_inverse=True)
-        first = int(shown[0] == NO_LABEL)
-        said = _noisy(_mistaken(vectors[shown[first:]], vectors, rng), rng)
+        strongest = raster.strongest_labels(_shrunk(camera), labels, lc.CompositingParams()).numpy()
+        visible_rows, labels = np.unique(rows[:, strongest], return_inverse=True)
+        first = int(visible_rows[0] == NO_LABEL)
+        vectors_seen = _noisy(_mistaken(vectors[visible_rows[first:]], vectors, rng), rng)
         yield (
             camera.name,
-            lc.Regions(torch.from_numpy((labels - first).astype(np.int32)), torch.from_numpy(said).half()),
+            lc.Regions(torch.from_numpy((labels - first).astype(np.int32)), torch.from_numpy(vectors_seen).half()),
         )
 
 
-def _vectors(count: int, room: Room) -> np.ndarray:
-    rng = np.random.default_rng((room.seed, 1))
-    own, common = _unit(rng.standard_normal((count, room.channels))), _unit(rng.standard_normal((1, room.channels)))
-    return _unit(np.sqrt(1.0 - room.alike) * own + np.sqrt(room.alike) * common)
+def _vectors(count: int, spec: RoomSpec) -> np.ndarray:
+    rng = np.random.default_rng((spec.seed, 1))
+    unique, common = (
+        _unit(rng.standard_normal((count, spec.channels))),
+        _unit(rng.standard_normal((1, spec.channels))),
+    )
+    return _unit(np.sqrt(1.0 - spec.cosine) * unique + np.sqrt(spec.cosine) * common)
 
 
 def _mistaken(book: np.ndarray, vectors: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    others = vectors[rng.integers(0, len(vectors), len(book))]
+    other_vectors = vectors[rng.integers(0, len(vectors), len(book))]
     fate = rng.uniform(size=(len(book), 1))
-    return _unit(np.where(fate < WRONG, others, np.where(fate < WRONG + MIXED, book + others, book)))
+    return _unit(np.where(fate < WRONG, other_vectors, np.where(fate < WRONG + MERGED, book + other_vectors, book)))
 
 
 def _noisy(book: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -97,7 +102,7 @@ def _shrunk(camera: lc.Camera) -> lc.Camera:
     return camera.replace(**sizes, **lengths)
 
 
-def write_bench_room(folder: Path, size: Room, different: int = 12) -> tuple[Path, Path, Path]:
+def write_bench_room(folder: Path, size: RoomSpec, different: int = 12) -> tuple[Path, Path, Path]:
     """The room of ``splatlift bench`` as files: Voronoi regions over random vectors, and no part is seen twice.
 
     Args:
@@ -120,14 +125,14 @@ def write_bench_room(folder: Path, size: Room, different: int = 12) -> tuple[Pat
 def main() -> None:
     """Write the scene."""
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.scenes", description=__doc__)
-    room = parser.add_subparsers(dest="kind", required=True).add_parser("room")
-    room.add_argument("folder", type=Path)
+    spec = parser.add_subparsers(dest="kind", required=True).add_parser("room")
+    spec.add_argument("folder", type=Path)
     for name, default in (("splats", 500_000), ("views", 160), ("width", 986), ("height", 728), ("channels", 512)):
-        room.add_argument(f"--{name}", type=int, default=default)
-    room.add_argument("--alike", type=float, default=0.0, metavar="C")
-    given = parser.parse_args()
-    size = given.width, given.height
-    write_room(given.folder, Room(given.splats, given.views, size, given.channels, given.alike))
+        spec.add_argument(f"--{name}", type=int, default=default)
+    spec.add_argument("--alike", type=float, default=0.0, metavar="C")
+    options = parser.parse_args()
+    size = options.width, options.height
+    write_room(options.folder, RoomSpec(options.splats, options.views, size, options.channels, options.cosine))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What the smoothness of features gains and costs: all tables of it in docs/results.md.
+"""Gains and costs of the smoothness of features: all its tables in docs/results.md.
 
     python -m tests.benchmarks.smoothness DATA [--tables NAME ...] [--only TEXT] [--into FILE] [--json]
 
@@ -52,7 +52,7 @@ from liftcore.solve.smooth_by_halves import STRENGTHS, SmoothnessChoice, choose_
 from liftcore.text.table import TableEncoder
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.views import NO_LABEL, FeatureGrid, ViewFeatures
-from tests.benchmarks.base import command_line, read_pack, read_scene, table_of, tell
+from tests.benchmarks.base import command_line, print_rows, read_pack, read_scene, table_of
 from tests.benchmarks.consensus import still_life_scene, with_mistakes
 from tests.benchmarks.objects import measure_boxes, things_of
 from tests.benchmarks.tabletop import Figures, Truth, tabletop
@@ -76,7 +76,7 @@ FACTORS: dict[str, dict[str, Any]] = {
     "and consensus (`default`)": {},
 }
 
-HIDDEN = ("table", "name")  # columns of the file alone
+FILE_COLUMNS = ("table", "name")  # columns of the file alone
 Row = dict[str, Any]
 
 
@@ -87,15 +87,17 @@ class RandomWords:
 
     def encode(self, texts: Sequence[str]) -> np.ndarray:
         """[n, 128] f32."""
-        drawn = [np.random.default_rng(zlib.crc32(text.encode())).standard_normal(self.channels) for text in texts]
+        samples = [np.random.default_rng(zlib.crc32(text.encode())).standard_normal(self.channels) for text in texts]
         common = np.random.default_rng(0).standard_normal(self.channels)
-        vectors = np.array([one / np.linalg.norm(one) for one in drawn]) + 0.3 * common / np.linalg.norm(common)
+        vectors = np.array([sample / np.linalg.norm(sample) for sample in samples]) + 0.3 * common / np.linalg.norm(
+            common
+        )
         return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
 
 
 @dataclass(frozen=True)
 class StepInputs:
-    """What the step has of a lift."""
+    """The inputs of the smoothing step in a lift."""
 
     truth: Truth
     W: RegionWeights
@@ -103,7 +105,7 @@ class StepInputs:
     codebook: Codebook
     total_weight: Tensor  # [P] f32
     confidence: Tensor | None  # [P] f32
-    seen: Tensor  # [P] bool
+    visible: Tensor  # [P] bool
     scores: Tensor  # [P, K] f32, of X with the classes
     params: lc.CompositingParams
 
@@ -121,9 +123,9 @@ class StepInputs:
             return SmoothnessChoice(0.0, {})
 
         def hold(X: Tensor, *arguments: Any, **_: Any) -> tuple[Tensor, dict[str, Any]]:
-            total_weight, confidence, seen = arguments[1:4]
+            total_weight, confidence, visible = arguments[1:4]
             scores = torch.cat([rows.float() @ truth.classes.T for rows in X.split(1 << 14)])
-            parts.update(total_weight=total_weight, confidence=confidence, seen=seen, scores=scores)
+            parts.update(total_weight=total_weight, confidence=confidence, visible=visible, scores=scores)
             return X, {"smoothness": 0.0}
 
         with mock.patch.multiple(in_memory, weaken_edges=weaken, choose_smoothness=choose, smooth=hold):
@@ -135,17 +137,17 @@ class StepInputs:
         return SplatGraph.of(coloured(self.truth.raster.splats, colours))
 
     def choose(self, graph: SplatGraph) -> float:
-        """What ``auto`` takes."""
+        """Choose the strength as ``auto`` does."""
         return choose_smoothness(self.W, self.codebook, graph, self.confidence).smoothness
 
-    def judge(self, steps: Mapping[str, tuple[SplatGraph, float]]) -> dict[str, str]:
+    def measure_steps(self, steps: Mapping[str, tuple[SplatGraph, float]]) -> dict[str, str]:
         """Figures after each step, a graph with a lambda."""
         tables = [
-            smooth(self.scores.clone(), graph, self.total_weight, self.confidence, self.seen, strength)[0]
+            smooth(self.scores.clone(), graph, self.total_weight, self.confidence, self.visible, strength)[0]
             for graph, strength in steps.values()
         ]
         figures = self.truth.judge_each(tables, self.params)
-        return {name: cell(one) for name, one in zip(steps, figures, strict=True)}
+        return {name: cell(figure) for name, figure in zip(steps, figures, strict=True)}
 
 
 def cell(figures: Figures) -> str:
@@ -195,28 +197,28 @@ class Case:
 
 def strengths(inputs: StepInputs, colours: str) -> dict[str, Any]:
     """Figures by lambda, without the edges of masks, and the lambda that was chosen."""
-    plain = inputs.graph(colours)
-    graph, parted = weaken_edges(plain, inputs.W, inputs.levels)
+    full_graph = inputs.graph(colours)
+    graph, weakened = weaken_edges(full_graph, inputs.W, inputs.levels)
     steps = {f"{strength:g}": (graph, strength) for strength in (0.0, *STRENGTHS)}
-    steps |= {"4, no edges": (plain, STRONG)} if parted else {}
-    return {"chosen": inputs.choose(graph), **inputs.judge(steps)}
+    steps |= {"4, no edges": (full_graph, STRONG)} if weakened else {}
+    return {"chosen": inputs.choose(graph), **inputs.measure_steps(steps)}
 
 
 def with_factor(inputs: StepInputs) -> dict[str, Any]:
     """Figures without smoothness, with 4 and with the chosen lambda."""
     graph, _ = weaken_edges(inputs.graph("own"), inputs.W, inputs.levels)
-    chosen = inputs.choose(graph)
-    steps = {"0": (graph, 0.0), "4": (graph, STRONG), "auto": (graph, chosen)}
-    return {"chosen": chosen, **inputs.judge(steps)}
+    choice = inputs.choose(graph)
+    steps = {"0": (graph, 0.0), "4": (graph, STRONG), "auto": (graph, choice)}
+    return {"chosen": choice, **inputs.measure_steps(steps)}
 
 
 def unsmoothed_and_smoothed(truth: Truth, views: Mapping[str, ViewFeatures]) -> tuple[lc.LiftResult, lc.LiftResult]:
     """A lift before the step, and after it with ``auto``."""
     before = list[Tensor]()
 
-    def step(X: Tensor, *arguments: Any, **how: Any) -> tuple[Tensor, dict[str, Any]]:
+    def step(X: Tensor, *arguments: Any, **keywords: Any) -> tuple[Tensor, dict[str, Any]]:
         before.append(X.clone())
-        return smooth(X, *arguments, **how)
+        return smooth(X, *arguments, **keywords)
 
     with mock.patch.object(in_memory, "smooth", step):
         lifted = truth.lift(views, smoothness="auto", progress=False)
@@ -224,26 +226,26 @@ def unsmoothed_and_smoothed(truth: Truth, views: Mapping[str, ViewFeatures]) -> 
 
 
 def answers(truth: Truth, table: TableEncoder, lifted: lc.LiftResult) -> dict[str, Any]:
-    """What is answered: masks of words alone, words for what is not there, boxes, and the map of all words."""
-    scene = truth.opened(lifted)
-    others = [word for word in table.words if word not in truth.words]
-    absent = np.random.default_rng(0).choice(others, ABSENT, replace=False).tolist()
-    alone = measure_alone(scene, truth, table, absent)
-    of_things = {thing: ask(scene, truth.words[thing], table) for thing in things_of(truth)}
+    """Measure answers: masks of single words, words of absent objects, boxes, and the map of all words."""
+    scene = truth.open_scene(lifted)
+    other_words = [word for word in table.words if word not in truth.words]
+    absent = np.random.default_rng(0).choice(other_words, ABSENT, replace=False).tolist()
+    single_queries = measure_alone(scene, truth, table, absent)
+    of_things = {number: ask(scene, truth.words[number], table) for number in things_of(truth)}
     boxes = measure_boxes(scene, of_things, truth.objects.numpy())
-    found = scene.segment(truth.words, encoder=table)
-    rows = [0, *(1 + truth.words.index(named.word) for named in found.named_words)]
-    classes = np.array(rows, np.int32)[found.values]
-    shown = torch.stack(list(truth.held_out.values()))
+    segmentation = scene.segment(truth.words, encoder=table)
+    rows = [0, *(1 + truth.words.index(label.word) for label in segmentation.named_words)]
+    classes = np.array(rows, np.int32)[segmentation.values]
+    truth_labels = torch.stack(list(truth.held_out.values()))
     maps = [torch.from_numpy(value_map(scene, classes, view)).long() - 1 for view in truth.held_out]
-    best = torch.where(shown < 0, NO_LABEL, torch.stack(maps))
+    best = torch.where(truth_labels < 0, NO_LABEL, torch.stack(maps))
     return {
-        "masks": f"{alone['mean']:.3f}, {alone['worst']:.2f}",
-        "called absent": alone["called absent"],
-        "absent words select nothing": alone["absent words select nothing"],
+        "masks": f"{single_queries['mean']:.3f}, {single_queries['worst']:.2f}",
+        "called absent": single_queries["called absent"],
+        "absent words select nothing": single_queries["absent words select nothing"],
         "one object": boxes["one"],
         "boxes": f"{boxes['box']:.3f}, {boxes['worst']:.2f}",
-        "segment": float(class_ious(best, shown, len(truth.words)).nanmean()),
+        "segment": float(class_ious(best, truth_labels, len(truth.words)).nanmean()),
     }
 
 
@@ -251,8 +253,8 @@ def with_aggregation(truth: Truth, views: Mapping[str, ViewFeatures], step: str)
     """Figures of a lift with aggregation."""
     strength = "auto" if step == "auto" else 0
     lifted = truth.lift(views, aggregation=True, smoothness=strength, progress=False)
-    chosen = lifted.diagnostics.get("smoothing", {}).get("smoothness", 0.0)
-    return {"chosen": chosen, "aggregated": cell(truth.judge(lifted))}
+    smoothness = lifted.diagnostics.get("smoothing", {}).get("smoothness", 0.0)
+    return {"chosen": smoothness, "aggregated": cell(truth.measure_steps(lifted))}
 
 
 def cases(data: Path, tables: Sequence[str]) -> Iterator[Case]:
@@ -264,19 +266,19 @@ def cases(data: Path, tables: Sequence[str]) -> Iterator[Case]:
         scenes.append(scenes[0] if scenes else tabletop(folder))
         return scenes[0]
 
-    def pack(name: str, every: int) -> Callable[[], tuple[Truth, Mapping[str, ViewFeatures]]]:
-        return lambda: (truth(), read_pack(folder, name, every))
+    def pack(name: str, stride: int) -> Callable[[], tuple[Truth, Mapping[str, ViewFeatures]]]:
+        return lambda: (truth(), read_pack(folder, name, stride))
 
     def mistaken(kind: str, seed: int) -> tuple[Truth, Mapping[str, ViewFeatures]]:
         return truth(), with_mistakes(folder, kind, seed)
 
-    for name, file, every, colours in (
+    for name, file, stride, colours in (
         ("grids", "grids", 1, COLOURS[:2]), ("grids", "grids", 3, COLOURS[:1]), ("grids", "grids", 5, COLOURS[:1]),
-        *(("hard", "features_hard", every, COLOURS[: 2 if every < 5 else 1]) for every in (13, 7, 4, 2, 1)),
-        *(("noisy", "features", every, COLOURS[: 2 if every in (1, 4) else 1]) for every in (13, 7, 4, 1)),
+        *(("hard", "features_hard", stride, COLOURS[: 2 if stride < 5 else 1]) for stride in (13, 7, 4, 2, 1)),
+        *(("noisy", "features", stride, COLOURS[: 2 if stride in (1, 4) else 1]) for stride in (13, 7, 4, 1)),
     ):  # fmt: skip
         if "strengths" in tables:
-            yield Case("strengths", f"{name}, every {every}", pack(file, every), colours)
+            yield Case("strengths", f"{name}, every {stride}", pack(file, stride), colours)
     for kind, seed in product(("hard", "usual"), (7, 8)):
         if "strengths" in tables:
             yield Case("strengths", f"{kind} {seed}", partial(mistaken, kind, seed))
@@ -286,18 +288,18 @@ def cases(data: Path, tables: Sequence[str]) -> Iterator[Case]:
             if kind in ("usual", "hard"):
                 name = f"{scene}, {kind} {seed}, masks of things alone"
                 yield Case("generated", name, partial(generated, scene, kind, seed), settings={"levels": 0})
-    for name, file, every in (
+    for name, file, stride in (
         ("hard", "features_hard", 1), ("hard", "features_hard", 4), ("noisy", "features", 1),
         ("noisy", "features", 4), ("grids", "grids", 1),
     ):  # fmt: skip
         if "factors" in tables:
-            yield Case("factors", f"{name}, every {every}", pack(file, every))
-    for table, (name, file, every) in product(
+            yield Case("factors", f"{name}, every {stride}", pack(file, stride))
+    for table, (name, file, stride) in product(
         ("answers", "aggregation"),
         (("hard", "features_hard", 4), ("grids", "grids", 1), ("hard", "features_hard", 1), ("noisy", "features", 1)),
     ):
         if table in tables:
-            yield Case(table, f"{name}, every {every}", pack(file, every), folder=folder)
+            yield Case(table, f"{name}, every {stride}", pack(file, stride), folder=folder)
     for scene in GENERATED if "factors" in tables else ():
         yield Case("factors", f"{scene}, hard 7", partial(generated, scene, "hard", 7))
 
@@ -320,17 +322,17 @@ def fidelity_rows(folder: Path, missing: Sequence[tuple[str, str]]) -> Iterator[
     """A row for each stride and lambda: fidelity of a lift to maps of other views."""
     splats, cameras = read_scene(folder)
     maps = {name: grid for name, grid in read_pack(folder, TEST_MAPS).items() if isinstance(grid, FeatureGrid)}
-    mean = torch.stack([one.grid.float().mean(dim=(0, 1)) for one in maps.values()]).mean(dim=0)
+    mean = torch.stack([grid_view.grid.float().mean(dim=(0, 1)) for grid_view in maps.values()]).mean(dim=0)
 
     def cosines(lifted: lc.LiftResult, name: str) -> torch.Tensor:
         grid = maps[name].grid.float()
         height, width, channels = grid.shape
         camera = at_cells(cameras[name], width, height)
         parts = [lifted.features[:, first : first + CHANNELS].float() for first in range(0, channels, CHANNELS)]
-        shown = torch.cat([lc.render(splats, camera, part) for part in parts], dim=2)
-        filled = lc.render(splats, camera, torch.ones(splats.count, 1))[:, :, 0]
-        shown = shown / filled.clamp_min(FULL)[:, :, None]
-        return cosine_similarity(shown - mean, grid - mean, dim=2)[filled >= FULL]
+        rendered = torch.cat([lc.render(splats, camera, part) for part in parts], dim=2)
+        opacity = lc.render(splats, camera, torch.ones(splats.count, 1))[:, :, 0]
+        rendered = rendered / opacity.clamp_min(FULL)[:, :, None]
+        return cosine_similarity(rendered - mean, grid - mean, dim=2)[opacity >= FULL]
 
     for name, smoothness in missing:
         views = read_pack(folder, "grids", int(name.rsplit(" ", 1)[1]))
@@ -377,8 +379,8 @@ def measure(options: Namespace, rows: Rows) -> None:
             for row in case.measure(missing):
                 rows.add(row)
     if "fidelity" in options.tables:
-        wanted = product(("dense, every 1", "dense, every 4"), LAMBDAS)
-        missing = [one for one in wanted if ("fidelity", *one) not in rows and options.only in one[0]]
+        requested = product(("dense, every 1", "dense, every 4"), LAMBDAS)
+        missing = [key for key in requested if ("fidelity", *key) not in rows and options.only in key[0]]
         for row in fidelity_rows(options.data / "plush", missing) if missing else ():
             rows.add(row)
 
@@ -396,12 +398,12 @@ def main() -> None:
     options = parser.parse_args()
     rows = Rows(options.into)
     measure(options, rows)
-    shown = [[row for row in rows.rows if row["table"] == table] for table in options.tables]
-    columns = [list(dict.fromkeys(key for row in part for key in row if key not in HIDDEN)) for part in shown]
+    tables = [[row for row in rows.rows if row["table"] == table] for table in options.tables]
+    columns = [list(dict.fromkeys(key for row in part for key in row if key not in FILE_COLUMNS)) for part in tables]
     if not options.json:
-        for part, names in list(zip(shown, columns, strict=True))[:-1]:
+        for part, names in list(zip(tables, columns, strict=True))[:-1]:
             print(table_of(part, names) + "\n")
-    tell(rows.rows if options.json else shown[-1], as_json=options.json, columns=columns[-1])
+    print_rows(rows.rows if options.json else tables[-1], as_json=options.json, columns=columns[-1])
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ KILLS_A_JOB = 2  # the third attempt is the last
 POOLED = 6  # descriptors of read connections that a server may come to hold later; a leak has one a job
 WARM_UP_JOBS = 5  # before the first look at what a server holds
 SUFFIXES = {"splats": ".ply", "cameras": ".json", "features": ".safetensors"}
-NOTHING = {kind: kind.encode() for kind in SUFFIXES}  # a scene for stand-ins, which look at none
+EMPTY_FILES = {kind: kind.encode() for kind in SUFFIXES}  # a scene for stand-ins, which look at none
 ANSWERS = ("--behaviour", "answer")
 
 
@@ -97,17 +97,17 @@ def _kill_jobs(
 ) -> dict[str, Any]:
     victims, stages = Counter[str](), Counter[str]()
     figures = Counter[str](jobs=0, lost=0, doubled=0, digests_equal=0, resumed=0)
-    begun = time.monotonic()
+    start = time.monotonic()
     reference = insist(service, body, "undisturbed")
     service.wait_until_ended(reference)
-    whole = time.monotonic() - begun
-    wanted = service.digest(reference)
-    begun = time.monotonic()  # of the kills: the first lift may have compiled kernels
-    while victims.total() < kills and time.monotonic() - begun < seconds:
+    duration = time.monotonic() - start
+    expected = service.digest(reference)
+    start = time.monotonic()  # of the kills: the first lift may have compiled kernels
+    while victims.total() < kills and time.monotonic() - start < seconds:
         key = f"job {figures['jobs']}"
         job = insist(service, body, key)
         for _ in range(min(KILLS_A_JOB, kills - victims.total())):
-            time.sleep(chance.uniform(0, whole))
+            time.sleep(chance.uniform(0, duration))
             stages[_stage(service.job(job))] += 1
             if chance.random() < 0.5 and kill_processes_of(job):
                 victims["child"] += 1
@@ -120,10 +120,10 @@ def _kill_jobs(
         figures["lost"] += not succeeded or insist(service, body, key) != job
         figures["doubled"] += service.times_succeeded(job) > 1
         figures["resumed"] += "files of earlier work are kept" in service.client.get(f"/jobs/{job}/events").text
-        figures["digests_equal"] += succeeded and service.digest(job) == wanted
+        figures["digests_equal"] += succeeded and service.digest(job) == expected
     figures["doubled"] += len(service.client.get("/jobs").json()["jobs"]) - figures["jobs"] - 1
     head = {"kills": victims.total(), "victims": victims, "killed_while": stages, **figures}
-    return head | {"undisturbed_seconds": round(whole, 2), "seconds": round(time.monotonic() - begun)}
+    return head | {"undisturbed_seconds": round(duration, 2), "seconds": round(time.monotonic() - start)}
 
 
 def _stage(job: dict[str, Any]) -> str:
@@ -138,10 +138,10 @@ def fault_points(points: Iterable[str]) -> dict[str, str]:
 
 
 def _at_point(point: str) -> str:
-    compared = "trade-off" in point
-    route, made = ("/tradeoff", "/tradeoffs/{}/chart") if compared else ("/lift", "/lifts/{}/features")
+    is_tradeoff = "trade-off" in point
+    route, result_route = ("/tradeoff", "/tradeoffs/{}/chart") if is_tradeoff else ("/lift", "/lifts/{}/features")
     with tempfile.TemporaryDirectory() as folder:
-        body = stored(Path(folder), NOTHING)
+        body = stored(Path(folder), EMPTY_FILES)
         with ServiceProcess(Path(folder), *ANSWERS, "--point", point) as service:
             first = service.order(body, "key", route)
             assert service.wait() == -9, point
@@ -150,7 +150,7 @@ def _at_point(point: str) -> str:
             assert job is not None and first in (None, job)
             state = service.wait_until_ended(job)["state"]
             jobs, times = len(service.client.get("/jobs").json()["jobs"]), service.times_succeeded(job)
-            result = service.client.get(made.format(job)).status_code
+            result = service.client.get(result_route.format(job)).status_code
     once = (state, jobs, times, result) == ("succeeded", 1, 1, 200)
     return "finished once" if once else f"{state}: {jobs} jobs, {times} times, the result gives {result}"
 
@@ -158,8 +158,8 @@ def _at_point(point: str) -> str:
 def leak_loop(jobs: int) -> dict[str, Any]:
     """Run jobs through one server, each followed by a stream, and see what it holds."""
     with tempfile.TemporaryDirectory() as folder:
-        body = stored(Path(folder), NOTHING)
-        seen = []
+        body = stored(Path(folder), EMPTY_FILES)
+        samples = []
         with ServiceProcess(Path(folder), *ANSWERS) as service:
             for number in range(WARM_UP_JOBS + jobs):
                 job = service.order(body, str(number))
@@ -167,10 +167,12 @@ def leak_loop(jobs: int) -> dict[str, Any]:
                 assert service.times_succeeded(job) == 1  # the stream ends with the job
                 if number >= WARM_UP_JOBS - 1:
                     time.sleep(0.5)
-                    seen.append(usage(service.pid))
-        left = [path.name for room in ("work", "tmp") for path in (Path(folder) / room).iterdir()]
-    growth = {name: int(np.median([look[name] for look in seen[-3:]])) - seen[0][name] for name in seen[0]}
-    return {"jobs": jobs, "first": seen[0], "last": seen[-1], "growth": growth, "left_over": left}
+                    samples.append(usage(service.pid))
+        remaining = [path.name for folder_name in ("work", "tmp") for path in (Path(folder) / folder_name).iterdir()]
+    growth = {
+        name: int(np.median([sample[name] for sample in samples[-3:]])) - samples[0][name] for name in samples[0]
+    }
+    return {"jobs": jobs, "first": samples[0], "last": samples[-1], "growth": growth, "left_over": remaining}
 
 
 def main() -> int:
@@ -179,21 +181,21 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--seconds", type=float, default=7_200, help="no job of the kill loop begins after these")
     parser.add_argument("--jobs", type=int, default=50, help="of the leak test")
-    given = parser.parse_args()
+    options = parser.parse_args()
     warm_up()  # the undisturbed lift is timed, and kernels that it compiled first would stretch its time
     with tempfile.TemporaryDirectory() as folder:
         files = scene_files(Path(folder), views=30, splats=20_000, width=320)
     figures = {
         **machine(),
-        "leaks": leak_loop(given.jobs),
+        "leaks": leak_loop(options.jobs),
         "points": fault_points(POINTS),
-        "kills": kill_loop(files, kills=given.kills, seconds=given.seconds),
+        "kills": kill_loop(files, kills=options.kills, seconds=options.seconds),
     }
     print(json.dumps(figures, indent=2))
     kills, growth = figures["kills"], figures["leaks"]["growth"]
-    kept = kills["lost"] == kills["doubled"] == 0 and kills["digests_equal"] == kills["jobs"]
+    passed = kills["lost"] == kills["doubled"] == 0 and kills["digests_equal"] == kills["jobs"]
     level = growth["descriptors"] <= POOLED and growth["threads"] <= 1
-    return 0 if kept and level and set(figures["points"].values()) == {"finished once"} else 1
+    return 0 if passed and level and set(figures["points"].values()) == {"finished once"} else 1
 
 
 if __name__ == "__main__":

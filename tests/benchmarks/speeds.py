@@ -13,7 +13,7 @@ import liftcore as lc
 from liftcore.evaluate.accuracy import cosine_figures
 from liftcore.lifting.files import lift_files
 from liftcore.values.settings import Speed
-from tests.benchmarks.base import command_line, scene_files, tell
+from tests.benchmarks.base import command_line, print_rows, scene_files
 
 
 def main() -> None:
@@ -28,27 +28,27 @@ def main() -> None:
     options = parser.parse_args()
     splats, cameras, pack = scene_files(options.folder)
     seconds: dict[str, float] = {}
-    made: dict[str, lc.LiftResult] = {}
+    lifts: dict[str, lc.LiftResult] = {}
     for number in range(1 + max(1, options.rounds)):  # the first round compiles
         for speed in dict.fromkeys(["exact", *options.speeds]):
             start = time.process_time()
             settings = lc.LiftSettings.of(preset="tikhonov", speed=speed, device="cpu")
-            made[speed] = lift_files(splats, cameras, [pack], settings, threads=1)
+            lifts[speed] = lift_files(splats, cameras, [pack], settings, threads=1)
             if number:
                 seconds[speed] = min(seconds.get(speed, float("inf")), time.process_time() - start)
-    exact = made["exact"]
+    exact = lifts["exact"]
     rows = [
         {
             "speed": speed,
-            "views": len(one.metadata.views),
+            "views": len(lifted.metadata.views),
             "processor s": seconds[speed],
             "times less": seconds["exact"] / seconds[speed],
-            **cosine_figures(one.features, exact.features, exact.total_weight),
-            "expected of the views": one.metadata.diagnostics["plan"]["view_cosine"],
+            **cosine_figures(lifted.features, exact.features, exact.total_weight),
+            "expected of the views": lifted.metadata.diagnostics["plan"]["view_cosine"],
         }
-        for speed, one in made.items()
+        for speed, lifted in lifts.items()
     ]
-    tell(rows, as_json=options.json)
+    print_rows(rows, as_json=options.json)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from unittest.mock import patch
 
 import liftcore as lc
 from liftcore.lifting.files import lift_files
-from tests.benchmarks.base import command_line, scene_files, tell
+from tests.benchmarks.base import command_line, print_rows, scene_files
 
 
 def main() -> None:
@@ -40,7 +40,7 @@ def main() -> None:
         {"preset": preset, **seconds, "all / geometry": seconds["all"] / seconds["geometry"]}
         for preset, seconds in best.items()
     ]
-    tell(rows, as_json=options.json)
+    print_rows(rows, as_json=options.json)
 
 
 if __name__ == "__main__":

@@ -24,14 +24,14 @@ from liftcore.query.scene import Scene
 from liftcore.raster.base import Raster
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.values.views import NO_LABEL, ViewFeatures
-from tests.benchmarks.base import command_line, read_pack, read_scene, tell
+from tests.benchmarks.base import command_line, print_rows, read_pack, read_scene
 
 EVIDENCE_OVER = 0.5  # of the splats that count
 
 
 @dataclass(frozen=True)
 class Figures:
-    """What a lift reached."""
+    """The accuracy of a lift."""
 
     accuracy: float  # over the splats that count
     miou: float  # over the classes, in the held-out views
@@ -47,33 +47,33 @@ class Truth:
     words: tuple[str, ...]  # [K], the classes
     classes: Tensor  # [K, F] f32, their unit vectors
     objects: Tensor  # [P] int, the class of each splat
-    counted: Tensor  # [P] bool, those that accuracy is over
+    evaluated: Tensor  # [P] bool, those that accuracy is over
     held_out: Mapping[str, Tensor]  # view -> [H, W] int, the class of each pixel, -1 for none
 
     def lift(self, views: Mapping[str, ViewFeatures], **settings: Any) -> lc.LiftResult:
         """A lift of views onto the scene, without the diagnostics unless the settings ask for it."""
-        chosen: dict[str, Any] = {"diagnostic_rays": 0, **settings}
-        return lc.lift(self.raster.splats, self.cameras, views, **chosen).cpu()
+        options: dict[str, Any] = {"diagnostic_rays": 0, **settings}
+        return lc.lift(self.raster.splats, self.cameras, views, **options).cpu()
 
-    def opened(self, lifted: lc.LiftResult) -> Scene:
+    def open_scene(self, lifted: lc.LiftResult) -> Scene:
         """A lift to ask questions of."""
         scene = Scene(lifted, self.raster.splats, self.cameras)
         scene.raster = self.raster
         return scene
 
     def scores(self, lifted: lc.LiftResult) -> Tensor:
-        """How near each splat is to each class, [P, K] f32."""
+        """Compute the score of each class at each splat, [P, K] f32."""
         return lifted.features.float() @ self.classes.T
 
     def rendered(self, scores: Tensor, params: lc.CompositingParams, raster: Raster | None = None) -> list[Tensor]:
         """The scores [P, K] in each held-out view, [H, W, K] f32; rendering is linear, so features need not be."""
         return [(raster or self.raster).render(self.cameras[view], scores, params) for view in self.held_out]
 
-    def judge(self, lifted: lc.LiftResult, raster: Raster | None = None) -> Figures:
+    def evaluate(self, lifted: lc.LiftResult, raster: Raster | None = None) -> Figures:
         """The figures of a lift; the raster is of the same splats in another form."""
-        return self.judge_scores(self.scores(lifted), lifted.settings.render_params, raster)
+        return self.evaluate_scores(self.scores(lifted), lifted.settings.render_params, raster)
 
-    def judge_scores(self, scores: Tensor, params: lc.CompositingParams, raster: Raster | None = None) -> Figures:
+    def evaluate_scores(self, scores: Tensor, params: lc.CompositingParams, raster: Raster | None = None) -> Figures:
         """The figures of scores [P, K], rendered with these parameters."""
         return self.judge_each([scores], params, raster)[0]
 
@@ -86,11 +86,11 @@ class Truth:
         return [self._figures(scores, part) for scores, part in zip(tables, parts, strict=True)]
 
     def _figures(self, scores: Tensor, images: Sequence[Tensor]) -> Figures:
-        accuracy = float((scores.argmax(dim=1) == self.objects)[self.counted].float().mean())
+        accuracy = float((scores.argmax(dim=1) == self.objects)[self.evaluated].float().mean())
         best = torch.stack([image.argmax(dim=2) for image in images])
-        shown = torch.stack(list(self.held_out.values()))
-        best[shown < 0] = NO_LABEL  # rays that meet nothing show no class
-        ious = class_ious(best, shown, len(self.classes))
+        truth_labels = torch.stack(list(self.held_out.values()))
+        best[truth_labels < 0] = NO_LABEL  # rays that meet nothing show no class
+        ious = class_ious(best, truth_labels, len(self.classes))
         return Figures(accuracy, float(ious.nanmean()), float(ious[~ious.isnan()].min()))
 
 
@@ -98,21 +98,21 @@ def tabletop(folder: Path) -> Truth:
     """The scene in a folder in the layout of ``tabletop``, opened once for many lifts."""
     document, truth = json.loads((folder / "truth.json").read_text()), load_file(folder / "truth.safetensors")
     vectors = load_file(folder / "text_table.safetensors")["embeddings"]
-    classes = vectors[[thing["lvis_row"] for thing in document["objects"]]].float()
+    classes = vectors[[entry["lvis_row"] for entry in document["objects"]]].float()
     splats, cameras = read_scene(folder)
-    nothing = lc.Regions(torch.full((1, 1, 1), NO_LABEL, dtype=torch.int32), torch.ones(1, 1))
+    no_labels = lc.Regions(torch.full((1, 1, 1), NO_LABEL, dtype=torch.int32), torch.ones(1, 1))
     return Truth(
         CpuRaster(splats),
         cameras,
-        tuple(thing["class"] for thing in document["objects"]),
+        tuple(entry["class"] for entry in document["objects"]),
         torch.nn.functional.normalize(classes, dim=1),
         truth["splat_object"],
-        counted(splats, cameras, dict.fromkeys(read_pack(folder, "features"), nothing)),
+        evaluated_splats(splats, cameras, dict.fromkeys(read_pack(folder, "features"), no_labels)),
         {view: truth[f"{view}/mask"] for view in document["held_out_views"]},
     )
 
 
-def counted(splats: lc.Splats, cameras: lc.Cameras, views: Mapping[str, ViewFeatures]) -> Tensor:
+def evaluated_splats(splats: lc.Splats, cameras: lc.Cameras, views: Mapping[str, ViewFeatures]) -> Tensor:
     """[P] bool: the splats with total weight over EVIDENCE_OVER in these views."""
     weights = lc.region_weights(splats, cameras, views, preset="row-sum")
     total_weight = torch.zeros(splats.count)
@@ -169,10 +169,10 @@ def measured(scene: Truth, folder: Path, case: Case) -> dict[str, Any]:
     """The row of one lift, beside the figures of the data README."""
     start = time.perf_counter()
     lifted = scene.lift(read_pack(folder, case.pack), **case.values)
-    seconds, found = time.perf_counter() - start, scene.judge(lifted)
+    seconds, figures = time.perf_counter() - start, scene.evaluate(lifted)
     return {
-        "features, weights": case.name, "accuracy": found.accuracy, "README accuracy": case.accuracy,
-        "mIoU": found.miou, "README mIoU": case.miou, "lift s": seconds,
+        "features, weights": case.name, "accuracy": figures.accuracy, "README accuracy": case.accuracy,
+        "mIoU": figures.miou, "README mIoU": case.miou, "lift s": seconds,
     }  # fmt: skip
 
 
@@ -181,7 +181,9 @@ def main() -> None:
     options = command_line("tests.benchmarks.tabletop", __doc__, ("folder", {"type": Path})).parse_args()
     scene = tabletop(options.folder)
     rows = [measured(scene, options.folder, case) for case in CASES]
-    tell(rows, as_json=options.json, note=f"{int(scene.counted.sum())} of {len(scene.counted)} splats count")
+    print_rows(
+        rows, as_json=options.json, note=f"{int(scene.evaluated.sum())} of {len(scene.evaluated)} splats count"
+    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""How good the recommendations of ``splatlift tradeoff`` are that see no labels: judged by truth.
+"""Quality of the recommendations of ``splatlift tradeoff`` without labels, measured by the ground truth.
 
     python -m tests.benchmarks.tradeoff TABLETOP [--cases NAME ...] [--json]
 
@@ -20,7 +20,7 @@ from liftcore.evaluate.tradeoff import candidates_of, hold_out
 from liftcore.lifting.warm_up import warm_up_lift
 from liftcore.runtime.device import CPU
 from liftcore.values.views import ViewFeatures
-from tests.benchmarks.base import command_line, read_pack, tell
+from tests.benchmarks.base import command_line, print_rows, read_pack
 from tests.benchmarks.consensus import still_life_scene
 from tests.benchmarks.tabletop import Truth, tabletop
 
@@ -31,21 +31,21 @@ CASES = (
 
 def measured(case: str, truth: Truth, views: Mapping[str, ViewFeatures]) -> dict[str, Any]:
     """The row of a case, and under ``runs`` what it comes from."""
-    lifted, judges = hold_out(list(views))
-    seen, runs, judged = [(truth.cameras[view], views[view]) for view in judges], [], []
+    lifted, held_out = hold_out(list(views))
+    observed, runs, accuracies = [(truth.cameras[view], views[view]) for view in held_out], [], []
     for candidate in candidates_of({}):
         settings = lc.LiftSettings.of(**{"diagnostic_rays": 0, **candidate.settings})
         warm_up_lift(truth.raster.splats.kernel, CPU, settings)
         busy = time.process_time()
-        made = lc.lift(truth.raster.splats, truth.cameras, {view: views[view] for view in lifted}, settings)
+        result = lc.lift(truth.raster.splats, truth.cameras, {view: views[view] for view in lifted}, settings)
         seconds = time.process_time() - busy
-        cosines = centred_cosines(truth.raster, seen, made.features, settings.render_params)
-        judged.append({"centred_cosine": cosines, "intersections": [], "unions": [], "phrase_iou": []})
-        own = {"name": candidate.name, "options": candidate.settings, "cpu_s": seconds, "cosine": 1.0}
-        runs.append({**own, **accuracy_of(judged[-1]), "miou": truth.judge(made).miou, "views": cosines})
-    choice, miou = choose(runs, judged), {run["name"]: run["miou"] for run in runs}
+        cosines = centred_cosines(truth.raster, observed, result.features, settings.render_params)
+        accuracies.append({"centred_cosine": cosines, "intersections": [], "unions": [], "phrase_iou": []})
+        entry = {"name": candidate.name, "options": candidate.settings, "cpu_s": seconds, "cosine": 1.0}
+        runs.append({**entry, **accuracy_of(accuracies[-1]), "miou": truth.evaluate(result).miou, "views": cosines})
+    choice, miou = choose(runs, accuracies), {run["name"]: run["miou"] for run in runs}
     best = max(miou, key=lambda name: miou[name])
-    row = {"case": f"{case}, {len(lifted)} and {len(judges)} views", "taken": choice["name"]}
+    row = {"case": f"{case}, {len(lifted)} and {len(held_out)} views", "taken": choice["name"]}
     row |= {"mIoU": miou[choice["name"]], "best": best, "its mIoU": miou[best]}
     return row | {"worse": miou[best] - miou[choice["name"]], "runs": runs}
 
@@ -58,8 +58,8 @@ def rows_of(folder: Path, cases: Iterable[str]) -> Iterator[dict[str, Any]]:
             kind, seed = case.split()
             yield measured(f"still life, {case}", *still_life_scene(kind, int(seed)))
         else:
-            pack, _, every = case.partition("/")
-            yield measured(case, truth, read_pack(folder, pack, int(every or 1)))
+            pack, _, stride = case.partition("/")
+            yield measured(case, truth, read_pack(folder, pack, int(stride or 1)))
 
 
 def main() -> None:
@@ -70,9 +70,11 @@ def main() -> None:
         ("folder", {"type": Path}),
         ("--cases", {"nargs": "+", "default": CASES, "metavar": "NAME"}),
     )
-    asked = parser.parse_args()
-    rows = list(rows_of(asked.folder, asked.cases))
-    tell(rows, as_json=asked.json, columns=() if asked.json else [name for name in rows[0] if name != "runs"])
+    options = parser.parse_args()
+    rows = list(rows_of(options.folder, options.cases))
+    print_rows(
+        rows, as_json=options.json, columns=() if options.json else [name for name in rows[0] if name != "runs"]
+    )
 
 
 if __name__ == "__main__":

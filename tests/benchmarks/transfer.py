@@ -1,4 +1,4 @@
-"""What a lift is worth on edited, compressed, decimated and moved copies of its splats.
+"""Accuracy of a lift on edited, compressed, decimated and moved copies of its splats.
 
     python -m tests.benchmarks.transfer [FOLDER] [--lift LIFT] [--node NODE --tool CLI.mjs] [--only COPY]
 
@@ -37,7 +37,7 @@ MOVE = Similarity.of(scale=2.5, rotation=[0.8, 0.2, -0.4, 0.3], translation=[10.
 
 
 @dataclass(frozen=True)
-class Judge:
+class TransferTruth:
     """A scene with its truth."""
 
     splats: lc.Splats
@@ -49,14 +49,14 @@ class Judge:
     features: Any  # of the other views
 
     @classmethod
-    def of_folder(cls, folder: Path) -> Judge:
+    def of_folder(cls, folder: Path) -> TransferTruth:
         """The truth of a folder in the layout of `tabletop`."""
         document = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
         truth = load_file(folder / "truth.safetensors")
         return cls(
             lc.read_splats(folder / "point_cloud.ply"),
             lc.read_cameras(folder / "cameras.json"),
-            [one["class"] for one in sorted(document["objects"], key=lambda one: one["id"])],
+            [entry["class"] for entry in sorted(document["objects"], key=lambda entry: entry["id"])],
             truth["splat_object"].astype(int),
             {view: truth[f"{view}/mask"] for view in document["held_out_views"]},
             lc.open_encoder(f"table:{folder / 'text_table.safetensors'}"),
@@ -64,7 +64,7 @@ class Judge:
         )
 
     @classmethod
-    def of_still_life(cls) -> Judge:
+    def of_still_life(cls) -> TransferTruth:
         """The truth of the generated scene, whose masks have mistakes."""
         scene = still_life()
         raster, words = CpuRaster(scene.splats), list(dict.fromkeys([*scene.things, *scene.parts]))
@@ -83,9 +83,9 @@ class Judge:
     def mean_iou(self, result: lc.LiftResult, splats: lc.Splats, move: Similarity | None) -> float:
         """The mean over classes and views of the IoU, of what the lift's words show in them."""
         scene = lc.Scene(result, splats, self.cameras)
-        found = scene.segment(self.words, encoder=self.encoder)
-        classes = np.array([-1, *(self.words.index(named.word) for named in found.found)])
-        return self._mean_iou(scene, classes[found.values], move)
+        segmentation = scene.segment(self.words, encoder=self.encoder)
+        classes = np.array([-1, *(self.words.index(label.word) for label in segmentation.found)])
+        return self._mean_iou(scene, classes[segmentation.values], move)
 
     def mean_iou_of_truth(self, result: lc.LiftResult, splats: lc.Splats, move: Similarity | None) -> float:
         """The same, of the true classes of the nearest splats."""
@@ -101,10 +101,10 @@ class Judge:
             camera = self.cameras[view]
             if move is not None:
                 camera = camera.transformed(scale=move.scale, rotation=move.rotation, translation=move.translation)
-            shown = value_map(scene, classes + 1, camera) - 1
+            predicted = value_map(scene, classes + 1, camera) - 1
             for number in np.unique(mask[mask >= 0]):
-                own, true = shown == number, mask == number
-                ratios.append((own & true).sum() / (own | true).sum())
+                mask_of, true = predicted == number, mask == number
+                ratios.append((mask_of & true).sum() / (mask_of | true).sum())
         return float(np.mean(ratios))
 
 
@@ -124,13 +124,13 @@ def copies(splats: lc.Splats, folder: Path, node: str, tool: str) -> dict[str, t
         "turned and scaled": splats.transformed(**move),
         "shuffled, turned and scaled": splats[generator.permutation(splats.count)].transformed(**move),
     }
-    found: dict[str, tuple[Path, Similarity | None]] = {}
-    for name, some in edited.items():
-        found[name] = folder / f"{name}.ply", MOVE if name.endswith("turned and scaled") else None
-        lc.write_splats(found[name][0], some)
+    copies_by_name: dict[str, tuple[Path, Similarity | None]] = {}
+    for name, edits in edited.items():
+        copies_by_name[name] = folder / f"{name}.ply", MOVE if name.endswith("turned and scaled") else None
+        lc.write_splats(copies_by_name[name][0], edits)
     for suffix in ("spz", "glb"):
-        found[f"our .{suffix}"] = folder / f"ours.{suffix}", None
-        lc.write_splats(found[f"our .{suffix}"][0], splats)
+        copies_by_name[f"our .{suffix}"] = folder / f"ours.{suffix}", None
+        lc.write_splats(copies_by_name[f"our .{suffix}"][0], splats)
 
     def transform(*arguments: Path | str) -> None:
         subprocess.run([node, tool, "-w", *map(str, arguments)], check=True, capture_output=True)
@@ -140,11 +140,11 @@ def copies(splats: lc.Splats, folder: Path, node: str, tool: str) -> dict[str, t
             back = folder / f"{name} back.ply"
             transform("-g", "cpu", source, folder / f"via.{name}")
             transform(folder / f"via.{name}", back)
-            found[f"through .{name} and back"] = back, None
-        found["through .spz, which declares no frame"] = folder / "via.spz", HALF_TURN
+            copies_by_name[f"through .{name} and back"] = back, None
+        copies_by_name["through .spz, which declares no frame"] = folder / "via.spz", HALF_TURN
         transform("-g", "cpu", source, "--decimate", "33%", folder / "third.ply")
-        found["decimated to a third"] = folder / "third.ply", None
-    return found
+        copies_by_name["decimated to a third"] = folder / "third.ply", None
+    return copies_by_name
 
 
 def main() -> None:
@@ -156,10 +156,10 @@ def main() -> None:
     parser.add_argument("--tool", default="")
     parser.add_argument("--only", default="", metavar="TEXT", help="copies whose name has this text")
     options = parser.parse_args()
-    judge = Judge.of_folder(options.folder) if options.folder else Judge.of_still_life()
-    splats = judge.splats
-    result = lc.load_lift(options.lift) if options.lift else lc.lift(splats, judge.cameras, judge.features)
-    scores = f"{judge.mean_iou(result, splats, None):.4f} | {judge.mean_iou_of_truth(result, splats, None):.4f}"
+    truth = TransferTruth.of_folder(options.folder) if options.folder else TransferTruth.of_still_life()
+    splats = truth.splats
+    result = lc.load_lift(options.lift) if options.lift else lc.lift(splats, truth.cameras, truth.features)
+    scores = f"{truth.mean_iou(result, splats, None):.4f} | {truth.mean_iou_of_truth(result, splats, None):.4f}"
     print(f"| copy | splats | rows | mixed | no partner | seconds | mIoU | truth |\n|{'---|' * 8}")
     print(f"| as lifted | {splats.count} | | | | | {scores} |", flush=True)
     with tempfile.TemporaryDirectory() as name:
@@ -170,7 +170,7 @@ def main() -> None:
             other = result.transferred(splats, new, progress=False)
             seconds, facts = time.perf_counter() - start, other.diagnostics["transfer"]
             counts = " | ".join(str(facts[key]) for key in ("rows", "mixed", "without_partner"))
-            scores = f"{judge.mean_iou(other, new, move):.4f} | {judge.mean_iou_of_truth(other, new, move):.4f}"
+            scores = f"{truth.mean_iou(other, new, move):.4f} | {truth.mean_iou_of_truth(other, new, move):.4f}"
             print(f"| {copy} | {new.count} | {counts} | {seconds:.1f} | {scores} |", flush=True)
 
 

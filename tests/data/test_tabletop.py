@@ -52,17 +52,17 @@ def encoder(folder: Path) -> TableEncoder:
 @pytest.fixture(scope="module")
 def default_lift(truth: Truth, folder: Path) -> lc.LiftResult:
     """The lift of masks that are mostly right, by default; every fourth view."""
-    return truth.lift(read_pack(folder, "features", every=4))
+    return truth.lift(read_pack(folder, "features", stride=4))
 
 
 @pytest.fixture(scope="module")
 def hard(truth: Truth, folder: Path) -> lc.LiftResult:
     """The lift of masks of which many are wrong, by default; every fourth view."""
-    return truth.lift(read_pack(folder, "features_hard", every=4))
+    return truth.lift(read_pack(folder, "features_hard", stride=4))
 
 
 def test_the_splats_that_count_are_those_of_the_data_readme(truth: Truth) -> None:
-    share = float(truth.counted.float().mean())
+    share = float(truth.evaluated.float().mean())
     assert share == pytest.approx(0.9056, abs=5e-4)
 
 
@@ -79,13 +79,13 @@ def test_a_row_sum_lift_reaches_the_baseline(
     """At least those of the data README, to the digits that it prints."""
     assert case.accuracy is not None
     assert case.miou is not None
-    got = truth.judge(lift_of(case))
+    got = truth.evaluate(lift_of(case))
     assert got.accuracy >= case.accuracy - ROUNDING
     assert got.miou >= case.miou - ROUNDING
 
 
 def test_hard_masks_gain_and_confidence_tells_right_from_wrong(truth: Truth, hard: lc.LiftResult) -> None:
-    figures = truth.judge(hard)
+    figures = truth.evaluate(hard)
     assert figures.accuracy > 0.893  # .818 with row-sum, .862 with a robust step
     assert figures.miou > 0.894  # .834 and .878
     assert hard.confidence is not None
@@ -96,8 +96,8 @@ def test_hard_masks_gain_and_confidence_tells_right_from_wrong(truth: Truth, har
 def test_masks_that_are_mostly_right_lose_nothing_by_the_default(
     truth: Truth, folder: Path, default_lift: lc.LiftResult
 ) -> None:
-    row_sum = truth.judge(truth.lift(read_pack(folder, "features", every=4), preset="row-sum"))
-    figures = truth.judge(default_lift)
+    row_sum = truth.evaluate(truth.lift(read_pack(folder, "features", stride=4), preset="row-sum"))
+    figures = truth.evaluate(default_lift)
     assert figures.accuracy >= row_sum.accuracy - TOLERANCE
     assert figures.miou >= row_sum.miou - TOLERANCE
     assert default_lift.confidence is not None
@@ -107,7 +107,7 @@ def test_masks_that_are_mostly_right_lose_nothing_by_the_default(
 def test_the_objects_of_hard_masks_are_the_things_of_the_scene(
     truth: Truth, lift_of: Callable[[Case], lc.LiftResult], encoder: TableEncoder
 ) -> None:
-    scene = truth.opened(lift_of(BARS[0]))
+    scene = truth.open_scene(lift_of(BARS[0]))
     answers = {number: ask(scene, truth.words[number], encoder) for number in OBJECTS}
     measures = measure_lift(scene, answers, truth.objects.numpy())
     assert measures["one"] == measures["things"] == 12
@@ -119,7 +119,7 @@ def test_the_objects_of_hard_masks_are_the_things_of_the_scene(
 def test_fourteen_words_are_found_among_many(
     truth: Truth, default_lift: lc.LiftResult, encoder: TableEncoder
 ) -> None:
-    scene, real = truth.opened(default_lift), truth.objects.numpy()
+    scene, real = truth.open_scene(default_lift), truth.objects.numpy()
     words = list(truth.words)
     other_words = [word for word in encoder.words if word not in words]
     absent = np.random.default_rng(0).choice(other_words, 100, replace=False).tolist()
@@ -132,7 +132,7 @@ def test_fourteen_words_are_found_among_many(
 
 
 def test_a_thing_stays_found_when_something_else_is_not_wanted(truth: Truth, default_lift: lc.LiftResult) -> None:
-    scene, real = truth.opened(default_lift), truth.objects.numpy()
+    scene, real = truth.open_scene(default_lift), truth.objects.numpy()
     best = [int(np.argmax(np.where(real == number, scene.total_weight, -1.0))) for number in range(CURTAIN + 1)]
 
     def iou(number: int, *unlike: int) -> float:
@@ -164,7 +164,7 @@ def test_things_are_found_in_the_words_of_their_masks(
             Image.fromarray(labels == number).save(tmp_path / truth.words[number] / f"{view}.png")
     views = prompt_views(tmp_path)
     write_pack(tmp_path / "pack", views.views, {}, table=views.table)
-    scene = truth.opened(truth.lift(read_features(tmp_path / "pack"), preset="row-sum"))
+    scene = truth.open_scene(truth.lift(read_features(tmp_path / "pack"), preset="row-sum"))
     for number in OBJECTS:
         answer, ious = ask(scene, truth.words[number]), []
         for view, mask in truth.held_out.items():

@@ -14,7 +14,7 @@ from liftcore.scene.cameras import Camera
 from liftcore.scene.compositing import ALPHA_FLOOR, CompositingParams, Weighting
 from liftcore.scene.splats import Kernel, Splats
 from liftcore.values.views import Regions
-from tests.benchmarks.extreme_measures import WEIGHTS, compare, traced, weights_of
+from tests.benchmarks.extreme_measures import WEIGHTS, compare, trace_weights, weights_of
 from tests.scenes import ROW, camera_at_origin, splats_at
 
 pytestmark = pytest.mark.usefixtures("every_kernel")
@@ -76,7 +76,7 @@ def test_two_saturated_splats_weigh_the_same_in_the_lift_and_in_its_diagnostics(
     # (1 - cap)^2 is the stop itself with the field's constants: every way to A must fall on the same side.
     splats, camera = splats_at([(0.0, 0.0, 2.0), (0.0, 0.0, 3.0)], log_scales=2.0, logits=1e4), camera_at_origin()
     lifted = weights_of(splats, camera, CompositingParams())[0]
-    assert np.abs(lifted - traced(splats, camera, CompositingParams())).max() < WEIGHTS
+    assert np.abs(lifted - trace_weights(splats, camera, CompositingParams())).max() < WEIGHTS
 
 
 def about_x(angle: float) -> tuple[float, float, float, float]:
@@ -134,10 +134,10 @@ def test_crossings_behind_the_camera_do_not_count():
 def test_a_beta_of_zero_is_a_cylinder_and_of_four_a_bell():
     camera = camera_at_origin(41, 41, focal=60.0)
     centre, flat = [(0.0, 0.0, 2.0)], math.log(0.4)
-    cylinder = traced(splats_at(centre, flat, betas=-200.0, kernel=BETA), camera, CompositingParams())
+    cylinder = trace_weights(splats_at(centre, flat, betas=-200.0, kernel=BETA), camera, CompositingParams())
     alpha = 1 / (1 + math.exp(-1.0))
     assert set(np.unique(cylinder.round(5))) == {0.0, round(alpha, 5)}
-    bell = traced(splats_at(centre, flat, betas=0.0, kernel=BETA), camera, CompositingParams()).reshape(41, 41)
+    bell = trace_weights(splats_at(centre, flat, betas=0.0, kernel=BETA), camera, CompositingParams()).reshape(41, 41)
     radius = 0.4 * 60 / 2
     row = alpha * np.maximum(1 - (np.arange(41) - 20) ** 2 / (radius**2 + 0.3), 0) ** 4
     assert np.abs(bell[20] - row).max() < 1e-6

@@ -16,13 +16,13 @@ def test_extreme_is_survived_with_the_stated_error(extreme: Extreme, kernel: Ker
     measured = extreme.measure(kernel)
     assert measured.holds
     assert measured.error is None or measured.error <= extreme.bound
-    assert extreme.told in " ".join(measured.told)
+    assert extreme.text in " ".join(measured.text)
 
 
 def test_a_row_says_what_was_measured() -> None:
     (row,) = rows_of(TABLES["Refused"][:1])
     assert (row["float32 gives"], row["error"]) == ("refused", None)
-    assert row["told"].startswith("splats: expected at least one splat of finite numbers")
+    assert row["message"].startswith("splats: expected at least one splat of finite numbers")
 
 
 @pytest.mark.parametrize("kernel", list(Kernel))

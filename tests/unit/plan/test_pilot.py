@@ -20,7 +20,7 @@ from liftcore.values.lift_views import LiftViews
 from liftcore.values.pack import write_pack
 from liftcore.values.settings import LiftSettings
 from liftcore.values.views import Regions
-from tests.benchmarks.scenes import Room, write_room
+from tests.benchmarks.scenes import RoomSpec, write_room
 from tests.scenes import centred, random_splats
 from tests.unit.plan.test_views import ring
 
@@ -123,7 +123,7 @@ def test_where_no_ray_meets_a_splat_all_views_are_taken_and_nothing_is_expected_
 
 
 def test_in_a_room_where_views_share_few_splats_a_pilot_is_right_too(tmp_path):
-    write_room(tmp_path, Room(splats=6_000, views=72, size=(160, 120), channels=32))
+    write_room(tmp_path, RoomSpec(splats=6_000, views=72, size=(160, 120), channels=32))
     paths = tmp_path / "point_cloud.ply", tmp_path / "cameras.json", tmp_path / "features.safetensors"
     full = lift_files(*paths[:2], [paths[2]], LiftSettings.of())
     for target in (0.9, 0.97):
