@@ -47,7 +47,7 @@ def measure_boxes(scene: Scene, answers: dict[int, Answer], owners: np.ndarray) 
     means, ious, of_all, middles, single_count = scene.splats.means.numpy(), [], [], [], 0
     for number, answer in answers.items():
         true = _bounds(means[owners == number])
-        selected_objects = objects(scene, answer).found
+        selected_objects = objects(scene, answer).objects
         single_count += len(selected_objects) == 1
         box = np.array(selected_objects[0].box) if selected_objects else np.zeros((2, 3))
         ious.append(box_iou(box, true))
@@ -68,9 +68,9 @@ def _are_two(scene: Scene, answers: dict[int, Answer], owners: np.ndarray) -> bo
     )
     grouped = objects(scene, Answer.of(first.query, first.scores, first.seen, union, **fields))
     majorities = {
-        int(np.bincount(owners[grouped.numbers == number]).argmax()) for number in range(len(grouped.found))
+        int(np.bincount(owners[grouped.numbers == number]).argmax()) for number in range(len(grouped.objects))
     }
-    return len(grouped.found) == 2 and majorities == set(answers)
+    return len(grouped.objects) == 2 and majorities == set(answers)
 
 
 def _bounds(means: np.ndarray) -> np.ndarray:

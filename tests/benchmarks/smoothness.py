@@ -254,7 +254,7 @@ def with_aggregation(truth: Truth, views: Mapping[str, ViewFeatures], step: str)
     strength = "auto" if step == "auto" else 0
     lifted = truth.lift(views, aggregation=True, smoothness=strength, progress=False)
     smoothness = lifted.diagnostics.get("smoothing", {}).get("smoothness", 0.0)
-    return {"chosen": smoothness, "aggregated": cell(truth.measure_steps(lifted))}
+    return {"chosen": smoothness, "aggregated": cell(truth.evaluate(lifted))}
 
 
 def cases(data: Path, tables: Sequence[str]) -> Iterator[Case]:

@@ -84,7 +84,7 @@ class TransferTruth:
         """The mean over classes and views of the IoU, of what the lift's words show in them."""
         scene = lc.Scene(result, splats, self.cameras)
         segmentation = scene.segment(self.words, encoder=self.encoder)
-        classes = np.array([-1, *(self.words.index(label.word) for label in segmentation.found)])
+        classes = np.array([-1, *(self.words.index(label.word) for label in segmentation.named_words)])
         return self._mean_iou(scene, classes[segmentation.values], move)
 
     def mean_iou_of_truth(self, result: lc.LiftResult, splats: lc.Splats, move: Similarity | None) -> float:
