@@ -423,7 +423,7 @@ def _kernel_warnings(mode: RenderMode | None, kernel: Kernel) -> list[str]:
         return []
     expected = Kernel.GAUSSIAN_2D if mode.model is RenderModel.DISCS else Kernel.GAUSSIAN_3D
     source = mode.source or f"render_mode={str(mode.model)!r}"
-    return [] if expected is kernel else [f"{source} says {mode.model}, but the splats are read as {kernel}"]
+    return [] if expected is kernel else [f"{source} says {mode.model}, but the splats are taken for {kernel}"]
 
 
 def shared_tensor(values: object) -> Tensor:
