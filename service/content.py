@@ -22,7 +22,7 @@ from starlette.types import Receive, Scope, Send
 from liftcore.errors import NotFound
 from service import models
 from service.errors import RangeNotSatisfiable, ServiceUnavailable, require_share
-from service.models import ENDED
+from service.models import FINAL_STATES
 from service.problems import PROBLEM
 from service.store.database import CURSOR, Page
 from service.store.files import require_whole
@@ -274,7 +274,7 @@ class EventStreams:
 
 def is_last(event: Event) -> bool:
     """Return True if no event follows this one."""
-    return event.kind is EventKind.STATE and event.data["state"] in ENDED
+    return event.kind is EventKind.STATE and event.data["state"] in FINAL_STATES
 
 
 class _Stream(EventSourceResponse):

@@ -47,12 +47,12 @@ FILE_CHARACTERS = 4 << 20  # of all names, or all words, of a file: a hundred th
 PAGE_CHARACTERS = 256 << 10  # of the names, or words, of one answer
 LIFT_NAME_CHARACTERS = 100
 SETTING_CHARACTERS = 1000  # of a name or a text among settings
-ASKED_CHARACTERS = 4000  # of the texts of a question together: an encoder takes seconds for more
+TEXT_CHARACTERS = 4000  # of the texts of a question together: an encoder takes seconds for more
 
 # Numbers
 PACKS = 64  # of a lift
 SETTINGS = 100  # of a lift
-ASKED = 32  # texts, or examples, of a question
+MAX_TEXTS = 32  # texts, or examples, of a question
 VECTOR = 65_536  # numbers of a vector
 WORDS = 4096  # that are asked at once
 PAGE = 1000  # records of a list, names or views in one answer
@@ -82,7 +82,7 @@ class Published:
 
 
 def _bounded(value: Any) -> Any:
-    """What is too much to be settings is refused before any of it is looked at."""
+    """Refuse settings that are too large before they are parsed."""
     if isinstance(value, dict):
         texts = (text for pair in value.items() for text in pair if isinstance(text, str))
         if len(value) > SETTINGS or any(len(text) > SETTING_CHARACTERS for text in texts):
@@ -98,10 +98,10 @@ Bounded = BeforeValidator(_bounded)
 
 ASSET_ID = r"^sha256:[0-9a-f]{64}$"
 JOB_ID = r"^[0-9a-f]{32}$"
-COMPARED = "speed"  # what only the runs of a trade-off set
+TRADEOFF_SETTING = "speed"  # set by the runs of a trade-off alone
 PRINTABLE = r"^[^\x00-\x1f\x7f]*$"
 
-BUILT = ConfigDict(defer_build=False)  # of models that FastAPI reads bodies by
+BODY_CONFIG = ConfigDict(defer_build=False)  # for models of bodies, which FastAPI builds at the start
 AssetId = Annotated[str, Field(pattern=ASSET_ID, description="sha256: and the digest of the bytes, in hex")]
 JobId = Annotated[str, Field(pattern=JOB_ID)]
 Text = Annotated[str, Field(min_length=1, max_length=WORD_CHARACTERS)]
@@ -109,7 +109,7 @@ Scalar = Annotated[bool | int | float | str, takes("a boolean, a number or a tex
 
 
 class AssetKind(StrEnum):
-    """What an upload is."""
+    """Kind of an upload."""
 
     SPLATS = "splats"
     CAMERAS = "cameras"
@@ -123,14 +123,14 @@ UploadKind = AssetKind | Literal["lift"]
 
 
 class JobKind(StrEnum):
-    """What a job does."""
+    """Kind of a job."""
 
     LIFT = "lift"
     TRADEOFF = "tradeoff"
 
 
 class JobState(StrEnum):
-    """Where a job is."""
+    """State of a job."""
 
     QUEUED = "queued"
     RUNNING = "running"
@@ -140,7 +140,7 @@ class JobState(StrEnum):
     CANCELED = "canceled"
 
 
-ENDED = frozenset({JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELED})
+FINAL_STATES = frozenset({JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELED})
 
 
 class Problem(BaseModel):
@@ -185,13 +185,6 @@ def iso_of(name: str, *, optional: bool = False) -> Any:
     return computed_field(return_type=kind, description=f"{name} as ISO 8601, in UTC")(property(moment))
 
 
-def old_field(new: str, kind: Any) -> Any:
-    """Return a field by the old name of another: a reply has both until version 1 of the API ends."""
-    value = property(lambda self: getattr(self, new))
-    extra: dict[str, Any] = {"deprecated": True}
-    return computed_field(return_type=kind, description=f"`{new}`, by its old name", json_schema_extra=extra)(value)
-
-
 class Asset(BaseModel):
     """An uploaded file."""
 
@@ -220,9 +213,9 @@ class Names(BaseModel):
 
 
 class LiftInputs(Body):
-    """What to lift. The assets must be here already."""
+    """Inputs of a lift: assets that are uploaded."""
 
-    model_config = BUILT
+    model_config = BODY_CONFIG
     splats: AssetId
     cameras: AssetId
     features: Annotated[
@@ -236,9 +229,9 @@ class LiftInputs(Body):
 
 
 class LiftRequest(LiftInputs):
-    """What to lift, and the words that it is asked in. The assets must be here already."""
+    """Inputs of a lift, with the words for its queries: assets that are uploaded."""
 
-    model_config = BUILT
+    model_config = BODY_CONFIG
     table: AssetId | None = Field(
         None, description="an uploaded text table whose words the lift is asked in; else those of its text space"
     )
@@ -255,9 +248,9 @@ class Labels(Body):
 
 
 class TradeoffRequest(LiftInputs):
-    """What to compare: lifts of these assets, each with another preset or place of the dial."""
+    """Inputs of a trade-off: lifts of these assets, each with another preset or quality level."""
 
-    settings: Annotated[dict[str, Scalar], Bounded, Published(LiftSettings, without=(COMPARED,))] = Field(
+    settings: Annotated[dict[str, Scalar], Bounded, Published(LiftSettings, without=(TRADEOFF_SETTING,))] = Field(
         default_factory=dict,
         description="of all runs: knobs of the lift beside speed, which is compared; the dial starts from a preset",
         examples=[{"robust_steps": 1}],
@@ -269,7 +262,7 @@ class TradeoffRequest(LiftInputs):
 
 
 class Progress(BaseModel):
-    """How far the current stage of a job is."""
+    """Progress of a job's current stage."""
 
     stage: str
     done: int
@@ -279,7 +272,7 @@ class Progress(BaseModel):
 
 
 class Plan(BaseModel):
-    """What a lift sets out to do: ``summary``, ``warnings``, and what its diagnostics will have as ``plan``."""
+    """Plan of a lift: ``summary``, ``warnings``, and the fields of ``plan`` in its diagnostics."""
 
     model_config = ConfigDict(extra="allow")  # the numbers of the diagnostics
 
@@ -365,34 +358,41 @@ class LiftResult(BaseModel):
     )
     world: WorldFrame = Field(description="which way is up and how long a scene unit is, as far as it is known")
     diagnostics: dict[str, Any] = Field(description="what the lift measured of itself, and its warnings")
-    certificate = old_field("diagnostics", dict[str, Any])
     timings: dict[str, float] = Field(description="seconds a stage")
     created: Seconds
     created_at = iso_of("created")
     links: dict[str, str]
 
+    @computed_field(description="`diagnostics`, by its old name", json_schema_extra={"deprecated": True})
+    @property
+    def certificate(self) -> dict[str, Any]:
+        """The diagnostics by their old name, until version 1 of the API ends."""
+        return self.diagnostics
 
-Named = Annotated[str, Field(min_length=1, max_length=SETTING_CHARACTERS, pattern=PRINTABLE)]
+
+SettingText = Annotated[str, Field(min_length=1, max_length=SETTING_CHARACTERS, pattern=PRINTABLE)]
 
 
 class PackChange(Body):
     """Names of a feature pack; what is left out stays as the pack says it."""
 
-    model_config = BUILT
-    encoder: Named | None = Field(None, description="what made the features")
-    text_space: Named | None = Field(None, description="the text encoder that shares their space; 'none' for none")
+    model_config = BODY_CONFIG
+    encoder: SettingText | None = Field(None, description="what made the features")
+    text_space: SettingText | None = Field(
+        None, description="the text encoder that shares their space; 'none' for none"
+    )
 
 
 class WorldUpdate(WorldFrame):
-    """Which way is up in a lift, and how long its unit is; what is left out is not known."""
+    """Up direction and unit of length of a lift; absent fields are unknown."""
 
     error_type: ClassVar = None
 
 
 class LiftChange(Body):
-    """What to change of a lift; what is left out stays."""
+    """Change of a lift; absent fields stay."""
 
-    model_config = BUILT
+    model_config = BODY_CONFIG
     name: (
         Annotated[str, Field(max_length=LIFT_NAME_CHARACTERS, pattern=PRINTABLE), AfterValidator(str.strip)] | None
     ) = Field(None, description="for people; null or an empty one takes the name away")
@@ -454,7 +454,7 @@ class Tradeoff(BaseModel):
 
 
 class Health(BaseModel):
-    """Whether the HTTP process answers."""
+    """Answer of the HTTP process that it is alive."""
 
     status: str
 
@@ -467,7 +467,7 @@ class Ready(BaseModel):
 
 
 class Version(BaseModel):
-    """What runs here."""
+    """Versions of the service and its packages."""
 
     version: str = Field(description="of splatlift")
     api: str = Field(description="of the routes and their JSON")
@@ -495,18 +495,18 @@ def at_most(characters: int) -> AfterValidator:
     return AfterValidator(check)
 
 
-# The first thing that is wrong is all that is told: whoever sends a hundred thousand is not answered about each.
-Texts = Annotated[list[Text], Field(max_length=ASKED, fail_fast=True), at_most(ASKED_CHARACTERS)]
+# Only the first error is reported: a list of a hundred thousand items must not make as many errors.
+Texts = Annotated[list[Text], Field(max_length=MAX_TEXTS, fail_fast=True), at_most(TEXT_CHARACTERS)]
 Numbers = Annotated[
     tuple[Annotated[float, Field(allow_inf_nan=False, strict=True)], ...],
     Field(min_length=1, max_length=VECTOR, fail_fast=True),
 ]
 AnExample = Annotated[Notation | Numbers, takes(f"{NOTATIONS}, or a vector of 1 to {VECTOR} finite numbers")]
-Examples = Annotated[list[AnExample], Field(max_length=ASKED, fail_fast=True)]
+Examples = Annotated[list[AnExample], Field(max_length=MAX_TEXTS, fail_fast=True)]
 
 
 class LiftQuestion(BaseModel):
-    """Which lift is asked, and in whose words."""
+    """The lift of a query, and the words that it may use."""
 
     lift: JobId | None = Field(None, description=THE_LIFT)
     encoder: str | None = Field(
@@ -515,8 +515,8 @@ class LiftQuestion(BaseModel):
     table: AssetId | None = Field(None, description="an uploaded text table that has the words, in place of encoder")
 
 
-def _same(name: str) -> Any:
-    """A field of a question with its default and description, which HTTP bounds."""
+def _query_field(name: str) -> Any:
+    """Return a field of `Query` with its default and description, for HTTP to add limits."""
     field = Query.model_fields[name]
     return Field(field.default, description=field.description)
 
@@ -524,12 +524,12 @@ def _same(name: str) -> Any:
 class Question(Query, LiftQuestion):
     """A question to a lift."""
 
-    model_config = BUILT
+    model_config = BODY_CONFIG
     error_type: ClassVar = None
-    text: Texts = _same("text")
-    like: Examples = _same("like")
-    negatives: Texts = _same("negatives")
-    unlike: Examples = _same("unlike")
+    text: Texts = _query_field("text")
+    like: Examples = _query_field("like")
+    negatives: Texts = _query_field("negatives")
+    unlike: Examples = _query_field("unlike")
 
 
 class Words(LiftQuestion, Body):
@@ -543,7 +543,7 @@ class Words(LiftQuestion, Body):
 class SegmentRequest(Words, Viewpoint):
     """Every splat's best word."""
 
-    model_config = BUILT
+    model_config = BODY_CONFIG
 
 
 SelectionName = Annotated[str, Field(min_length=1, max_length=LIFT_NAME_CHARACTERS, pattern=PRINTABLE)]
@@ -552,14 +552,14 @@ SelectionName = Annotated[str, Field(min_length=1, max_length=LIFT_NAME_CHARACTE
 class NamedQuestion(Question):
     """A question to a lift, and what files call its answer."""
 
-    model_config = BUILT
+    model_config = BODY_CONFIG
     name: SelectionName | None = Field(None, description="else its words")
 
 
 class ExportRequest(Words):
     """The content of a ZIP: the answers of questions, every splat's best word, or the objects of the lift."""
 
-    model_config = BUILT
+    model_config = BODY_CONFIG
     of: Annotated[
         Literal["questions", "words", "objects"],
         BeforeValidator(lambda of: "objects" if of == "things" else of),  # the old name
@@ -573,17 +573,17 @@ class ExportRequest(Words):
 
 
 class NearestWordsRequest(Words):
-    """What is this?"""
+    """Example for which the nearest words are requested."""
 
-    model_config = BUILT
+    model_config = BODY_CONFIG
     example: AnExample = Field(description="what is meant")
     top: Annotated[int, Field(ge=1, le=1000), NoBoolean] = Field(5, description="how many words")
 
 
 class SuggestedWordsRequest(LiftQuestion):
-    """What is being typed."""
+    """Text for which completions are requested."""
 
-    model_config = BUILT
+    model_config = BODY_CONFIG
     text: str = Field("", max_length=200, description="what was typed of a word; empty: what is here alone")
     limit: int = Field(8, ge=1, le=100, description="how many words at most")
 
@@ -591,7 +591,7 @@ class SuggestedWordsRequest(LiftQuestion):
 class RenderRequest(Picture):
     """A picture of a lift's scene."""
 
-    model_config = BUILT
+    model_config = BODY_CONFIG
 
     lift: JobId | None = Field(None, description=THE_LIFT)
 
@@ -603,7 +603,7 @@ class OfLift(BaseModel):
 
 
 class SegmentAnswer(LabelSummary, OfLift):
-    """What is there, of many words."""
+    """Words that are requested, of many."""
 
     encoder: str = Field(description="the text encoder that was asked, without its file")
 
@@ -615,7 +615,7 @@ class NearestWordsAnswer(BestWords, OfLift):
 
 
 class WordsAnswer(SuggestedWords, OfLift):
-    """What a lift can be asked."""
+    """Words that a lift can be queried with."""
 
 
 class QueryAnswer(Answer, OfLift):
@@ -641,7 +641,7 @@ class CoveringRegions(OfLift):
 class EditRequest(Edit):
     """One change of a selection."""
 
-    model_config = BUILT
+    model_config = BODY_CONFIG
     error_type: ClassVar = None
     query: Question | None = Field(None, description="a question: the splats that answer it")  # pyright: ignore[reportIncompatibleVariableOverride]
 
@@ -649,15 +649,15 @@ class EditRequest(Edit):
 class NewSelection(Body):
     """A selection to begin."""
 
-    model_config = BUILT
+    model_config = BODY_CONFIG
     name: SelectionName = Field(description="for people")
     edit: EditRequest | None = Field(None, description="how, of no splats, it begins; left out, it has none")
 
 
 class SelectionChange(Body):
-    """What to change of a selection; what is left out stays."""
+    """Change of a selection; absent fields stay."""
 
-    model_config = BUILT
+    model_config = BODY_CONFIG
     name: SelectionName | None = Field(None, description="for people")
     step: Annotated[int, Field(ge=0, le=10**9), NoBoolean] | None = Field(
         None, description="the number of a step of its history: undo and redo"
@@ -667,7 +667,7 @@ class SelectionChange(Body):
 class ObjectLabelChange(Body):
     """Changes of an object's label; fields that are left out stay."""
 
-    model_config = BUILT
+    model_config = BODY_CONFIG
     name: SelectionName | None = Field(None, description="of your own; null for the nearest word again")
     hidden: bool = Field(False, description="whether lists leave it out")
 
@@ -731,7 +731,7 @@ class Selections(BaseModel):
 
 
 class OwnKey(BaseModel):
-    """What a key may do."""
+    """Rights of a key."""
 
     name: str | None = Field(description="whose it is, or what for; null where no key is needed")
     scopes: list[str]
@@ -743,7 +743,7 @@ class OwnKey(BaseModel):
 class ShareRequest(Body):
     """A key to make for somebody."""
 
-    model_config = BUILT
+    model_config = BODY_CONFIG
     name: SelectionName = Field(description="for whom it is")
     expires_s: Annotated[float, Field(ge=60, le=31_622_400), NoBoolean] = Field(
         2_592_000, description="seconds until it ends; 30 days if left out, a year at most"
@@ -775,7 +775,7 @@ class Shares(BaseModel):
 
 
 class NodesRequest(BaseModel):
-    """Which nodes of a lift's tree to list, and what names them."""
+    """Nodes of a lift's tree to list, and words to name them."""
 
     table: AssetId | None = Field(None, description="an uploaded text table: they are named by its words")
     encoder: str | None = Field(
@@ -792,7 +792,7 @@ UP = rf"^(cameras|{NUMBER},{NUMBER},{NUMBER})$"
 
 
 class TreeRequest(NodesRequest):
-    """Which nodes to list, and whether to say how objects lie to each other."""
+    """Nodes to list, with or without relations of objects."""
 
     relations: bool = Field(False, description="how the objects lie to each other, with numbers")
     up: str | None = Field(
@@ -804,7 +804,7 @@ class TreeRequest(NodesRequest):
 
 
 class SceneObjectsRequest(NodesRequest):
-    """Which objects to list, and what names them."""
+    """Objects to list, and words to name them."""
 
     features: Annotated[bool, Field(description="with the mean feature of each")] = False
     splat: int | None = Field(None, ge=0, le=10**9, description="the one of this splat alone, by its row")

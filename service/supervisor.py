@@ -24,7 +24,7 @@ from typing import IO, Any, Self
 from liftcore.errors import SplatliftError
 from service.child import Messages, children_of, fault_of, memory_of
 from service.errors import NoSpace, OverLimit, ProcessDied
-from service.models import ENDED, JobKind, JobState
+from service.models import FINAL_STATES, JobKind, JobState
 from service.observe import current_id, working_for
 from service.store.assets import kernel_of
 from service.store.jobs import LOG_LINES, EventKind, JobRecord, labels_of
@@ -295,7 +295,7 @@ class Attempt:
             retry_until_committed(
                 lambda: self._settle(draft, reason or _describe_exit(status), stopping.is_set()), stopping
             )
-        if self._store.jobs.state(SERVICE, self._job.id) in ENDED:
+        if self._store.jobs.state(SERVICE, self._job.id) in FINAL_STATES:
             files.forget_work(self._job.id)
 
     def _follow(self, process: JobProcess, stopping: threading.Event) -> str | SplatliftError | None:

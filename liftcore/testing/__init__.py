@@ -1,4 +1,4 @@
-"""Public conformance suites for rasters and text encoders; derive from them in a test file of pytest.
+"""Public: conformance suites for rasters and text encoders; derive from them in a test file of pytest.
 
 from liftcore.testing import RasterConformance
 

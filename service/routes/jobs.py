@@ -201,7 +201,7 @@ async def follow_job(job: str, deps: Deps, last_event: LastEvent = 0) -> Respons
     """Stream the events of a job: its states, plan, latest progress and log. Ends after the last state."""
     read_events = partial(deps.store.jobs.events, deps.owner, job)
     state = await anyio.to_thread.run_sync(deps.store.jobs.state, deps.owner, job)
-    if not await anyio.to_thread.run_sync(read_events, last_event) and state in models.ENDED:
+    if not await anyio.to_thread.run_sync(read_events, last_event) and state in models.FINAL_STATES:
         return Response(status_code=204)
     return deps.streams.answer(read_events, event_data, last_event, deps.caller.key)
 
@@ -246,7 +246,7 @@ def event_data(event: Event) -> str:
 def shape(job: JobRecord) -> models.Job:
     """Return a job as clients get it."""
     links = {"self": f"/jobs/{job.id}", "events": f"/jobs/{job.id}/events"}
-    if job.state not in models.ENDED:
+    if job.state not in models.FINAL_STATES:
         links["cancel"] = f"/jobs/{job.id}/cancel"
     if job.state is models.JobState.SUCCEEDED:
         links |= RESULT_LINKS[job.kind](job.id)

@@ -304,29 +304,33 @@ def get_region_mask(
 
 
 @router.get("/lifts/{lift}/objects", response_model=models.SceneObjects, tags=["lifts"])
-def list_objects(lift: str, deps: Deps, ask: Ask, asked: Annotated[models.SceneObjectsRequest, Query()]) -> Response:
+def list_objects(
+    lift: str, deps: Deps, ask: Ask, options: Annotated[models.SceneObjectsRequest, Query()]
+) -> Response:
     """List the objects of the scene, found by masks when it was lifted; a vocabulary names them."""
     labels = list(deps.store.selections.object_labels(deps.owner, deps.store.lifts.get(deps.owner, lift).id).items())
-    fields = {"means": asked.features, "object_labels": labels, "splat": asked.splat}
-    return _nodes("catalogue", lift, deps, ask, asked, **fields)
+    fields = {"means": options.features, "object_labels": labels, "splat": options.splat}
+    return _nodes("catalogue", lift, deps, ask, options, **fields)
 
 
 @router.get("/lifts/{lift}/tree", response_model=models.LiftTree, tags=["lifts"])
-def get_tree(lift: str, deps: Deps, ask: Ask, asked: Annotated[models.TreeRequest, Query()]) -> Response:
+def get_tree(lift: str, deps: Deps, ask: Ask, options: Annotated[models.TreeRequest, Query()]) -> Response:
     """Get the objects with their parts and their groups, objects first; nodes have splats as objects have.
 
     With `relations`, how the objects lie to each other.
     """
-    return _nodes("tree", lift, deps, ask, asked, relations=asked.relations or asked.up is not None, up=asked.up)
+    return _nodes(
+        "tree", lift, deps, ask, options, relations=options.relations or options.up is not None, up=options.up
+    )
 
 
-def _nodes(operation: str, lift: str, deps: Deps, ask: Ask, asked: models.NodesRequest, **options: Any) -> Response:
+def _nodes(operation: str, lift: str, deps: Deps, ask: Ask, options: models.NodesRequest, **fields: Any) -> Response:
     record = deps.store.lifts.get(deps.owner, lift)
     request: dict[str, Any] = scene_request(operation, record, deps) | NO_ENCODER | {"words": None}
-    if asked.table is not None or asked.encoder is not None:
-        request = with_encoder(request, asked, record, deps)
+    if options.table is not None or options.encoder is not None:
+        request = with_encoder(request, options, record, deps)
     encoder = None if request["encoder"] is None else encoder_label(request["encoder"])
-    request |= {"first": asked.cursor, "count": asked.limit, **options}
+    request |= {"first": options.cursor, "count": options.limit, **fields}
     return binary_response(deps, request | {"head": {"lift": record.id, "encoder": encoder}}, record, ask, {})
 
 

@@ -136,7 +136,7 @@ def find_lift(lift: str | None, deps: AppState) -> LiftRecord:
 
 
 def scene_request(operation: str, lift: LiftRecord, deps: AppState) -> dict[str, Any]:
-    """What the query process must know of a lift's files; ``names`` says what the client calls them."""
+    """Return the fields of a lift's files for the query process; ``names`` maps them to the client's names."""
     job = deps.store.jobs.get(deps.owner, lift.id)
     splats, cameras = (deps.store.assets.get(deps.owner, asset) for asset in (job.splats, job.cameras))
     return {

@@ -21,7 +21,7 @@ from typing import Any
 from liftcore.errors import NotFound
 from service.child import fault_of
 from service.errors import Conflict, KeyReused, ProcessDied, ServiceUnavailable, Unauthorized
-from service.models import ENDED, AssetKind, JobKind, JobState
+from service.models import FINAL_STATES, AssetKind, JobKind, JobState
 from service.store.assets import add_owner
 from service.store.database import Database, Page, insert, page_of, parsed, record_of
 from service.store.files import DataDirectory
@@ -227,7 +227,7 @@ class JobStore:
             state = JobState(row["state"])
             if state in (JobState.CANCELING, JobState.CANCELED):
                 return False
-            if state in ENDED:
+            if state in FINAL_STATES:
                 raise Conflict("job", expected="a job that has not ended", got=f"one that has {state}")
             move(connection, row, JobState.CANCELED if state is JobState.QUEUED else JobState.CANCELING)
             return True
@@ -265,7 +265,7 @@ class JobStore:
 
         def forget(connection: sqlite3.Connection) -> list[Path]:
             row = row_of(connection, job, owner)
-            if row["state"] not in ENDED:
+            if row["state"] not in FINAL_STATES:
                 raise Conflict(
                     "job", expected="a job that has ended", got=f"one that is {row['state']}",
                     hint=f"POST /jobs/{job}/cancel first",
@@ -512,7 +512,7 @@ def move(
         {
             "state": state,
             "problem": None if problem is None else json.dumps(problem),
-            "ended": state in ENDED,
+            "ended": state in FINAL_STATES,
             "now": time.time(),
             "job": row["id"],
         },

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Self
 
 from service.errors import Misconfigured, StaleDatabase
-from service.models import ENDED
+from service.models import FINAL_STATES
 from service.settings import ServiceSettings
 from service.store.assets import AssetStore
 from service.store.database import (
@@ -181,7 +181,7 @@ def empty_quarantine(files: DataDirectory, since_before: float) -> list[Path]:
 def _unused_work(store: Store) -> tuple[list[Path], list[Path]]:
     """Return the folders of jobs that have ended, and of unknown jobs."""
     states = {folder: store.jobs.state(SERVICE, folder.name) for folder in (store.files.root / "work").iterdir()}
-    finished = [folder for folder, state in states.items() if state in ENDED]
+    finished = [folder for folder, state in states.items() if state in FINAL_STATES]
     return finished, [folder for folder, state in states.items() if state is None]
 
 

@@ -17,7 +17,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from service.commands.serve import bind, server_of
-from service.models import ENDED, AssetKind
+from service.models import FINAL_STATES, AssetKind
 from service.settings import ServiceSettings
 from service.store.assets import CheckedUpload
 from service.store.jobs import JobOrder, JobRecord
@@ -91,7 +91,7 @@ def address_of(server: uvicorn.Server) -> tuple[str, int]:
 
 def wait_until_ended(store: Store, job: str) -> JobRecord:
     """The job, once it has ended."""
-    until(lambda: store.jobs.get(SERVICE, job).state in ENDED)
+    until(lambda: store.jobs.get(SERVICE, job).state in FINAL_STATES)
     return store.jobs.get(SERVICE, job)
 
 

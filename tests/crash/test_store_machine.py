@@ -17,7 +17,7 @@ from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invar
 
 from liftcore.errors import NotFound
 from service.errors import Conflict, InUse, KeyReused, ServiceUnavailable
-from service.models import ENDED, AssetKind, JobKind, JobState
+from service.models import FINAL_STATES, AssetKind, JobKind, JobState
 from service.store.assets import CheckedUpload
 from service.store.jobs import MAX_ATTEMPTS, EventKind, JobOrder
 from service.store.lifts import FinishedLift, FinishedTradeoff
@@ -276,7 +276,7 @@ class StoreMachine(RuleBasedStateMachine):
         if not OWNERS[owner_name].sees_all and model.owner != owner_name:
             with pytest.raises(NotFound):
                 jobs.delete(owner, job, given_up=given_up)
-        elif model.state in ENDED and (model.result is None or model.order.kind in given_up):
+        elif model.state in FINAL_STATES and (model.result is None or model.order.kind in given_up):
             jobs.delete(owner, job, given_up=given_up)
             del self.jobs[job]
         else:

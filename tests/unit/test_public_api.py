@@ -248,7 +248,7 @@ def test_what_a_machine_lacks_goes_to_whoever_listens_else_to_the_log(tmp_path, 
 @pytest.mark.parametrize(
     ("changed", "error", "told"),
     [
-        ({"splats": "scene.ply"}, lc.InvalidSplats, r"splats: .*got str 'scene.ply'; read_splats"),
+        ({"splats": "scene.ply"}, lc.InvalidSplats, r"splats: .*got str 'scene.ply'; .*read_splats"),
         ({"cameras": "sparse/0"}, lc.InvalidCameras, r"cameras: .*got str 'sparse/0'; read_cameras"),
         ({"cameras": {0: None}}, lc.InvalidCameras, r"cameras: expected names that are texts, as of photos, got 0"),
         ({"cameras": None}, lc.InvalidCameras, r"cameras: expected a Camera for each name, got NoneType"),
