@@ -129,9 +129,9 @@ def _planned(order: models.LiftRequest, deps: AppState) -> models.Plan:
 
 
 def _compare(order: models.TradeoffRequest, deps: AppState, key: str | None) -> Response:
-    if models.COMPARED in order.settings:
+    if models.TRADEOFF_SETTING in order.settings:
         expected, got = "settings that are the same in all runs", "one that is compared"
-        raise InvalidSettings(models.COMPARED, expected=expected, got=got)
+        raise InvalidSettings(models.TRADEOFF_SETTING, expected=expected, got=got)
     LiftSettings.of_json(order.settings)
     if order.budget_s > deps.settings.tradeoff_seconds:
         limit = f"at most {deps.settings.tradeoff_seconds:g} s, as the operator allows"

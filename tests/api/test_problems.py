@@ -19,7 +19,7 @@ from liftcore.query.terms import NOTATIONS
 from liftcore.values.settings import LiftSettings
 from service import errors, problems
 from service.child import error_of, fault_of
-from service.models import COMPARED
+from service.models import TRADEOFF_SETTING
 from service.problems import TABLE, problem_of
 
 from .conftest import SceneAssets
@@ -259,7 +259,10 @@ def test_missing_parameter_and_a_value_of_another_type_are_told(client: TestClie
 def test_settings_have_the_types_that_the_document_shows(client: TestClient) -> None:
     order = {"splats": NO_ASSET, "cameras": NO_ASSET, "features": [NO_ASSET]}
     schemas = client.get("/openapi.json").json()["components"]["schemas"]
-    for path, schema, left_out in (("/lift", "LiftRequest", set()), ("/tradeoff", "TradeoffRequest", {COMPARED})):
+    for path, schema, left_out in (
+        ("/lift", "LiftRequest", set()),
+        ("/tradeoff", "TradeoffRequest", {TRADEOFF_SETTING}),
+    ):
         fields = schemas[schema]["properties"]["settings"]
         assert set(fields["properties"]) == set(LiftSettings.model_fields) - left_out
         assert fields["additionalProperties"] is False
