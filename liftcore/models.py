@@ -15,7 +15,7 @@ from liftcore.query.question import (
     Viewpoint,
 )
 from liftcore.query.terms import NOTATIONS
-from liftcore.runtime.aliases import deprecated_classes
+from liftcore.runtime.aliases import deprecated_module_names
 from liftcore.runtime.fields import Body, NoBoolean, takes
 
 __all__ = [
@@ -23,6 +23,6 @@ __all__ = [
     "Notation", "OwnCamera", "SceneTree", "SelectionSummary", "SuggestedWords", "Viewpoint", "takes",
 ]  # fmt: skip
 
-__getattr__ = deprecated_classes(
+__getattr__ = deprecated_module_names(
     __name__, AskableWords="SuggestedWords", Found="SelectionSummary", FoundWords="LabelSummary", Seen="Viewpoint"
 )

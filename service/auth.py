@@ -34,7 +34,7 @@ from service.problems import CLOSE
 from service.requests import is_json
 from service.settings import ServiceSettings
 from service.store.keys import KeyRecord, KeyStore
-from service.store.owners import NOBODY, SERVICE, Owner, Scope
+from service.store.owners import NO_OWNER, SERVICE, Owner, Scope
 
 CALLER = "caller"  # in the state of the ASGI scope
 LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
@@ -78,7 +78,7 @@ class Caller:
 
 
 LOCAL_ADMIN = Caller(SERVICE)  # while there are no keys
-ANONYMOUS = Caller(NOBODY)  # on an open route
+ANONYMOUS = Caller(NO_OWNER)  # on an open route
 
 
 class AuthMiddleware:

@@ -40,13 +40,13 @@ class Reporter:
         self._last = 0.0
         self._turn = threading.Lock()  # one message at a time
 
-    def __call__(self, stage: str, done: int, total: int, unit: str) -> None:
+    def __call__(self, stage: str, completed: int, total: int, unit: str) -> None:
         """Report progress (`liftcore.runtime.progress.Progress`)."""
         now = time.monotonic()
-        if stage == self._stage and done < total and now - self._last < SECONDS_BETWEEN_WORDS:
+        if stage == self._stage and completed < total and now - self._last < SECONDS_BETWEEN_WORDS:
             return
         self._stage, self._last = stage, now
-        self.say({"event": "progress", "stage": stage, "done": done, "total": total, "unit": unit})
+        self.say({"event": "progress", "stage": stage, "completed": completed, "total": total, "unit": unit})
 
     def plan(self, plan: dict[str, Any]) -> None:
         """Report the plan of the work, as `service.models.Plan` has it."""

@@ -11,6 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
     AfterValidator,
+    AliasChoices,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -265,10 +266,16 @@ class Progress(BaseModel):
     """Progress of a job's current stage."""
 
     stage: str
-    done: int
+    completed: int = Field(validation_alias=AliasChoices("completed", "done"))  # stored jobs may have the old name
     total: int
     unit: str
     eta_s: float | None = Field(description="seconds until the end of this stage, at its pace so far")
+
+    @computed_field(description="`completed`, by its old name", json_schema_extra={"deprecated": True})
+    @property
+    def done(self) -> int:
+        """Return ``completed`` by its old name, until version 1 of the API ends."""
+        return self.completed
 
 
 class Plan(BaseModel):

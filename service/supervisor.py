@@ -415,7 +415,7 @@ class StagePace:
     def __init__(self) -> None:
         self._stage = ""
         self._begin = 0.0
-        self._done_at_begin = 0
+        self._completed_at_begin = 0
 
     def begins(self, message: dict[str, Any]) -> bool:
         """Return True if a message is the first of another stage."""
@@ -424,14 +424,14 @@ class StagePace:
     def progress(self, message: dict[str, Any]) -> dict[str, Any]:
         """Return the message as `service.models.Progress` has it."""
         now = time.monotonic()
-        completed, total = message["done"], message["total"]
+        completed, total = message["completed"], message["total"]
         if self.begins(message):
-            self._stage, self._begin, self._done_at_begin = message["stage"], now, completed
-        advanced = completed - self._done_at_begin
+            self._stage, self._begin, self._completed_at_begin = message["stage"], now, completed
+        advanced = completed - self._completed_at_begin
         eta = (now - self._begin) / advanced * (total - completed) if advanced > 0 else None
         return {
             "stage": self._stage,
-            "done": completed,
+            "completed": completed,
             "total": total,
             "unit": message["unit"],
             "eta_s": None if eta is None else round(eta, 2),

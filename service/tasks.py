@@ -272,7 +272,7 @@ def lift_as_ordered(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
 
 def plan_document(plan: Plan, names: Mapping[str, str]) -> dict[str, Any]:
     """Return a plan as `service.models.Plan` has it, with clients' names in place of paths."""
-    warnings = [replace_names(warning, names) for warning in (*plan.warnings, *plan.told)]
+    warnings = [replace_names(warning, names) for warning in (*plan.warnings, *plan.input_warnings)]
     return finite({"summary": list(plan.summary()), "warnings": warnings, **plan.facts()})
 
 

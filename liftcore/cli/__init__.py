@@ -9,6 +9,7 @@ stdout has exactly one JSON object.
 import argparse
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 from functools import partial
 from importlib import import_module
@@ -48,6 +49,14 @@ SERVICE_COMMANDS = {  # modules of another package, which are entry points in sp
 WITH_ACTIONS = ("keys", "pack", "store")  # whose actions take the shared options
 INTERNAL_ERROR = 1
 INTERRUPTED = 130
+
+
+def __getattr__(name: str) -> Any:
+    """Return ``whole_number`` by its old name, with a `DeprecationWarning`."""
+    if name != "whole":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    warnings.warn(f"{__name__}.whole is now whole_number", DeprecationWarning, stacklevel=2)
+    return whole_number
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -73,7 +73,7 @@ def run(options: argparse.Namespace) -> int:
     warnings = result.metadata.diagnostics["warnings"]
     document = {"out": str(options.output), **_summary(result), "warnings": [*plan.warnings, *warnings]}
     lift_warnings = [
-        warning for warning in warnings if warning not in plan.told
+        warning for warning in warnings if warning not in plan.input_warnings
     ]  # the others were printed with the plan
     reply(
         document,
@@ -165,7 +165,7 @@ def plan_lines(plan: Plan) -> Iterable[str]:
     yield from (f"  {line}" for line in rest)
     if plan.seconds is not None:
         yield f"  about {max(plan.seconds, 1):.0f} s to rasterize the views on this machine"
-    warnings = (*plan.warnings, *plan.told)
+    warnings = (*plan.warnings, *plan.input_warnings)
     yield from (f"warning: {warning}" for warning in warnings)
     if not warnings:
         yield "  healthy: no contradictions between the inputs"

@@ -43,7 +43,7 @@ def run(options: argparse.Namespace) -> int:
         "seconds": plan.seconds,
         "device": device,
         "views": views,
-        "warnings": [*plan.warnings, *plan.told],
+        "warnings": [*plan.warnings, *plan.input_warnings],
     }
     reply(document, as_json=options.json, lines=plan.lines() if options.verbose else plan_lines(plan))
     return 0

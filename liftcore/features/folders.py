@@ -90,7 +90,7 @@ def grids_of(files: Mapping[str, Path], layout: Layout = "hwc") -> ViewFolder[Fe
             )
             hint = f"{hint} token; where channels come first, array.reshape(F, h, w).transpose(1, 2, 0)"
             raise InvalidFeatures(f"view {view!r} grid", expected="a map [h, w, F] of a photo", got=got, hint=hint)
-        return FeatureGrid(grid, where=f"view {view!r}")
+        return FeatureGrid(grid, context=f"view {view!r}")
 
     return ViewFolder(files, read)
 
@@ -113,7 +113,7 @@ def langsplat_views(folder: Path) -> ViewFolder[Regions]:
     def read(view: str) -> Regions:
         codebook = read_floats(codebooks[view], "M, F")
         ids = mask_ids(open_npy(labels[view]), len(codebook), labels[view])
-        return Regions(ids, codebook, where=f"view {view!r}")
+        return Regions(ids, codebook, context=f"view {view!r}")
 
     return ViewFolder(labels, read, codebooks.values())
 

@@ -103,7 +103,7 @@ def mask_views(
 
         def add_masks(view: str) -> Regions:
             labels = _labels(by_view[view], len(mask_vectors[view]), unlabelled)
-            return Regions(labels, mask_vectors[view], where=f"view {view!r}")
+            return Regions(labels, mask_vectors[view], context=f"view {view!r}")
 
         return ViewFolder(by_view, add_masks)
     arrays = npy_files(folder, VECTORS, ZIPPED_ARRAY)
@@ -125,7 +125,7 @@ def mask_views(
 
     def read(view: str) -> Regions:
         codebook = read_floats(vectors[view], "M, F")
-        return Regions(_labels(masks[view], len(codebook), unlabelled), codebook, where=f"view {view!r}")
+        return Regions(_labels(masks[view], len(codebook), unlabelled), codebook, context=f"view {view!r}")
 
     return ViewFolder(vectors, read, masks.values())
 

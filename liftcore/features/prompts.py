@@ -306,7 +306,7 @@ def _regions(name: str, view: _View, rows: Mapping[str, int], vectors: np.ndarra
     if view.was_searched(rows):
         rest = (labels == NO_LABEL).all(axis=0)
         labels[0][rest if void is None else rest & ~void] = len(masks)
-    return Regions(labels, vectors[[*(rows[phrase] for phrase in masks), len(rows)]], where=f"view {name!r}")
+    return Regions(labels, vectors[[*(rows[phrase] for phrase in masks), len(rows)]], context=f"view {name!r}")
 
 
 def _view_of(path: Path, folder: Path) -> str:

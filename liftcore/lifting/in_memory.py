@@ -113,7 +113,7 @@ class InMemory(LiftSteps[SceneWeights]):
             seconds = time.perf_counter() - begin
             if views.features.paths:
                 warnings = contradictions(raster, views, self.settings, plan.seen_share, geometry)
-                plans.append(replace(plan, told=(*plan.told, *warnings)))
+                plans.append(replace(plan, input_warnings=(*plan.input_warnings, *warnings)))
             if len(views) >= TIMED_VIEWS:
                 plans.append(replace(plans[-1], seconds=seconds * len(views) / len(first)))
             on_plan(plans[-1])

@@ -61,8 +61,8 @@ def lift(
             dict, a feature pack (`read_features`), or an iterator of (name, view) pairs. An iterator is read once and
             stored on disk, so that no more than a few maps are in memory.
         preset: a published choice of weights (`Preset`), or `LiftSettings` in place of preset and settings.
-        progress: called ``progress(stage, done, total, unit)``; an exception from it stops the lift. None: bars where
-            stderr is a terminal. True: bars there and lines elsewhere. False: nothing.
+        progress: called ``progress(stage, completed, total, unit)``; an exception from it stops the lift. None: bars
+            where stderr is a terminal. True: bars there and lines elsewhere. False: nothing.
         on_plan: called with the plan before the first view; it is to show the plan's warnings. None: the warnings of
             the plan are logged, and at the end those of the diagnostics.
         threads: None uses the cores that this process may use. The result is bitwise identical for any value.
@@ -91,7 +91,7 @@ def lift(
         raise InvalidSettings("on_plan", expected="a function of the plan, or None", got=repr(on_plan)[:80])
     checkpoint = _open_checkpoint(checkpoint)
     log_once = WarningLog()
-    show_plan = on_plan or (lambda plan: log_once((*plan.warnings, *plan.told)))
+    show_plan = on_plan or (lambda plan: log_once((*plan.warnings, *plan.input_warnings)))
     with shown_progress(progress) as reporter:
         timings = Timings(reporter)
         if engine is None:
@@ -250,7 +250,7 @@ def diagnose(
     }
     warnings = lift_warnings(inputs.splats, inputs.views.lifted, support.sums, settings.dtype, dtype, facts)
     warnings += [part["warning"] for part in steps.values() if "warning" in part]
-    facts["warnings"] = [*warnings, *plan.told]
+    facts["warnings"] = [*warnings, *plan.input_warnings]
     return certify(measures, support.sums, support.total_weight, settings) | dict(steps) | facts
 
 

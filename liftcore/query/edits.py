@@ -10,6 +10,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 from liftcore.errors import InvalidQuery
 from liftcore.query.question import MOST_CHARACTERS, Box, OwnCamera, Query, as_own_camera
 from liftcore.query.terms import PixelBox, Stroke, Vector, parse_example
+from liftcore.runtime.aliases import add_deprecated_properties
 from liftcore.runtime.fields import Body, NoBoolean
 
 AREAS = "VIEW:box:x0,y0,x1,y1 or VIEW:stroke:x0,y0,x1,y1,..."
@@ -82,3 +83,6 @@ class Edit(Body):
                 example if isinstance(example, str) else str(Vector(tuple(example))) for example in query[name]
             ]
         return document
+
+
+add_deprecated_properties(Edit, {"described": "to_json"})

@@ -178,7 +178,7 @@ def object_splats(scene: OpenedLift, answer: Answer, suffix: str = ".ply") -> It
     from liftcore.io.splats import labelled, some_rows
     from liftcore.query.labels import labels
 
-    if answer.dropped:
+    if answer.is_dropped:
         hint = "absent=keep selects the most similar splats; or ask in other words or by example"
         raise InvalidQuery("object", expected="an object in the scene", got=answer.reason.rstrip("."), hint=hint)
     if answer.count == 0:
@@ -209,7 +209,7 @@ def coloured_ply(scene: OpenedLift, answer: Answer) -> Iterable[bytes]:
     from liftcore.io.splats import recoloured
 
     colours = heat_colours(answer.scores, answer.seen)
-    colours[~answer.seen | answer.dropped] = NOT_SEEN_COLOUR
+    colours[~answer.seen | answer.is_dropped] = NOT_SEEN_COLOUR
     return recoloured(scene.splat_file, colours)
 
 

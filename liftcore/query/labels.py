@@ -102,10 +102,10 @@ def _of_words(scene: OpenedLift, segmentation: Segmentation) -> Labels:
 
 
 def _of_answers(scene: OpenedLift, answers: Mapping[str, Answer]) -> Labels:
-    selections = {name: (a, objects(scene, a)) for name, a in answers.items() if a.count and not a.dropped}
+    selections = {name: (a, objects(scene, a)) for name, a in answers.items() if a.count and not a.is_dropped}
     if not selections:
         first = next(iter(answers.values()))
-        got = first.reason.rstrip(".") if first.dropped else "none above the threshold"
+        got = first.reason.rstrip(".") if first.is_dropped else "none above the threshold"
         raise InvalidQuery("source", expected="an answer with selected splats", got=got, hint="ask in other words")
     count = len(scene.features)
     class_ids, best = np.zeros(count, np.int32), np.full(count, -np.inf)

@@ -15,7 +15,7 @@ import numpy as np
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound
 from liftcore.io.splats import quick_count
 from liftcore.query.scores import mean_direction, norms_of
-from liftcore.runtime.aliases import deprecated_names
+from liftcore.runtime.aliases import deprecated_keywords, deprecated_names
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.world import UNKNOWN, WorldFrame
 from liftcore.text.table import TableEncoder, own_words
@@ -232,6 +232,7 @@ class OpenedLift:
         """Weights in histograms of the splats with a feature, their total weights; None if all are zero."""
         return self.weights_with_feature(self.total_weight)
 
+    @deprecated_keywords(weigh="weight_by")
     def splat_weights(self, weight_by: str) -> np.ndarray:
         """Return the weight of each splat, [P] f32: its total weight, or that times its confidence.
 

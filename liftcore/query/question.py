@@ -27,7 +27,8 @@ from pydantic_core import CoreSchema, core_schema
 
 from liftcore.errors import InvalidQuery
 from liftcore.query.terms import NOTATIONS, SETS, Example, SplatSet, Term, Vector, parse_example, parse_set
-from liftcore.runtime.fields import Body, NoBoolean, Shown, old_field, takes
+from liftcore.runtime.aliases import add_deprecated_properties
+from liftcore.runtime.fields import Body, NoBoolean, PlainModel, old_field, takes
 from liftcore.scene.compositing import MAX_SIDE
 from liftcore.scene.world import WorldFrame
 
@@ -311,7 +312,7 @@ class Corners(BaseModel):
     high: tuple[Coordinate, Coordinate, Coordinate]
 
 
-class Value(Shown):
+class Value(PlainModel):
     """A part of an answer."""
 
     model_config = ConfigDict(frozen=True, defer_build=True)
@@ -469,9 +470,12 @@ class Answer(SelectionSummary):
         return self._arrays[2]
 
     @property
-    def dropped(self) -> bool:
+    def is_dropped(self) -> bool:
         """True if the target is absent and the query drops absent words: nothing is selected or shown."""
         return self.present is False and self.query.absent == "drop"
+
+
+add_deprecated_properties(Answer, {"dropped": "is_dropped"})
 
 
 class WithUnits(Value):

@@ -41,7 +41,10 @@ Source: TypeAlias = (  # of a file
 )
 
 
-@deprecated_names(look="view_mask", what="nearest_words")
+@deprecated_names(
+    look="view_mask", what="nearest_words", counted="splat_weights", seen_alone="weights_with_feature",
+    thing_means="object_means",
+)  # fmt: skip
 class Scene(OpenedLift):
     """A lift opened for queries, with the splats and cameras of its scene.
 

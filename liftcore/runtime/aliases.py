@@ -10,6 +10,7 @@ import sys
 import warnings
 from collections.abc import Callable, Mapping
 from functools import wraps
+from inspect import getattr_static
 from typing import Any, TypeVar, cast
 
 from liftcore.errors import InvalidInput, SplatliftError
@@ -71,9 +72,20 @@ def deprecated_names(**aliases: str) -> Callable[[C], C]:
 
 
 def add_deprecated_properties(cls: type, aliases: Mapping[str, str]) -> None:
-    """Let instances of a class be read by old names, each with a `DeprecationWarning`."""
+    """Let attributes and methods of a class be read by old names, each with a `DeprecationWarning`."""
     for old, new in aliases.items():
-        setattr(cls, old, property(deprecated_getter(new, old), doc=f"Deprecated: `{new}`."))
+        if isinstance(getattr_static(cls, new, None), classmethod):
+            setattr(cls, old, _deprecated_classmethod(new, old))
+        else:
+            setattr(cls, old, property(deprecated_getter(new, old), doc=f"Deprecated: `{new}`."))
+
+
+def _deprecated_classmethod(new: str, old: str) -> classmethod[Any, ..., Any]:
+    def call_new(cls: type, *args: Any, **keywords: Any) -> Any:
+        _warn(cls.__name__, old, new)
+        return getattr(cls, new)(*args, **keywords)
+
+    return classmethod(call_new)
 
 
 def deprecated_getter(new: str, old: str = "", readers: tuple[str, ...] = ()) -> Callable[[Any], Any]:
@@ -111,8 +123,8 @@ def deprecated_keywords(**aliases: str) -> Callable[[F], F]:
     return decorate
 
 
-def deprecated_classes(module: str, **aliases: str) -> Callable[[str], Any]:
-    """Return a ``__getattr__`` of a module that has classes by their old names, each with a `DeprecationWarning`.
+def deprecated_module_names(module: str, **aliases: str) -> Callable[[str], Any]:
+    """Return a ``__getattr__`` of a module for its old names, each of which is read with a `DeprecationWarning`.
 
     Args:
         module: its name. aliases: new names by old ones.

@@ -1,4 +1,4 @@
-"""What models of requests and answers share: strict fields, and one error in words for what does not fit."""
+"""Base models of requests and answers: strict fields, old names, and one readable error for an invalid value."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from liftcore.runtime.aliases import add_deprecated_properties, current_names, d
 from liftcore.runtime.arguments import one_of
 from liftcore.runtime.one_line import one_line, value_text
 
-NAME_CHARACTERS = 80  # of a name or a value that came, told back
+NAME_CHARACTERS = 80  # of an invalid name or value, in an error
 
 
 def takes(expected: str) -> WrapValidator:
-    """Says what a union takes, in one error in place of one for each of its branches."""
+    """Return a validator of a union with one error, in place of one error a branch."""
 
     def check(value: Any, branches: ValidatorFunctionWrapHandler) -> Any:
         try:
@@ -54,7 +54,7 @@ class AliasedModel(BaseModel):
     """A model that is read by old names of its fields too, and written by the new (`liftcore.runtime.aliases`)."""
 
     old_names: ClassVar[Mapping[str, str]] = {}  # new names of fields by old ones
-    error_type: ClassVar[type[SplatliftError] | None] = None  # what stands in for pydantic's errors; None: nothing
+    error_type: ClassVar[type[SplatliftError] | None] = None  # in place of pydantic's errors; None: these
 
     @classmethod
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
@@ -103,8 +103,8 @@ def old_field(new: str, annotation: Any) -> Any:
     return decorate(field)
 
 
-class Shown(AliasedModel):
-    """A model that Python prints in a line: the fields that were given."""
+class PlainModel(AliasedModel):
+    """A model whose representation is one line: the fields that were set."""
 
     def __repr__(self) -> str:
         names = self.model_fields_set
@@ -114,8 +114,8 @@ class Shown(AliasedModel):
         return repr(self)
 
 
-class Body(Shown):
-    """What a body, or a part of one, may hold. A field that is not known is refused with those that are."""
+class Body(PlainModel):
+    """The body of a request, or a part of one. An unknown field is an error that lists the known ones."""
 
     model_config = ConfigDict(extra="forbid", defer_build=True)  # help lists fields, and checks none
 
@@ -144,7 +144,7 @@ class Body(Shown):
 
 
 def _error_of(model: type[BaseModel], error: ValidationError, error_type: type[SplatliftError]) -> SplatliftError:
-    """The first thing that does not fit, with all that its field takes."""
+    """Return the error of the first invalid field, with the values that it may have."""
     first = error.errors(include_url=False)[0]
     context, place = first.get("ctx", {}), [str(part) for part in first["loc"]]
     place = [context["field"]] if first["type"] == "unknown_field" else place
@@ -159,7 +159,7 @@ def _error_of(model: type[BaseModel], error: ValidationError, error_type: type[S
 
 
 def bounds_of(schema: dict[str, Any]) -> tuple[Any, Any]:
-    """The least and the greatest number of a field, by its JSON schema; None where it has none."""
+    """Return the minimum and the maximum of a field, by its JSON schema; None for no bound."""
     parts = [schema, *schema.get("anyOf", ())]
     low, high = (next((part[name] for part in parts if name in part), None) for name in ("minimum", "maximum"))
     return low, high

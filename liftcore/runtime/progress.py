@@ -1,4 +1,4 @@
-"""How long work says where it is, and how many seconds each of its stages took."""
+"""Progress of long work, and the seconds of each of its stages."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ LINE_SECONDS = 10.0  # between two lines of progress where nothing draws bars
 
 
 class Progress(Protocol):
-    """Called as work advances: ``progress(stage, done, total, unit)``. May raise to stop the work."""
+    """Function called as work advances: ``progress(stage, completed, total, unit)``. May raise to stop the work."""
 
-    def __call__(self, stage: str, done: int, total: int, unit: str) -> None:
-        """Say that ``done`` of ``total`` units of ``stage`` are done."""
+    def __call__(self, stage: str, completed: int, total: int, unit: str, /) -> None:
+        """Report that ``completed`` of ``total`` units of ``stage`` are complete."""
         ...
 
 
-def silent(stage: str, done: int, total: int, unit: str) -> None:
-    """Say nothing."""
+def silent(stage: str, completed: int, total: int, unit: str) -> None:
+    """Report nothing."""
 
 
 @contextmanager
 def one_step(progress: Progress, stage: str) -> Iterator[None]:
-    """Tell of the block as a stage without parts that could be counted."""
+    """Report the block as a stage of one step."""
     progress(stage, 0, 1, "steps")
     yield
     progress(stage, 1, 1, "steps")
 
 
 class Timings:
-    """Seconds of each stage of a piece of work, of which ``progress`` is told."""
+    """Seconds of each stage of some work, which are reported to ``progress``."""
 
     def __init__(self, progress: Progress | None = None) -> None:
         self.seconds: dict[str, float] = {}
@@ -43,7 +43,7 @@ class Timings:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Time the block, which tells of itself, under that name; without the stages within it."""
+        """Add the seconds of the block to that stage, without those of stages within it; report no progress."""
         start, before = time.perf_counter(), self._within
         self._within = 0.0
         yield
@@ -53,21 +53,21 @@ class Timings:
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
-        """Time the block, and tell of it as one step."""
+        """Time the block, and report it as one step."""
         with self.stage(name), one_step(self.progress, name):
             yield
 
 
 @contextmanager
 def shown_progress(progress: Progress | bool | None) -> Iterator[Progress]:
-    """Give what a caller of the library wants to see of the work.
+    """Yield the function that reports the progress of work to a caller.
 
     Args:
         progress: a function that is called as work advances; True for bars on a terminal and lines elsewhere; False
             for nothing; None for bars on a terminal and nothing elsewhere.
 
     Raises:
-        InvalidSettings: it is something else.
+        InvalidSettings: ``progress`` is something else.
     """
     if progress is None:
         progress = sys.stderr is not None and sys.stderr.isatty()
@@ -79,13 +79,13 @@ def shown_progress(progress: Progress | bool | None) -> Iterator[Progress]:
         with progress_bars() as bars:
             yield bars
     else:
-        expected = "a function of (stage, done, total, unit), True, False or None"
+        expected = "a function of (stage, completed, total, unit), True, False or None"
         raise InvalidSettings("progress", expected=expected, got=repr(progress)[:80])
 
 
 @contextmanager
 def progress_bars() -> Iterator[Progress]:
-    """Yield progress that draws one bar a stage on a terminal; elsewhere it says a line every ten seconds."""
+    """Yield progress that draws one bar a stage on a terminal, and elsewhere prints a line every LINE_SECONDS."""
     if not sys.stderr.isatty():
         yield _Lines()
         return
@@ -97,35 +97,35 @@ def progress_bars() -> Iterator[Progress]:
 
 
 class _Lines:
-    """A line every LINE_SECONDS."""
+    """Progress as a line every LINE_SECONDS."""
 
     def __init__(self) -> None:
         self.next = time.monotonic() + LINE_SECONDS
 
-    def __call__(self, stage: str, done: int, total: int, unit: str) -> None:
+    def __call__(self, stage: str, completed: int, total: int, unit: str) -> None:
         if time.monotonic() >= self.next:
-            print(f"{stage}: {done} of {total} {unit}", file=sys.stderr, flush=True)
+            print(f"{stage}: {completed} of {total} {unit}", file=sys.stderr, flush=True)
             self.next = time.monotonic() + LINE_SECONDS
 
 
 class _Bars:
-    """One bar a stage, of tqdm."""
+    """Progress as one bar of tqdm a stage."""
 
     def __init__(self) -> None:
         self.stage = ""
         self.bar: Any = None
 
-    def __call__(self, stage: str, done: int, total: int, unit: str) -> None:
+    def __call__(self, stage: str, completed: int, total: int, unit: str) -> None:
         if self.bar is None or stage != self.stage:
             from tqdm import tqdm
 
             self.close()
             self.stage = stage
-            look = {"leave": total > 1, "file": sys.stderr, "dynamic_ncols": True}
-            self.bar = tqdm(total=total, desc=stage, unit=f" {unit}", **look)
+            options = {"leave": total > 1, "file": sys.stderr, "dynamic_ncols": True}
+            self.bar = tqdm(total=total, desc=stage, unit=f" {unit}", **options)
         self.bar.total = total
-        self.bar.update(done - self.bar.n)
-        if done >= total == 1:  # one step is shown while it lasts: the plan is printed where its bar was
+        self.bar.update(completed - self.bar.n)
+        if completed >= total == 1:  # one step is shown while it lasts: the plan is printed where its bar was
             self.close()
 
     def close(self) -> None:

@@ -416,12 +416,12 @@ class _Stored:
     def read(self) -> ViewFeatures:
         tensor = self.pack.handle.get_tensor
         if "grid" in self.specs:
-            return FeatureGrid(tensor(f"{self.name}/grid"), where=self.where)
+            return FeatureGrid(tensor(f"{self.name}/grid"), context=self.where)
         stored = tensor(f"{self.name}/labels")
         labels = stored.to(torch.int32)
         if stored.dtype == torch.uint8:
             labels[stored == U8_NO_LABEL] = NO_LABEL
-        return Regions(labels, tensor(f"{self.name}/codebook"), where=self.where)
+        return Regions(labels, tensor(f"{self.name}/codebook"), context=self.where)
 
 
 def _open(path: Path) -> _PackFile:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from liftcore.errors import InvalidInput, Unavailable
 from liftcore.io.safetensors_file import map_tensors, write_tensors
-from liftcore.runtime.aliases import current_names, deprecated_names
+from liftcore.runtime.aliases import current_names, deprecated_keywords, deprecated_names
 from liftcore.runtime.cores import cores
 from liftcore.runtime.device import out_of_memory
 from liftcore.runtime.memory import zeros
@@ -175,6 +175,7 @@ class RegionWeights:
         indptr = np.concatenate([[0], np.cumsum(lengths)])
         return csr_array((host.weight.numpy(), host.region.numpy(), indptr), shape=(splats, int(host.offsets[-1])))
 
+    @deprecated_keywords(others="extra_tensors")
     def save(self, path: Path | str, extra_tensors: Mapping[str, Tensor] | None = None) -> None:
         """Write one safetensors file, whole or not at all: its tensors by name, and ``views`` in the metadata.
 

@@ -14,8 +14,9 @@ from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, ValidationErr
 from pydantic_core import PydanticCustomError
 
 from liftcore.errors import InvalidSettings
+from liftcore.runtime.aliases import add_deprecated_properties
 from liftcore.runtime.device_name import device_name
-from liftcore.runtime.fields import Shown
+from liftcore.runtime.fields import PlainModel
 from liftcore.runtime.nearest import nearest
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.compositing import (
@@ -119,7 +120,7 @@ GROUPS = {  # of the settings, for people who read all of them
 }  # fmt: skip
 
 
-class LiftSettings(Shown):
+class LiftSettings(PlainModel):
     """All that decides the result of a lift, and where it runs. Knobs left out take the preset's values."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -551,6 +552,9 @@ class LiftSettings(Shown):
             expected, got = f"at most {MOST_DIAGNOSTIC_RAYS} rays", str(settings.diagnostic_rays)
             raise InvalidSettings("diagnostic_rays", expected=expected, got=got)
         return settings
+
+
+add_deprecated_properties(LiftSettings, {"chosen": "from_preset"})
 
 
 def _settings_error(error: ValidationError, known_names: Iterable[str]) -> InvalidSettings:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from liftcore.errors import InvalidFeatures
 from liftcore.io.npy import without_unit_axes
+from liftcore.runtime.aliases import deprecated_keywords
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.splats import shared_tensor
 
@@ -47,9 +48,9 @@ class Regions:
         labels: [L, h, w], or [h, w] for one level, of integers: rows of the codebook, -1 for none. Here and in the
             others, axes of length 1 before these are taken off.
         codebook: [M, F] of floats; float16 and float32 stay as they are, others become float32.
-        where: what errors name before the argument.
+        context: text before the argument's name in errors, such as a view.
 
-    Both come from numpy or torch, on the CPU or a card, without a copy where type and order allow.
+    Both come from numpy or torch, on the CPU or a GPU, without a copy where type and order allow.
 
     Raises:
         InvalidFeatures: another shape or type, a label out of the codebook, or a value that is not finite.
@@ -60,19 +61,21 @@ class Regions:
     codebook: Tensor
     """[M, F] f16 or f32"""
 
-    def __init__(self, labels: Array, codebook: Array, *, where: str = "") -> None:
-        rows = _features(codebook, "M, F", f"{where} codebook".strip())
+    @deprecated_keywords(where="context")
+    def __init__(self, labels: Array, codebook: Array, *, context: str = "") -> None:
+        rows = _features(codebook, "M, F", f"{context} codebook".strip())
         object.__setattr__(self, "codebook", rows)
-        object.__setattr__(self, "labels", _labels(labels, len(rows), f"{where} labels".strip()))
+        object.__setattr__(self, "labels", _labels(labels, len(rows), f"{context} labels".strip()))
 
     @classmethod
+    @deprecated_keywords(where="context")
     def from_masks(
         cls,
         masks: Array | Sequence[Array],
         vectors: Array,
         levels: Sequence[int] | None = None,
         *,
-        where: str = "",
+        context: str = "",
     ) -> Self:
         """Regions of masks that may overlap, as SAM gives them, with a vector each.
 
@@ -86,13 +89,13 @@ class Regions:
             levels: M whole numbers from 0 on, the level of each mask, such as SAM's sub-part, part and whole; masks
                 of one level must not overlap. None: large masks first, each on the first level that has room for it
                 (`label_levels`). The setting ``levels`` of a lift can take one of them alone.
-            where: what errors name before the argument.
+            context: text before the argument's name in errors, such as a view.
 
         Raises:
             InvalidFeatures: masks that are no booleans, of another number than the vectors, or in which two of a
                 level overlap; or as the constructor has it.
         """
-        argument = f"{where} masks".strip()
+        argument = f"{context} masks".strip()
         try:
             tensors = [mask for mask in masks if isinstance(mask, Tensor)] if isinstance(masks, Sequence) else []
             planes = (torch.stack(tensors) if tensors else shared_tensor(masks)).cpu()
@@ -104,12 +107,12 @@ class Regions:
             hint = "masks of numbers are booleans by masks > 0.5" if planes.dtype != torch.bool else ""
             expected = "booleans [M, H, W], at least one mask and no side empty"
             raise InvalidFeatures(argument, expected=expected, got=_kind(planes), hint=hint)
-        codebook = _features(vectors, "M, F", f"{where} vectors".strip())
+        codebook = _features(vectors, "M, F", f"{context} vectors".strip())
         if len(codebook) != len(planes):
             expected, got = f"{len(codebook)} masks, one a vector", f"{len(planes)} of shape {list(planes.shape[1:])}"
             raise InvalidFeatures(argument, expected=expected, got=got, hint="row k of the vectors is of mask k")
         planes = planes.numpy()
-        labels = label_levels(list(planes), argument) if levels is None else _levels_of(planes, levels, where)
+        labels = label_levels(list(planes), argument) if levels is None else _levels_of(planes, levels, context)
         return cls.unchecked(torch.from_numpy(labels).to(codebook.device), codebook)
 
     def __repr__(self) -> str:
@@ -139,7 +142,7 @@ class FeatureGrid:
 
     Args:
         grid: [h, w, F] of floats, as the codebook of `Regions`. Maps [F, h, w] of torch are ``permute(1, 2, 0)``.
-        where: what errors name before the argument.
+        context: text before the argument's name in errors, such as a view.
 
     Raises:
         InvalidFeatures: another shape or type, or a value that is not finite.
@@ -148,9 +151,9 @@ class FeatureGrid:
     grid: Tensor
     """[h, w, F] f16 or f32"""
 
-    def __init__(self, grid: Array, *, where: str = "") -> None:
-        where = f"{where} grid".strip()
-        cells = _features(grid, "h, w, F", where)
+    @deprecated_keywords(where="context")
+    def __init__(self, grid: Array, *, context: str = "") -> None:
+        cells = _features(grid, "h, w, F", f"{context} grid".strip())
         object.__setattr__(self, "grid", cells)
 
     def __repr__(self) -> str:

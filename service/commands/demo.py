@@ -262,7 +262,7 @@ def _show_progress(job: dict[str, Any]) -> None:
     if not sys.stderr.isatty():
         return
     step = job.get("progress") or {}
-    parts = f" {step['done']}/{step['total']} {step['unit']}" if step and step["total"] > 1 else ""
+    parts = f" {step['completed']}/{step['total']} {step['unit']}" if step and step["total"] > 1 else ""
     text = f"{job['state']}  {step['stage'] if step else ''}{parts}" if job["state"] not in FINAL_STATES else ""
     print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
 

@@ -182,7 +182,7 @@ def list_shares(lift: str, deps: Deps) -> models.Shares:
 
 
 @router.post("/lifts/{lift}/shares", response_model=models.NewShare, status_code=201, tags=["keys"])
-def create_share(lift: str, asked: models.ShareRequest, request: Request, deps: Deps) -> Response:
+def create_share(lift: str, share_request: models.ShareRequest, request: Request, deps: Deps) -> Response:
     """Create a key that can read and query this lift. The secret is shown once, and in a link of the page."""
     record = deps.store.lifts.get(deps.owner, lift)
     if deps.caller.record is None:
@@ -193,8 +193,8 @@ def create_share(lift: str, asked: models.ShareRequest, request: Request, deps: 
     if len(deps.store.keys.of_lift(record.id)) >= MOST_SHARES:
         raise OverLimit("share", expected=f"at most {MOST_SHARES} of a lift", got="more", hint="delete some first")
     key, secret = deps.store.keys.create(
-        asked.name, frozenset({Scope.SHARED}), Quota(), expires=time.time() + asked.expires_s, lifts=[record.id],
-        maker=bearer(request.headers),
+        share_request.name, frozenset({Scope.SHARED}), Quota(), expires=time.time() + share_request.expires_s,
+        lifts=[record.id], maker=bearer(request.headers),
     )  # fmt: skip
     share = shape_share(key, record.id)
     # After the #, which browsers do not send: it reaches neither the log of a proxy nor another site.

@@ -16,7 +16,7 @@ from service.errors import InUse
 from service.models import AssetKind, UploadKind
 from service.store.database import Database, Page, insert, page_of, record_of
 from service.store.files import DataDirectory, is_whole
-from service.store.owners import OWNED, VISIBLE_ASSETS, Owner, require_quota
+from service.store.owners import OWNER_CLAUSE, VISIBLE_ASSETS, Owner, require_quota
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,9 @@ class CheckedUpload:
 # Several owners of the same bytes share one file and one row; each owner has it since its own upload.
 VISIBLE = (
     "SELECT assets.*, created FROM (SELECT asset, min(created) AS created"
-    f" FROM asset_owners WHERE {OWNED} GROUP BY asset) JOIN assets ON asset = id"
+    f" FROM asset_owners WHERE {OWNER_CLAUSE} GROUP BY asset) JOIN assets ON asset = id"
 )
-ONE_ASSET = VISIBLE.replace(f"{OWNED} GROUP", f"{VISIBLE_ASSETS} AND asset = :asset GROUP")
+ONE_ASSET = VISIBLE.replace(f"{OWNER_CLAUSE} GROUP", f"{VISIBLE_ASSETS} AND asset = :asset GROUP")
 
 
 SHOWN_CHARACTERS = 256 << 10  # of counts; longer lists of names or words are given in pages
@@ -183,7 +183,7 @@ class AssetStore:
 
             def forget(connection: sqlite3.Connection) -> list[Path]:
                 users = connection.execute(
-                    f"SELECT id FROM jobs WHERE {OWNED} AND (splats = :asset OR cameras = :asset OR EXISTS"
+                    f"SELECT id FROM jobs WHERE {OWNER_CLAUSE} AND (splats = :asset OR cameras = :asset OR EXISTS"
                     " (SELECT 1 FROM job_features WHERE job = id AND asset = :asset) OR EXISTS"
                     " (SELECT 1 FROM job_labels WHERE job = id AND asset = :asset) OR EXISTS"
                     " (SELECT 1 FROM lifts WHERE lifts.id = jobs.id AND photos = :asset)) LIMIT 4",
@@ -194,7 +194,7 @@ class AssetStore:
                         "asset", expected="an asset that no job and no lift refers to", got=asset,
                         hint=f"jobs that refer to it: {', '.join(row['id'] for row in users)}",
                     )  # fmt: skip
-                connection.execute(f"DELETE FROM asset_owners WHERE asset = :asset AND {OWNED}", terms)
+                connection.execute(f"DELETE FROM asset_owners WHERE asset = :asset AND {OWNER_CLAUSE}", terms)
                 last = connection.execute(
                     "DELETE FROM assets WHERE id = :asset"
                     " AND NOT EXISTS (SELECT 1 FROM asset_owners WHERE asset = :asset) RETURNING id",

@@ -27,7 +27,7 @@ from service.store.database import Database, Page, insert, page_of, parsed, reco
 from service.store.files import DataDirectory
 from service.store.owners import (
     INVALID_KEYS,
-    OWNED,
+    OWNER_CLAUSE,
     QUEUE_RETRY_SECONDS,
     VISIBLE_JOBS,
     Owner,
@@ -199,7 +199,7 @@ class JobStore:
     def page(self, owner: Owner, limit: int, cursor: str | None = None) -> Page[JobRecord]:
         """Return so many jobs after a cursor, newest first."""
         with self._database.read() as connection:
-            select = f"SELECT * FROM jobs WHERE {OWNED}"
+            select = f"SELECT * FROM jobs WHERE {OWNER_CLAUSE}"
             return page_of(connection, select, owner.terms(), limit, cursor, lambda row: record(connection, row))
 
     def all(self, owner: Owner) -> list[JobRecord]:
@@ -240,7 +240,7 @@ class JobStore:
         """
         with self._database.read() as connection:
             visible = connection.execute(
-                f"SELECT 1 FROM jobs WHERE id = :job AND {OWNED} AND :owner NOT IN ({INVALID_KEYS})",
+                f"SELECT 1 FROM jobs WHERE id = :job AND {OWNER_CLAUSE} AND :owner NOT IN ({INVALID_KEYS})",
                 owner.terms(job=job, now=time.time()),
             )
             if visible.fetchone() is None:
@@ -465,7 +465,8 @@ def _take_assets(connection: sqlite3.Connection, order: JobOrder, owner: Owner) 
     """Require that the assets are there; an admin becomes an owner of those that its job needs."""
     for asset, kind in order.assets():
         visible = connection.execute(
-            f"SELECT 1 FROM assets JOIN asset_owners ON asset = id WHERE id = :asset AND kind = :kind AND {OWNED}",
+            "SELECT 1 FROM assets JOIN asset_owners ON asset = id WHERE id = :asset AND kind = :kind"
+            f" AND {OWNER_CLAUSE}",
             owner.terms(asset=asset, kind=kind),
         )
         if visible.fetchone() is None:

@@ -23,7 +23,7 @@ from service.store.assets import add_owner
 from service.store.database import Database, Page, insert, page_of, parsed, record_of
 from service.store.files import DataDirectory, sync_directory
 from service.store.jobs import JobOrder, record_state, succeed
-from service.store.owners import OWNED, VISIBLE_JOBS, Owner, require_quota
+from service.store.owners import OWNER_CLAUSE, VISIBLE_JOBS, Owner, require_quota
 
 BY_HAND = "set by hand"  # reason of the rendering in a lift's plan: the setting was not auto
 WORLD_CHANGED = "world_changed"  # in a lift's metadata in the database: its file has another world
@@ -127,7 +127,7 @@ VISIBLE = (
 )
 VISIBLE_TRADEOFFS = (
     "SELECT tradeoffs.*, splats, cameras, json_extract(parameters, '$.labels') AS labels,"
-    f" {FEATURES} AS features FROM tradeoffs JOIN jobs USING (id) WHERE {OWNED}"
+    f" {FEATURES} AS features FROM tradeoffs JOIN jobs USING (id) WHERE {OWNER_CLAUSE}"
 )
 
 
@@ -259,7 +259,7 @@ class LiftStore:
         """Add the lift's owner to assets, within a write transaction, whoever requested it."""
         row = connection.execute(
             "SELECT 1 FROM assets JOIN asset_owners ON asset = id"
-            f" WHERE id = :photos AND kind = 'photos' AND {OWNED}",
+            f" WHERE id = :photos AND kind = 'photos' AND {OWNER_CLAUSE}",
             owner.terms(photos=photos),
         ).fetchone()
         if row is None:

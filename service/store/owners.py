@@ -11,7 +11,7 @@ from typing import Any
 from service.errors import InvalidRequest, KeyLimitReached, OverQuota
 
 # For WHERE clauses over a table with a column `owner`; `Owner.terms` binds its names.
-OWNED = "(:sees_all OR owner = :owner)"
+OWNER_CLAUSE = "(:sees_all OR owner = :owner)"
 # The same for reads of jobs and of owners of assets: includes shared lifts (`service.auth` limits the routes).
 SHARED_LIFTS = "SELECT lift FROM key_lifts WHERE key = :owner"
 SHARED_ASSETS = (
@@ -35,7 +35,7 @@ class Scope(StrEnum):
     READ = "read"  # read assets, jobs, results, queries, pictures
     WRITE = "write"  # upload, order, cancel, delete
     SHARED = "shared"  # read and query the lifts shared with the key
-    METRICS = "metrics"  # /metrics, which tells of everybody's work together, and nothing else
+    METRICS = "metrics"  # read /metrics, which sums the work of all owners, and nothing else
     ADMIN = "admin"  # all of these, on the records of all owners
 
 
@@ -61,14 +61,14 @@ class Owner:
     max_bytes: int | None = None  # of assets and results together; None = no limit
     max_queued: int | None = None  # jobs in line
 
-    def terms(self, **others: Any) -> dict[str, Any]:
-        """Return values for OWNED, and others."""
-        return {"sees_all": self.sees_all, "owner": self.key, **others}
+    def terms(self, **values: Any) -> dict[str, Any]:
+        """Return values to bind to OWNER_CLAUSE, and ``values``."""
+        return {"sees_all": self.sees_all, "owner": self.key, **values}
 
 
 # The service itself, and every caller while there are no keys; its records belong to admins once there are keys.
 SERVICE = Owner("", sees_all=True)
-NOBODY = Owner("-", sees_all=False)  # the id of no key: it owns nothing
+NO_OWNER = Owner("-", sees_all=False)  # the id of no key: it owns nothing
 
 
 def stored_bytes(connection: sqlite3.Connection, owner: Owner) -> int:

@@ -34,6 +34,7 @@ from service import supervisor as pace
 from service.child import fault_of
 from service.job_child import Reporter
 from service.models import AssetKind
+from service.routes.jobs import shape
 from service.store.jobs import LINE_CHARACTERS, LOG_LINES, EventKind, log_line, note
 from service.store.owners import SERVICE
 from service.store.store import Store
@@ -235,7 +236,18 @@ def test_job_tells_of_every_stage_and_its_plan_comes_with_the_first_views(
     assert job["created"] <= job["started"] <= job["ended"]
     assert job["request_id"] == LIFT_REQUEST
     assert LIFT_REQUEST in client.get(job["links"]["events"]).text
-    assert job["progress"] == {"stage": "save", "done": 1, "total": 1, "unit": "steps", "eta_s": 0.0}
+    assert job["progress"] == {
+        "stage": "save", "completed": 1, "done": 1, "total": 1, "unit": "steps", "eta_s": 0.0,
+    }  # fmt: skip
+
+
+def test_progress_stored_by_its_old_name_is_answered_by_both(store: Store) -> None:
+    job, _ = store.jobs.submit(SERVICE, order(store))
+    progress = {"stage": "solve", "done": 2, "total": 3, "unit": "slices", "eta_s": None}
+    with store.database.write() as connection:
+        connection.execute("UPDATE jobs SET progress = ? WHERE id = ?", (json.dumps(progress), job))
+    shaped = shape(store.jobs.get(SERVICE, job)).model_dump(mode="json")
+    assert shaped["progress"] == progress | {"completed": 2}
 
 
 def test_lists_begin_with_the_newest(store: Store) -> None:
@@ -257,13 +269,13 @@ def test_job_keeps_its_states_the_last_of_its_log_and_its_latest_progress(store:
     with store.database.write() as connection:
         for number in range(LOG_LINES + 5):
             note(connection, job, EventKind.LOG, log_line(f"{number:03} {'x' * LINE_CHARACTERS}"))
-            note(connection, job, EventKind.PROGRESS, {"done": number})
+            note(connection, job, EventKind.PROGRESS, {"completed": number})
     events = store.jobs.events(SERVICE, job, 0)
     assert [event.data["state"] for event in events if event.kind is EventKind.STATE] == ["queued"]
     lines = [event.data["line"] for event in events if event.kind is EventKind.LOG]
     assert [int(line[:3]) for line in lines] == list(range(5, LOG_LINES + 5))
     assert {len(line) for line in lines} == {LINE_CHARACTERS}
-    assert [event.data for event in events if event.kind is EventKind.PROGRESS] == [{"done": LOG_LINES + 4}]
+    assert [event.data for event in events if event.kind is EventKind.PROGRESS] == [{"completed": LOG_LINES + 4}]
     numbers = [event.number for event in events]
     assert numbers == sorted(set(numbers)) and store.jobs.events(SERVICE, job, numbers[-2]) == events[-1:]
 
@@ -274,7 +286,7 @@ def test_what_a_stage_will_still_take_follows_from_its_own_pace(monkeypatch: pyt
     stages = pace.StagePace()
 
     def seconds_left(stage: str, completed: int) -> float | None:
-        return stages.progress({"stage": stage, "done": completed, "total": 10, "unit": "views"})["eta_s"]
+        return stages.progress({"stage": stage, "completed": completed, "total": 10, "unit": "views"})["eta_s"]
 
     assert seconds_left("walk", 4) is None  # what an earlier attempt has done says nothing of the pace
     now += 10

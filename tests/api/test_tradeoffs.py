@@ -118,7 +118,7 @@ def test_real_tradeoff_is_judged_by_the_masks_of_its_order(
     job = wait_for_end(client, client.post("/tradeoff", json=order).headers["location"])
     assert job["state"] == "succeeded", job
     assert job["parameters"] == {"budget_s": 10, "labels": masked_order}
-    assert job["progress"]["stage"] == "tradeoff" and job["progress"]["done"] == job["progress"]["total"]
+    assert job["progress"]["stage"] == "tradeoff" and job["progress"]["completed"] == job["progress"]["total"]
     tradeoff = client.get(job["links"]["tradeoff"]).json()
     exact = tradeoff["runs"][0]
     assert exact["name"] == "exact" and exact["cosine"] == pytest.approx(1.0) and exact["mask_iou"] > 0.5

@@ -54,9 +54,9 @@ def plan(line: str) -> None:
 
 def answer(order: dict[str, Any]) -> None:
     plan("one splat")
-    say(event="progress", stage="geometry", done=0, total=2, unit="views")
-    say(event="progress", stage="geometry", done=1, total=2, unit="views")
-    say(event="progress", stage="solve", done=1, total=1, unit="slices")
+    say(event="progress", stage="geometry", completed=0, total=2, unit="views")
+    say(event="progress", stage="geometry", completed=1, total=2, unit="views")
+    say(event="progress", stage="solve", completed=1, total=1, unit="slices")
     finish(order)
 
 

@@ -243,7 +243,7 @@ class StoreMachine(RuleBasedStateMachine):
 
     @rule(attempt=attempts)
     def advance(self, attempt: tuple[str, int]) -> None:
-        self.store.jobs.advance(*attempt, {"done": 1})
+        self.store.jobs.advance(*attempt, {"completed": 1})
 
     def draw_job(self, data: Any) -> str:
         """A job by its place in line: ids are random, so a choice among them would differ when a story is retold."""

@@ -103,6 +103,22 @@ def settings_by_old_names(old: str, value: object) -> dict[str, Callable[[], lc.
     }
 
 
+def test_method_and_argument_of_a_class_are_read_by_old_names() -> None:
+    settings: Any = lc.LiftSettings
+    with pytest.deprecated_call(match="chosen is now from_preset"):
+        assert settings.chosen("row-sum", {"seed": 3}) == lc.LiftSettings.from_preset("row-sum", {"seed": 3})
+    regions: Any = lc.Regions
+    for make in (
+        lambda: regions([[1]], torch.ones(1, 2), where="view 'a'"),
+        lambda: lc.FeatureGrid(torch.ones(2), **{"where": "view 'a'"}),
+    ):
+        with (
+            pytest.deprecated_call(match="where is now context"),
+            pytest.raises(lc.InvalidFeatures, match="view 'a'"),
+        ):
+            make()
+
+
 VALUES = {"certificate_rays": 7}  # of settings with an old name
 
 

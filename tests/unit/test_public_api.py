@@ -361,9 +361,14 @@ def test_splats_of_activated_opacities_and_scales_are_told_in_the_plan(scene):
     _, _, cameras, views = scene
     splats = random_splats(3, 200, spread=1.5)
     opacities, scales = torch.sigmoid(splats.opacity_logits), splats.log_scales.exp()
-    told = lc.plan(replace(splats, opacity_logits=opacities, log_scales=scales), cameras, views).told
-    assert any("no logits" in text for text in told) and any("no logarithms" in text for text in told)
-    assert not any("as if they were no" in text for text in lc.plan(splats, cameras, views).told)
+    plan = lc.plan(replace(splats, opacity_logits=opacities, log_scales=scales), cameras, views)
+    warnings = plan.input_warnings
+    assert any("no logits" in text for text in warnings) and any("no logarithms" in text for text in warnings)
+    for old, new in (("told", "input_warnings"), ("there", "available_views")):
+        with pytest.deprecated_call(match=f"{old} is now {new}"):
+            assert getattr(plan, old) == getattr(plan, new)
+    assert plan.available_views == len(views)
+    assert not any("as if they were no" in text for text in lc.plan(splats, cameras, views).input_warnings)
 
 
 def test_region_weights_of_a_label_a_pixel_are_the_weights_of_rays(scene):

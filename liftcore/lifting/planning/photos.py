@@ -30,6 +30,7 @@ from liftcore.lifting.planning.plan import PlannedScene, first_names, planned_sc
 from liftcore.lifting.planning.views import SAMPLE, WELL_COVERED, greedy, spread
 from liftcore.raster import check_splats_and_threads, open_raster
 from liftcore.raster.base import Raster, ViewRequest
+from liftcore.runtime.aliases import deprecated_names, with_old_names
 from liftcore.runtime.device import CPU
 from liftcore.runtime.one_line import one_line
 from liftcore.runtime.one_thread import one_thread
@@ -51,22 +52,23 @@ NO_PIXELS = torch.empty(0, 2, dtype=torch.int32)
 
 
 @dataclass(frozen=True)
-class Shown:
-    """What the first photos of the order show."""
+class PhotoCoverage:
+    """Coverage of the splats by the first photos of the order."""
 
-    photos: int
-    once: float  # of the splats' weight, the share that one of them sees at least
-    twice: float  # that two of them see
-    seconds: float  # that a lift takes to look through them on this machine today, about
+    photos: int  # their number
+    once: float  # share of the splats' weight that at least one of them sees
+    twice: float  # share that at least two of them see
+    seconds: float  # estimate of the geometry of a lift with them, on this machine now
 
 
+@deprecated_names(shown="coverage")
 @dataclass(frozen=True)
 class PhotoPlan(PlannedScene):
     """An order of photos to encode. Plain values; except for the seconds, the same inputs give the same plan."""
 
     order: tuple[str, ...]  # all photos, in the order to encode them
     spare: tuple[str, ...]  # of those: WELL_COVERED before them in the order see the same splats
-    shown: tuple[Shown, ...]  # by the first 4, 8, 16, ... and all of them
+    coverage: tuple[PhotoCoverage, ...]  # by the first 4, 8, 16, ... and all photos
     seen_share: float  # of the splats, that some photo sees
     row_sum: float  # mean sum of the weights of a ray
     warnings: tuple[str, ...]
@@ -77,7 +79,7 @@ class PhotoPlan(PlannedScene):
 
     def facts(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        return {**asdict(self), "photos": len(self.order)}
+        return {**with_old_names(asdict(self), {"shown": "coverage"}), "photos": len(self.order)}
 
     def lines(self, *, verbose: bool = False) -> Iterator[str]:
         """Yield lines of the plan for people.
@@ -88,7 +90,7 @@ class PhotoPlan(PlannedScene):
         limit = None if verbose else SHOWN_PHOTOS
         yield f"plan: {self.splats} splats ({self.rendered}), {len(self.order)} photos, no features yet"
         yield "  photos  see of the weight  twice or more  to look through"
-        for row in self.shown:
+        for row in self.coverage:
             seconds = f"about {max(row.seconds, 1):.0f} s"
             yield f"  {row.photos:>6}  {row.once:>17.1%}  {row.twice:>13.1%}  {seconds:>15}"
         yield f"encode first: {first_names(self.order, limit)}"
@@ -138,7 +140,7 @@ def plan_photos(
         **vars(planned_scene(splats, settings)),
         order=tuple(views[k].name for k in order),
         spare=tuple(views[k].name for k in spare_photos(visible, weight, order)),
-        shown=tuple(coverage_rows(visible, weight, order, seconds)),
+        coverage=tuple(coverage_rows(visible, weight, order, seconds)),
         seen_share=seen_share,
         row_sum=row_sum,
         warnings=(*scene_warnings(splats, all_cameras, views, settings), *empty_warnings),
@@ -183,7 +185,7 @@ def photo_order(visible: np.ndarray, weight: np.ndarray) -> Iterator[int]:
     """Order all photos: each next one adds the most; of equal ones the first comes first.
 
     Args:
-        seen: [V, n] bool. weight: [n] f64, of the splats.
+        visible: [V, n] bool. weight: [n] f64, of the splats.
     """
     splats_of, gains = [np.flatnonzero(row) for row in visible], weight / 2  # of one more photo of a splat
 
@@ -204,14 +206,16 @@ def spare_photos(visible: np.ndarray, weight: np.ndarray, order: Sequence[int]) 
     return spare
 
 
-def coverage_rows(visible: np.ndarray, weight: np.ndarray, order: Sequence[int], seconds: float) -> Iterator[Shown]:
+def coverage_rows(
+    visible: np.ndarray, weight: np.ndarray, order: Sequence[int], seconds: float
+) -> Iterator[PhotoCoverage]:
     """Yield the coverage of the first 4, 8, 16, ... photos of the order; ``seconds`` are of one photo."""
     view_counts, total, next_row = np.zeros(visible.shape[1], np.int64), max(weight.sum(), 1e-30), FIRST_COUNT
     for count, photo in enumerate(order, start=1):
         view_counts += visible[photo]
         if count in (next_row, len(order)):
             once, twice = (float(weight[view_counts >= times].sum() / total) for times in (1, 2))
-            yield Shown(count, once, twice, count * seconds)
+            yield PhotoCoverage(count, once, twice, count * seconds)
             next_row *= 2
 
 

@@ -26,6 +26,7 @@ from liftcore.lifting.planning.views import (
 )
 from liftcore.raster import open_raster
 from liftcore.raster.base import Raster
+from liftcore.runtime.aliases import deprecated_names
 from liftcore.runtime.device import CPU, Device
 from liftcore.runtime.memory import check_disk, free_memory, lack_of_disk
 from liftcore.runtime.one_line import one_line
@@ -105,13 +106,14 @@ def scene_warnings(
     return *splats.warnings, *rendering, *cameras.warnings, *distortion_warning(views)
 
 
+@deprecated_names(told="input_warnings", there="available_views")
 @dataclass(frozen=True)
 class Plan(PlannedScene):
     """The plan of a lift. Plain values: the same inputs and settings give the same plan."""
 
     views: tuple[str, ...]  # that will be lifted, in the order of the sums
     left_out: tuple[str, ...]  # that the settings' coverage or view_cosine leaves out
-    there: int  # views with features and a camera, whatever the settings take of them
+    available_views: int  # views with features and a camera, also those that the settings leave out
     view_cosine: float | None  # expected, of the views' features to those of all, if the setting chose views
     spare: tuple[str, ...]  # of those lifted: WELL_COVERED of the others see the same splats
     seen_share: float  # of the splats, that some view can see, before occlusion
@@ -126,12 +128,12 @@ class Plan(PlannedScene):
     features_room: int | None  # bytes of this machine's memory that X may take today; None for no limit
     seconds: float | None  # estimate for the geometry of all views on this machine now; None for few views
     warnings: tuple[str, ...]  # of this machine, today
-    told: tuple[str, ...]  # warnings of what is lifted, which the diagnostics of the lift has too
+    input_warnings: tuple[str, ...]  # of splats, cameras and features; the diagnostics of the lift have them too
 
     def __repr__(self) -> str:
-        views = f"{len(self.views)} of {self.there} views"
+        views = f"{len(self.views)} of {self.available_views} views"
         memory = f"{self.memory_bytes / 2**30:.1f} GiB"
-        warnings = f"{len(self.warnings) + len(self.told)} warnings"
+        warnings = f"{len(self.warnings) + len(self.input_warnings)} warnings"
         return one_line(self, f"{self.splats} of {self.kernel}", views, f"{self.channels} channels", memory, warnings)
 
     @property
@@ -170,7 +172,8 @@ class Plan(PlannedScene):
         """Yield three lines for people: the scene and its views, the channels, the memory."""
         visible = f"{self.seen_share:.1%} in some view's field"
         spare = f", {len(self.spare)} of them see nothing that {WELL_COVERED} others do not" if self.spare else ""
-        yield f"{self.splats} splats ({self.rendered}), {visible}; {len(self.views)} of {self.there} views{spare}"
+        views = f"{len(self.views)} of {self.available_views} views{spare}"
+        yield f"{self.splats} splats ({self.rendered}), {visible}; {views}"
         level = f", level {self.levels[0]} alone of {self.levels[1]}, as the settings choose" if self.levels else ""
         yield f"{self.channels} channels, stored as {self.dtype}{level}"
         files = f", {self.in_files / MIB:.0f} MiB of region weights in files" if self.in_files else ""
@@ -188,7 +191,7 @@ class Plan(PlannedScene):
         yield f"  {channels}"
         parts = ", ".join(f"{name} {size / MIB:.0f}" for name, size in self.memory.items())
         yield f"  {memory} ({parts})"
-        yield from (f"warning: {warning}" for warning in (*self.warnings, *self.told))
+        yield from (f"warning: {warning}" for warning in (*self.warnings, *self.input_warnings))
 
     def _spare_line(self) -> str:
         if not self.spare:
@@ -251,7 +254,7 @@ def plan_lift(
         **vars(planned_scene(splats, settings)),
         views=tuple(names),
         left_out=tuple(name for name in views.names if name not in lifted),
-        there=len(features),
+        available_views=len(features),
         view_cosine=expected,
         spare=tuple(names[k] for k in spare_views(visible)),
         seen_share=visible.seen_share,
@@ -266,7 +269,7 @@ def plan_lift(
         features_room=features_room(parts, free),
         seconds=seconds,
         warnings=(*short, *check_memory(parts, free), *check_weights(in_files)),
-        told=(
+        input_warnings=(
             *scene_warnings(splats, views.cameras, cameras, settings),
             *shape_warnings(features, cameras),
             *contradicting,

@@ -77,7 +77,7 @@ def test_arrays_that_fit_are_not_copied() -> None:
         (lambda: ANY_REGIONS(np.ones((1, 1), np.uint64), np.eye(2)), r"integers \[L, h, w\].*uint64"),
         (lambda: ANY_REGIONS([0], np.eye(2)), r"labels: .*int64 \[1\]"),
         (lambda: ANY_REGIONS([[0]], np.ones(2)), r"codebook: expected floats \[M, F\]"),
-        (lambda: ANY_REGIONS([[0]], np.full((1, 2), np.nan), where="view 'a'"), "view 'a' codebook: .*got 2 of 2"),
+        (lambda: ANY_REGIONS([[0]], np.full((1, 2), np.nan), context="view 'a'"), "view 'a' codebook: .*got 2 of 2"),
         (lambda: ANY_GRID(np.ones((2, 3))), r"grid: expected floats \[h, w, F\]"),
         (lambda: ANY_GRID(np.ones((2, 0, 3))), "no side empty"),
         (lambda: ANY_GRID(torch.ones(1, 2, 3, dtype=torch.int32)), "int32"),

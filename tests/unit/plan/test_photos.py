@@ -41,10 +41,10 @@ def test_order_and_shares_are_those_of_the_dense_definition():
         shares.append([weight[hits >= times].sum() / weight.sum() for times in (1, 2)])
     plan = lc.plan_photos(splats, cameras, threads=1)
     assert plan.order == tuple(f"v{k}" for k in order) != tuple(cameras)
-    assert [row.photos for row in plan.shown] == [4, 8, 9]
-    shares_of_plan = [[row.once, row.twice] for row in plan.shown]
+    assert [row.photos for row in plan.coverage] == [4, 8, 9]
+    shares_of_plan = [[row.once, row.twice] for row in plan.coverage]
     assert np.allclose(shares_of_plan, [shares[3], shares[7], shares[8]], atol=1e-6)
-    assert 0.5 < plan.shown[0].twice < plan.shown[0].once <= plan.shown[-1].once
+    assert 0.5 < plan.coverage[0].twice < plan.coverage[0].once <= plan.coverage[-1].once
     threaded = lc.plan_photos(splats, cameras, threads=2)
     assert (threaded.order, threaded.spare, threaded.seen_share) == (plan.order, plan.spare, plan.seen_share)
 
@@ -65,7 +65,11 @@ def test_command_without_features_tells_what_to_encode_first(tmp_path, capsys):
     reply = json.loads(capsys.readouterr().out)
     plan = lc.plan_photos(lc.read_splats(paths[0]), lc.read_cameras(paths[1]))
     assert reply["order"] == list(plan.order) and reply["photos"] == 3
-    assert reply["shown"][0]["once"] == pytest.approx(plan.shown[0].once) and reply["shown"][0]["seconds"] > 0
+    [first, *_] = reply["coverage"]
+    assert first["once"] == pytest.approx(plan.coverage[0].once) and first["seconds"] > 0
+    assert reply["shown"] == reply["coverage"]
+    with pytest.deprecated_call(match="shown is now coverage"):
+        assert plan.shown is plan.coverage
     assert cli.main(["plan", *map(str, paths[:2])]) == 0
     assert f"encode first: {', '.join(plan.order)}" in capsys.readouterr().out
 
@@ -78,7 +82,7 @@ def test_smoothness_changes_no_share_and_the_plan_says_so(smoothness, tmp_path, 
     assert cli.main([*arguments, "--json"]) == 0
     reply = json.loads(capsys.readouterr().out)
     assert reply["order"] == list(plan.order)
-    assert [row["twice"] for row in reply["shown"]] == pytest.approx([row.twice for row in plan.shown])
+    assert [row["twice"] for row in reply["coverage"]] == pytest.approx([row.twice for row in plan.coverage])
     assert cli.main(arguments) == 0
     assert ("smoothness adds no look" in capsys.readouterr().out) == (smoothness != "0")
 

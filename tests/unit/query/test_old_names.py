@@ -35,7 +35,9 @@ def test_old_attributes_are_the_new_ones_with_a_warning(scene: lc.Scene) -> None
         (scene.askable(encoder=AXES), "any_text", "open_vocabulary"),
         (models.Edit(operation="grow"), "how", "operation"), (lc.Picture(channel="pca"), "what", "channel"),
         (lc.load_lift(scene.path).query(np.eye(CHANNELS)[0]), "why", "reason"),
-        (scene, "look", "view_mask"), (scene, "what", "nearest_words"),
+        (scene, "look", "view_mask"), (scene, "what", "nearest_words"), (scene, "counted", "splat_weights"),
+        (scene, "seen_alone", "weights_with_feature"), (answer, "dropped", "is_dropped"),
+        (models.Edit(operation="grow"), "described", "to_json"),
     ]  # fmt: skip
     for value, old, new in pairs:
         with deprecated(new):

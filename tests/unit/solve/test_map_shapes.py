@@ -61,7 +61,7 @@ def test_the_lift_and_its_plan_warn_of_a_crop(tmp_path: Path) -> None:
     splats, cameras, _ = write_scene(tmp_path, 3)
     pack, settings = tmp_path / "crops.safetensors", LiftSettings.of(diagnostic_rays=10)
     write_pack(pack, {"v0": grid(23, 31), "v1": grid(23, 23), "v2": grid(23, 23)}, {"encoder": "e"})
-    [planned_for] = plan(*open_files(splats, cameras, [pack], settings), settings).told
+    [planned_for] = plan(*open_files(splats, cameras, [pack], settings), settings).input_warnings
     assert planned_for.startswith("2 of 3 views have maps of another aspect than their images (v1: 23x23 for 37x27)")
     warnings = lift_files(splats, cameras, [pack], settings).metadata.diagnostics["warnings"]
     assert warnings.count(planned_for) == 1
