@@ -14,7 +14,7 @@
     ├── NotFound                   a name does not exist             -> exit 2, HTTP 404
     └── Unavailable                a capability is missing here      -> exit 2, HTTP 422 (weights, encoders)
 
-Every error names the argument, the expected value and the actual one, and says what to do.
+Every error names the argument, the expected value and the actual one, and has a hint.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class SplatliftError(Exception):
         argument: the argument, file or field at fault, by the name that the user knows.
         expected: a valid value.
         got: the actual value.
-        hint: what to do; empty if the first three say it.
+        hint: what to do; empty if the first three are enough.
         nearest: for an unknown word, known words near to it, the likeliest first; None for
             any other error.
     """

@@ -97,7 +97,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
         description="Lift 2D features onto trained splat scenes and query them in words.",
         lifespan=lifespan,
         responses=problems.RESPONSES,
-        openapi_url=None,  # `service.routes.operations` tells it, and of keys, beside the event loop
+        openapi_url=None,  # `service.routes.operations` serves it, with keys, outside the event loop
         redirect_slashes=False,
         generate_unique_id_function=lambda route: route.name,  # clients name their functions by it
     )

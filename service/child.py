@@ -126,7 +126,7 @@ def fault_of(error: SplatliftError, names: Mapping[str, str] | None = None) -> d
 
     Args:
         error: the error to send.
-        names: server path -> the name that the client knows; paths of this machine are nobody's business.
+        names: server path -> the name that the client knows: paths of the server are private.
     """
     fault = {name: str(getattr(error, name)) for name in FIELDS}
     document: dict[str, Any] = {"kind": error.kind}

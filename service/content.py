@@ -39,7 +39,7 @@ BYTES = {BINARY: {"schema": {"type": "string", "format": "binary"}}}
 TAGGED: dict[int | str, dict[str, Any]] = {304: {"description": "The client has it already (If-None-Match)"}}
 FILE: dict[int | str, dict[str, Any]] = TAGGED | {
     200: {"description": "The whole of it", "content": BYTES},
-    206: {"description": "The range that was asked for", "content": BYTES},
+    206: {"description": "The requested range", "content": BYTES},
     416: {**PROBLEM, "description": "A range beyond the end"},
 }
 
@@ -210,7 +210,7 @@ def page_response(
 
 POLL_SECONDS = 0.25  # between polls for new events
 KEEPALIVE_SECONDS = 15.0  # of silence, then a comment keeps the connection open
-POLL_THREADS = 2  # threads for polls, whatever the number of streams: other routes keep theirs
+POLL_THREADS = 2  # threads for polls of all streams, so that these do not starve other routes
 
 EventSource = Callable[[int], list[Event]]  # returns the events after a number
 Shape = Callable[[Event], str]  # returns the JSON of an event

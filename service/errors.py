@@ -174,7 +174,7 @@ class TimedOut(ServiceError):
 
 
 class ClientDisconnected(ServiceError):
-    """The client disconnected before its turn: nobody reads the answer."""
+    """The client disconnected before its answer was computed."""
 
     kind, status, title = "client-left", 400, "The client left"
 

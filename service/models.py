@@ -40,10 +40,10 @@ from liftcore.models import (
     takes,
 )
 
-# What one file or request may hold, beside the sizes that the operator sets (`service.settings`).
+# Limits of one file or request, beside those that the operator sets (`service.settings`).
 # Texts, in characters
-VIEW_CHARACTERS = 500  # of a view's name, so that a query can say it
-WORD_CHARACTERS = 1000  # of a word, of a text that is asked for, and of what a pack is named
+VIEW_CHARACTERS = 500  # of a view's name, so that it fits a query string
+WORD_CHARACTERS = 1000  # of a word, of a query's text, and of a pack's names
 FILE_CHARACTERS = 4 << 20  # of all names, or all words, of a file: a hundred thousand of 40
 PAGE_CHARACTERS = 256 << 10  # of the names, or words, of one answer
 LIFT_NAME_CHARACTERS = 100
@@ -55,7 +55,7 @@ PACKS = 64  # of a lift
 SETTINGS = 100  # of a lift
 MAX_TEXTS = 32  # texts, or examples, of a question
 VECTOR = 65_536  # numbers of a vector
-WORDS = 4096  # that are asked at once
+WORDS = 4096  # of a query
 PAGE = 1000  # records of a list, names or views in one answer
 
 # JSON bodies, before they are parsed: what a question needs at most is 4,096 words, or 32 vectors of 4,096 numbers
@@ -117,7 +117,7 @@ class AssetKind(StrEnum):
     FEATURES = "features"
     MASKS = "masks"  # of views, to judge by
     TABLE = "table"  # of text embeddings
-    PHOTOS = "photos"  # of views, to look at
+    PHOTOS = "photos"  # of views
 
 
 UploadKind = AssetKind | Literal["lift"]
@@ -135,7 +135,7 @@ class JobState(StrEnum):
 
     QUEUED = "queued"
     RUNNING = "running"
-    CANCELING = "canceling"  # asked for, and not yet true
+    CANCELING = "canceling"  # requested, and not complete
     SUCCEEDED = "succeeded"
     FAILED = "failed"
     CANCELED = "canceled"
@@ -157,9 +157,7 @@ class Problem(BaseModel):
     hint: str | None = None
     nearest: Annotated[
         list[str] | None,
-        Field(
-            description="of a word that cannot be asked: those that can be and are near to it, the likeliest first"
-        ),
+        Field(description="for an unknown word: known words near to it, the likeliest first"),
     ] = None
     request_id: Annotated[str | None, Field(description="as in X-Request-ID; the log has it too")] = None
 
@@ -234,12 +232,12 @@ class LiftRequest(LiftInputs):
 
     model_config = BODY_CONFIG
     table: AssetId | None = Field(
-        None, description="an uploaded text table whose words the lift is asked in; else those of its text space"
+        None, description="an uploaded text table, with the words of the lift's queries; else those of its text space"
     )
 
 
 class Labels(Body):
-    """Masks of views, and the words that they mean: views with masks are not lifted, and say how good a lift is."""
+    """Masks of views and their words; views with masks are held out, to measure the accuracy of lifts."""
 
     masks: AssetId
     table: AssetId
@@ -301,7 +299,7 @@ class Job(BaseModel):
     parameters: dict[str, Any] = Field(
         description="of its kind: the table of a lift's words; budget_s of a trade-off, and its labels"
     )
-    plan: Plan | None = Field(description="of a lift, from before its first view is walked; the latest attempt's")
+    plan: Plan | None = Field(description="of a lift, before its first view is rasterized; of the latest attempt")
     progress: Progress | None
     problem: Problem | None
     created: Seconds
@@ -341,20 +339,20 @@ class LiftResult(BaseModel):
     """Features on splats. A lift has the id of the job that made it."""
 
     id: JobId
-    name: str | None = Field(description="that somebody gave it")
+    name: str | None = Field(description="set by a user")
     bytes: int = Field(description="of its file, as it was made")
-    sha256: str = Field(description="likewise; of the download after its `world` was changed the ETag tells")
+    sha256: str = Field(description="likewise; after a change of `world` the download has another, in its ETag")
     splats: AssetId
     cameras: AssetId
     features: list[AssetId]
-    photos: AssetId | None = Field(description="of its views, to look at")
+    photos: AssetId | None = Field(description="of its views")
     count: int = Field(description="P, the number of splats")
     channels: int = Field(description="F, the number of feature channels")
     version: str
     settings: dict[str, Any]
-    encoder: str = Field(description="the 2D encoder that made the features, as their packs tell it")
+    encoder: str = Field(description="the 2D encoder that made the features, as in their packs")
     text_space: str = Field(description="the text space that the features share")
-    words: list[str] = Field(description="that its packs brought: it is asked in these without an encoder")
+    words: list[str] = Field(description="from its packs, for queries without an encoder")
     views: list[str] = Field(description="the views that were lifted; very many are at links.views alone")
     view_count: int = Field(description="how many these are")
     origin: list[float] = Field(
@@ -381,7 +379,7 @@ SettingText = Annotated[str, Field(min_length=1, max_length=SETTING_CHARACTERS, 
 
 
 class PackChange(Body):
-    """Names of a feature pack; what is left out stays as the pack says it."""
+    """Names of a feature pack; fields that are left out stay as in the pack."""
 
     model_config = BODY_CONFIG
     encoder: SettingText | None = Field(None, description="what made the features")
@@ -441,7 +439,7 @@ class Views(BaseModel):
 class Tradeoff(BaseModel):
     """Speed against accuracy on a scene, as ``splatlift tradeoff --json`` has it. It has the id of its job."""
 
-    model_config = ConfigDict(extra="allow")  # what else the comparison tells
+    model_config = ConfigDict(extra="allow")  # other fields of the comparison
 
     id: JobId
     splats: AssetId
@@ -479,12 +477,12 @@ class Version(BaseModel):
     version: str = Field(description="of splatlift")
     api: str = Field(description="of the routes and their JSON")
     database: int = Field(description="of the database's schema")
-    commit: str | None = Field(description="the git commit that this was built from, if the operator said so")
+    commit: str | None = Field(description="the git commit of the build, if the operator set it")
     python: str
     packages: dict[str, str] = Field(description="versions of what matters most")
 
 
-# Questions: what liftcore declares, with the lift that is asked, its encoder, and bounds of HTTP
+# Queries: the models of liftcore, with the lift, the encoder, and limits of HTTP
 
 QUESTIONS = 16  # that are exported together
 THE_LIFT = "the lift; may be left out when there is exactly one"
@@ -612,7 +610,7 @@ class OfLift(BaseModel):
 class SegmentAnswer(LabelSummary, OfLift):
     """Words that are requested, of many."""
 
-    encoder: str = Field(description="the text encoder that was asked, without its file")
+    encoder: str = Field(description="the text encoder of the query, without its file")
 
 
 class NearestWordsAnswer(BestWords, OfLift):
@@ -630,12 +628,12 @@ class QueryAnswer(Answer, OfLift):
 
     view: str | None
     text_space: str = Field(description="of the lift's features")
-    encoder: str | None = Field(description="the text encoder that was asked, without its file; null without a text")
+    encoder: str | None = Field(description="the text encoder of the query, without its file; null without a text")
     links: dict[str, str]
 
 
 class ObjectsAnswer(SelectionSummary, Objects, OfLift):
-    """The things that were found."""
+    """The objects of an answer."""
 
 
 class CoveringRegions(OfLift):
@@ -676,7 +674,7 @@ class ObjectLabelChange(Body):
 
     model_config = BODY_CONFIG
     name: SelectionName | None = Field(None, description="of your own; null for the nearest word again")
-    hidden: bool = Field(False, description="whether lists leave it out")
+    hidden: bool = Field(False, description="true if lists leave it out")
 
 
 class ObjectLabel(BaseModel):
@@ -728,7 +726,7 @@ class SelectionDetail(ListedSelection):
     """A selection with its history."""
 
     history: list[SelectionStep] = Field(description="also the steps that were undone")
-    bits: str | None = Field(description="base64 of a bit a splat, the first the lowest of its byte, if asked for")
+    bits: str | None = Field(description="base64 of a bit a splat, the first the lowest of its byte, if requested")
 
 
 class Selections(BaseModel):
@@ -748,7 +746,7 @@ class OwnKey(BaseModel):
 
 
 class ShareRequest(Body):
-    """A key to make for somebody."""
+    """Request for a new key."""
 
     model_config = BODY_CONFIG
     name: SelectionName = Field(description="for whom it is")
@@ -758,7 +756,7 @@ class ShareRequest(Body):
 
 
 class Share(BaseModel):
-    """A key that looks at one lift and asks it. It ends with the key that made it."""
+    """Request for a key that can read and query one lift; it expires with the key that created it."""
 
     id: str
     name: str
@@ -772,7 +770,7 @@ class Share(BaseModel):
 class NewShare(Share):
     """A share with its secret."""
 
-    key: str = Field(description="the secret, which nobody can ask for again; links.page carries it")
+    key: str = Field(description="the secret, which cannot be read again; links.page has it")
 
 
 class Shares(BaseModel):
@@ -828,9 +826,9 @@ class LiftTree(SceneTree, OfLift):
 
 
 class NamedObject(SceneObject):
-    """A thing of a lift, perhaps with a name that somebody gave it."""
+    """An object of a lift, with its name if a user gave it one."""
 
-    hidden: bool = Field(description="whether somebody hid it")
+    hidden: bool = Field(description="true if a user hid it")
 
 
 class SceneObjects(ListedObjects, OfLift):

@@ -86,7 +86,7 @@ access = logging.getLogger("service.access")
 def logging_to_stderr(log_format: str) -> Iterator[None]:
     """Send the records of this process to stderr while the block runs, with warnings and exceptions of threads.
 
-    A thread of its own writes them: where stderr is stalled nobody waits for it.
+    A thread of its own writes them: a stalled stderr then blocks no request.
     """
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonLines() if log_format == "json" else TextLines())

@@ -127,7 +127,7 @@ async def _handle_error(request: Request, error: Exception) -> JSONResponse:
             return answer_to(refusal(request, error))
         case HTTPException():
             return _of_framework(request, error)
-        case ClientDisconnect():  # nobody reads this; without it the log would show an error of the server
+        case ClientDisconnect():  # the client is gone; without this the log would show an error of the server
             return answer(by_status(400, "The client left before the end of the body."))
     return _of_system(f"{request.method} {request.url.path}", error)
 

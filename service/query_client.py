@@ -20,7 +20,7 @@ from liftcore.errors import SplatliftError
 from service.child import ONE_THREAD, error_of, is_stopped
 from service.errors import ClientDisconnected, ProcessDied, ServiceUnavailable, TimedOut, require_share
 
-# Without the first two, each array of a query is mapped anew and its pages fault one by one: a fifth of its time.
+# Without the first two, each array of a query is mapped again and its pages fault one by one: a fifth of its time.
 # A query is many small operations, each of which would wait for its library's threads to synchronise; beside a lift
 # that took more than half of its time. The kernels have threads of their own.
 ENVIRONMENT = {
@@ -157,7 +157,7 @@ class QueryClient:
         """Send a request to the worker and return its answer.
 
         Args:
-            request: what is asked, as JSON takes it.
+            request: JSON values.
             waiter: for whom.
 
         Raises:
@@ -165,7 +165,7 @@ class QueryClient:
             ServiceUnavailable: too many calls are waiting, this one had no turn in its time, or the server stops.
             KeyLimitReached: too many of them are of this key.
             TimedOut: the answer took too long.
-            ClientDisconnected: nobody waits for it.
+            ClientDisconnected: all clients that waited have left.
             ProcessDied: the worker died twice over this call, or failed with an error that is ours.
         """
         start, outcome = time.monotonic(), "crashed"
@@ -192,11 +192,11 @@ class QueryClient:
     def require_device(self, device: str) -> None:
         """Refuse a device that is not available; ``auto`` and ``cpu`` always are.
 
-        The worker looks, once, as this process never loads torch. When it cannot be asked the device is let through:
+        The worker looks, once, as this process never loads torch. If it cannot run, the device is accepted:
         the job looks again, and fails in the same words.
 
         Raises:
-            Unavailable: what is missing, as the lift would say it.
+            Unavailable: something is missing, as in a lift.
         """
         if device != "cuda":
             return

@@ -119,12 +119,12 @@ class Answers:
         """Return the reply to one request, by its ``operation``.
 
         Args:
-            request: what is asked.
+            request: the query.
             ahead: the requests that follow it. Questions among them to the same lift are answered in the same pass
                 over its features, which costs little more than one question alone, and kept for their turn.
 
         Raises:
-            SplatliftError: what was asked cannot be answered.
+            SplatliftError: the request cannot be answered.
         """
         if request.get("lift") in self._scenes:  # each request describes its selection, whatever another request set
             self._scenes[request["lift"]].selections.clear()

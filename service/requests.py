@@ -42,7 +42,7 @@ LET_GO = 16  # times the limit of a body: an upload to the wrong route ends ther
 
 # Async: a sync dependency waits for a thread of the pool, and every route with it.
 async def _known_only(request: Request) -> None:
-    """Refuse query parameters that the route does not know, rather than ignore them."""
+    """Refuse unknown query parameters rather than ignore them."""
     parameters = request.query_params
     if not parameters:
         return
@@ -186,7 +186,7 @@ def require_plain(content_encodings: Sequence[str]) -> None:
 
 def _validated(request: Request, model: TypeAdapter[Any], content: bytearray) -> Any:
     """Return a body as a model, or its error; an exception raised here would keep the body in memory."""
-    # Parsing these takes a tenth of a second of the event loop, whatever they are.
+    # Parsing these takes a tenth of a second of the event loop.
     if content.count(b"[") + content.count(b"{") > models.BODY_BRACKETS or content.count(b",") > models.BODY_COMMAS:
         expected = f"JSON of at most {models.BODY_COMMAS} values and {models.BODY_BRACKETS} lists and objects"
         return InvalidRequest("body", expected=expected, got="more", hint=BODY)
@@ -210,7 +210,7 @@ class Parameters(Generic[M]):
     """Return a dependency that gives a model of the parameters of a request.
 
     Args:
-        model: what is asked. names: its fields that are parameters. needs: those that must be there.
+        model: of the request. names: its fields that are parameters. needs: those that are required.
     """
 
     model: type[M]
@@ -240,7 +240,7 @@ class Parameters(Generic[M]):
         return self.model.model_json_schema()
 
     def _names(self) -> list[str]:
-        """Return the names of the parameters, and old names of these, which the schema says are deprecated."""
+        """Return the names of the parameters, and old names of these, which the schema has as deprecated."""
         return [*self.names, *(old for old, new in self.model.old_names.items() if new in self.names)]
 
     def openapi_schema(self) -> dict[str, Any]:

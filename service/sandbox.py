@@ -121,10 +121,10 @@ def run_sandboxed(task: str, arguments: Sequence[str], scratch: Path, limits: Sa
         task: the name of the function, such as ``service.tasks.check``: this process must not import what it needs.
         arguments: of the function, which gives a JSON object with an ``event``.
         scratch: the folder for its temporary files.
-        limits: beyond that of time it is ended; one that meets that of memory dies, or says so.
+        limits: beyond that of time it is ended; one over the memory limit dies, or reports it.
 
     Returns:
-        What it said; None when it took longer than it may, and was ended.
+        Its messages; None if it exceeded the time limit and was ended.
 
     Raises:
         ServiceUnavailable: the server ended meanwhile, there is no process, or it was ended with its template, twice.

@@ -45,7 +45,7 @@ class ServiceSettings(BaseSettings):
 
     forwarded_allow: str = Field(
         "",
-        description="addresses or networks of proxies whose X-Forwarded-For tells the client's address, for the log, "
+        description="addresses or networks of proxies whose X-Forwarded-For has the client's address, for the log, "
         "with commas between; not set = nobody's",
     )
 
@@ -147,9 +147,7 @@ class ServiceSettings(BaseSettings):
     query_waiting: int = Field(16, ge=1, le=32, description="queries that may wait or run; more are answered 503")
     query_seconds: float = Field(120, gt=0, description="wall time after which a query is given up")
     query_scenes: int = Field(2, ge=1, description="lifts that the query process keeps open")
-    query_cache_bytes: int = Field(
-        256 * MiB, ge=0, description="answers and views that the query process keeps for what is asked next"
-    )
+    query_cache_bytes: int = Field(256 * MiB, ge=0, description="answers and views that the query process caches")
 
     @field_validator("allowed_hosts", "cors_origins", mode="before")
     @classmethod
@@ -223,11 +221,11 @@ def encoder_spec(settings: ServiceSettings, text_space: str, requested: str | No
 
     The default stands in for a space that has none only where the operator chose it: scores of an encoder of
     another space look like any others, and mean nothing. Encoders that need no file answer for their own spaces,
-    and a lift that brings its words is asked in these: ``OWN_WORDS``. A lift's own space may
-    be asked for by its name.
+    and a lift with words of its own is queried in these: ``OWN_WORDS``. A lift's own space may
+    be requested by its name.
 
     Raises:
-        InvalidRequest: no encoder was set up under the name asked for, or for the lift's text space.
+        InvalidRequest: no encoder is configured by that name, or for the lift's text space.
     """
     if requested == "default":
         return settings.encoder

@@ -30,7 +30,7 @@ from service.store.store import Store
 from service.supervisor import Supervisor
 
 PATIENCE_SECONDS = 2.0  # for all checks of readiness; a disk that takes longer is not usable
-FRESH_SECONDS = 1.0  # a result is kept so long: the disk is written once a second, whatever the number of probes
+FRESH_SECONDS = 1.0  # a result is kept so long: the disk is written once a second, for any number of probes
 HURRY_SECONDS = 0.1  # between two polls for a forced exit
 PROBE_BYTES = 4096
 CHECKS = ("database", "disk", "supervisor", "queries", "uploads")

@@ -240,7 +240,7 @@ class AttemptLog:
         try:
             self.flush()
         except TRANSIENT_ERRORS as error:
-            log.warning("what job %s tells cannot be noted yet: %s", self._job.id, error)
+            log.warning("the progress of job %s cannot be stored yet: %s", self._job.id, error)
             self._retry_at = time.monotonic() + RETRY_SECONDS
 
     def flush(self) -> None:
@@ -344,7 +344,7 @@ class Attempt:
     def _is_wanted(self) -> bool:
         try:
             return self._store.jobs.state(SERVICE, self._job.id) is JobState.RUNNING
-        except TRANSIENT_ERRORS:  # if the database cannot be read, nobody can have canceled the job
+        except TRANSIENT_ERRORS:  # if the database cannot be read, the job cannot have been canceled
             return True
 
     def _settle(self, draft: Path, reason: str | SplatliftError, stopping: bool) -> None:

@@ -233,7 +233,7 @@ def lift_as_ordered(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
     """Lift, and write the lift to ``output``.
 
     Returns:
-        What the job's last message tells of it.
+        Fields of the job's last message.
 
     Raises:
         SplatliftError: as `liftcore.lift` has it.
@@ -292,7 +292,7 @@ def compare_as_ordered(order: dict[str, Any], progress: Reporter) -> dict[str, A
     """Compare, and draw the chart to ``output``. Each run is a process of this group, with this environment.
 
     Returns:
-        What the job's last message tells of it: ``document`` and ``page``.
+        Fields of the job's last message: ``document`` and ``page``.
 
     Raises:
         SplatliftError: as `liftcore.evaluate.compare_speeds` has it.

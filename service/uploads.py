@@ -106,7 +106,7 @@ class Intake(ABC, Generic[Record]):
         """Finish after the last byte: check the digest and the file, and store it.
 
         Args:
-            promised: the sha256 in hex that the client said, if it did.
+            promised: the sha256 in hex that the client sent, if any.
 
         Returns:
             What there is, when its owner has these very bytes already.

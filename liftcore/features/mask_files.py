@@ -239,7 +239,7 @@ def read_mask(record: Any, size: tuple[int, int] | None, location: str) -> Store
         location: of the record in its file, for errors.
 
     Raises:
-        InvalidFeatures: as `read_runs` and `read_polygons` say, or polygons of an image of unknown size.
+        InvalidFeatures: as in `read_runs` and `read_polygons`, or polygons of an image of unknown size.
     """
     fields = record if isinstance(record, dict) else {}
     bitmap, shape = fields.get("bitmap"), fields.get("shape_type")

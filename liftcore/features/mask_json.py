@@ -64,7 +64,7 @@ class ImageMasks:
     not_searched: set[str] = field(
         default_factory=set
     )  # normalized phrases that were not searched for, or not completely
-    annotated: bool = True  # has a record, or the document says that it is empty
+    annotated: bool = True  # has a record, or is listed as empty
     ids: "IdObjects | None" = None  # objects of a picture of ids
     in_data_set: bool = False  # among the images of a data set
     file: str = ""  # its file name in a data set
@@ -279,7 +279,7 @@ def _data_set(content: Mapping[str, Any], document: MaskDocument, *, unannotated
     category_names = {
         other: category["name"] for other, category in categories.items() if isinstance(category.get("name"), str)
     }
-    questions = {number: image["text_input"] for number, image in images.items() if _asks(image)}
+    questions = {number: image["text_input"] for number, image in images.items() if _has_prompt(image)}
     masked = [phrase for image_masks in by_number.values() for phrase in image_masks.phrases]
     phrases = {
         normalize_text(phrase)
@@ -317,7 +317,7 @@ def _drop_upload_prefixes(images: Sequence[ImageMasks]) -> None:
             image.image = str(path.with_name(LABEL_STUDIO.sub("", path.name)))
 
 
-def _asks(image: Mapping[str, Any]) -> bool:
+def _has_prompt(image: Mapping[str, Any]) -> bool:
     return isinstance(image.get("text_input"), str)
 
 

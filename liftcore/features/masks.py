@@ -65,7 +65,7 @@ def labels_alone(path: Path, unlabelled: int = 0) -> tuple[np.ndarray, int]:
     """Read labels [L, h, w] i32 of a view's masks, -1 for none, and the number of masks, of a view without vectors.
 
     Raises:
-        InvalidFeatures: as `mask_views` says.
+        InvalidFeatures: as in `mask_views`.
     """
     if path.suffix.lower() == RUNS:
         rows = len(mask_records(read_mask_json(path), path))

@@ -1,4 +1,4 @@
-"""Smoothness of feature maps, to find maps whose bytes have another order of axes than their shape says.
+"""Smoothness of feature maps, to find maps whose bytes have another order of axes than their shape.
 
 In a map of a photo, neighbouring cells are more similar than any two cells. If the order of axes is wrong, the map is
 smooth only in the right order.

@@ -59,7 +59,7 @@ ARRAYS = ("path", "parts")  # members with any number of values in a row
 def gltf_blocks(splats: Splats, document: Mapping[str, Any] | None = None) -> Iterator[bytes]:
     """Yield the bytes of a ``.glb`` of any splats (`gaussian_rows`), with their extras and the labels' document.
 
-    Harmonics above degree 3 are left out; 2DGS and DBS become the nearest Gaussians, which ``asset.extras`` says.
+    Harmonics above degree 3 are left out; 2DGS and DBS become the nearest Gaussians, as ``asset.extras`` records.
 
     Args:
         splats: P. document: of `liftcore.io.labels`; None: splats without labels.

@@ -206,7 +206,7 @@ _MAGIC: tuple[tuple[int, bytes, FileKind], ...] = (
         None, "a run's config.yml of nerfstudio", "give its last nerfstudio_models/step-*.ckpt, or ns-export "
         "gaussian-splat --load-config config.yml --output-dir OUT and give OUT/splat.ply")),
 )  # fmt: skip
-# By the suffix, where the bytes say nothing.
+# By the suffix, if the content is ambiguous.
 _BY_SUFFIX: dict[str, FileKind] = {
     ".ksplat": FileKind(None, "splats in GaussianSplats3D's .ksplat format", CONVERT),
     ".lcc": FileKind(None, "splats in XGRIDS's .lcc format", CONVERT),

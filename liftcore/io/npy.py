@@ -40,7 +40,7 @@ def open_npy(path: Path, kinds: str = NUMBERS) -> np.ndarray:
     """Map a ``.npy`` file whose dtype is one of ``kinds``, in NumPy's letters.
 
     Raises:
-        InvalidFeatures: the file is no ``.npy`` file, holds Python objects, or has another size than it says.
+        InvalidFeatures: the file is no ``.npy`` file, holds Python objects, or has another size than its header.
     """
     try:
         with open_regular(path) as handle:

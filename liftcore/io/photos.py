@@ -1,6 +1,6 @@
 """Photos as files: size and orientation from their headers, and the photo of a camera in a folder.
 
-**Orientation.** EXIF may ask viewers to rotate a photo. COLMAP, nerfstudio and Inria's code calibrate and train on
+**Orientation.** EXIF may have viewers rotate a photo. COLMAP, nerfstudio and Inria's code calibrate and train on
 the pixels as they are stored, so a photo is read as stored, unless the size of its camera or of its masks fits the
 rotated photo alone (`PhotoHeader.turns_for`).
 """

@@ -511,7 +511,7 @@ def read_header(path: Path) -> PlyHeader:
 
     Raises:
         InvalidSplats: the file cannot be opened, is not a binary little-endian PLY that begins with a vertex element
-            of scalar properties, is shorter than the header says, or has longer rows.
+            of scalar properties, is shorter than its header has it, or has longer rows.
     """
     head, size = read_head(path)
     header = parse_header(head, str(path))

@@ -7,7 +7,7 @@ magnitude, behind two bits for the largest of x y z w) and higher harmonics u8, 
 sizes of the sections' zstd streams, then these.
 
 The frame is right, up, back (RUB) unless an extension declares another of 16. PLYs and cameras are in right, down,
-front (RDF): axes are turned, and quaternions and harmonics with them. A flag says that the splats were trained
+front (RDF): axes are turned, and quaternions and harmonics with them. A flag records that the splats were trained
 antialiased. The format is of nianticlabs/spz. What is written has version 3, which every reader knows, or version 4
 where splats have labels, which are an extension (`liftcore.io.spz_labels`).
 """

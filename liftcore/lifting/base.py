@@ -76,7 +76,7 @@ class LiftSteps(Protocol[Weights]):
         ...
 
     def reweight(self, W: Weights, levels_apart: bool) -> tuple[Weights, float | None]:
-        """Reweight W by the robust steps; return the median reliability of regions too, None if settings want none.
+        """Reweight W by the robust steps; return it and the median reliability of regions, None if that is off.
 
         Args:
             levels_apart: True if regions are compared with those of their own level alone.
@@ -96,7 +96,7 @@ class LiftSteps(Protocol[Weights]):
         ...
 
     def smooth(self, W: Weights, X: Tensor, support: SplatSupport) -> tuple[Tensor, dict[str, Any]]:
-        """Smooth X over neighbouring splats as the settings say; return facts of the smoothing too."""
+        """Smooth X over neighbouring splats by the settings; return facts of the smoothing too."""
         ...
 
     def aggregate(self, W: Weights, X: Tensor, clusters: RegionObjects | None) -> tuple[Tensor, Aggregation]:

@@ -105,7 +105,7 @@ class InMemory(LiftSteps[SceneWeights]):
     def weigh(
         self, views: LiftViews, plan: Plan, on_plan: Callable[[Plan], None]
     ) -> tuple[SceneWeights, WeightStatistics]:
-        raster = open_raster(self.splats, plan.device, self.threads, plan.kept_on_card)
+        raster = open_raster(self.splats, plan.device, self.threads, plan.gpu_weight_bytes)
         first, begin = probe_views(len(views)), time.perf_counter()
         plans = [plan]
 
@@ -120,7 +120,7 @@ class InMemory(LiftSteps[SceneWeights]):
 
         geometry = weigh_views(
             raster, self.splats.count, views, self.settings, self.timings.progress,
-            by_rows=self.settings.weighs_rows, device_bytes=plan.kept_on_card, threads=self.threads,
+            by_rows=self.settings.weighs_rows, device_bytes=plan.gpu_weight_bytes, threads=self.threads,
             checkpoint=self.checkpoint.of(self.splats, plan.device.facts()) if self.checkpoint else None,
             first=first, on_first=check_first,
         )  # fmt: skip

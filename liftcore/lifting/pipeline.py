@@ -27,7 +27,7 @@ from liftcore.runtime.progress import Progress, Timings, shown_progress
 from liftcore.runtime.torch_modes import default_modes
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
-from liftcore.solve.diagnostics import ViewMeasures, certify, lift_warnings
+from liftcore.solve.diagnostics import ViewMeasures, compute_diagnostics, lift_warnings
 from liftcore.solve.objects import NodeVectors, RegionObjects, object_facts
 from liftcore.solve.reweight import reweighting_facts
 from liftcore.values.lift_options import LiftOptions
@@ -183,7 +183,7 @@ def object_tensors(objects: RegionObjects, node_vectors: NodeVectors) -> dict[st
 def find_objects(
     steps: LiftSteps[Weights], W: Weights, masks: bool, settings: LiftSettings, timings: Timings
 ) -> tuple[RegionObjects | None, NodeVectors | None]:
-    """Find objects and the mean features of their nodes; None and None where the settings want no objects.
+    """Find objects and the mean features of their nodes; None and None if the settings have them off.
 
     Args:
         masks: True if any view has masks.
@@ -203,7 +203,7 @@ def needs_separate_levels(node_vectors: NodeVectors | None, views: int) -> bool:
 def reweigh(
     steps: LiftSteps[Weights], W: Weights, masks: bool, levels_apart: bool, settings: LiftSettings, timings: Timings
 ) -> tuple[Weights, float | None]:
-    """Reweight W for the solve; return it with the median reliability of regions, None where settings want none.
+    """Reweight W for the solve; return it and the median reliability of regions, None if that is off.
 
     Consensus, the robust steps and Huber's loss each multiply the entries of W by factors.
 
@@ -215,7 +215,7 @@ def reweigh(
         InvalidSettings: the settings require consensus, and no view has masks.
     """
     reliability = None
-    if settings.asks_consensus(masks):
+    if settings.uses_consensus(masks):
         with timings.stage("consensus"):
             W = steps.compare_masks(W)
     if settings.robust_steps:
@@ -251,7 +251,7 @@ def diagnose(
     warnings = lift_warnings(inputs.splats, inputs.views.lifted, support.sums, settings.dtype, dtype, facts)
     warnings += [part["warning"] for part in steps.values() if "warning" in part]
     facts["warnings"] = [*warnings, *plan.input_warnings]
-    return certify(measures, support.sums, support.total_weight, settings) | dict(steps) | facts
+    return compute_diagnostics(measures, support.sums, support.total_weight, settings) | dict(steps) | facts
 
 
 @default_modes()

@@ -370,7 +370,7 @@ def _answer(scene: OpenedLift, request: ResolvedQuery, similarities: np.ndarray)
         nodes = parts_of(scene, objects_within(scene, selected))
         sentence = presence.reason.replace(
             repr(query.text[0]), repr(request.unknown_part.object_phrase)
-        )  # what is there is the thing
+        )  # the object is there, the part may not be
         presence = presence.model_copy(
             update={"reason": f"{sentence} {_without_word(request.unknown_part, len(nodes))}"}
         )

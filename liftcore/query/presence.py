@@ -1,6 +1,6 @@
 """Presence of a word's object in a scene: a comparison of the word's best splats with other words.
 
-A score says where a scene is most similar to a word, and not that the object is in the scene. So the splats most
+A score is highest where a scene is most similar to a word, even if the object is not in the scene. So the splats most
 similar to the word are compared with some hundreds of **reference words** of the same encoder. If the object is in
 the scene, its word is among the nearest of them; else the words of the objects that are there are nearer.
 

@@ -205,8 +205,8 @@ class Query(Viewpoint):
     )
     weight_by: Literal["evidence", "confidence"] = Field(
         default="evidence",
-        description="the weight of a splat in the threshold's histogram and in objects: its evidence, or that times "
-        "its confidence",
+        description="the weight of a splat in the threshold's histogram and in objects: its total weight "
+        "(`evidence`), or that times its confidence",
     )
     top: Annotated[int, Field(ge=0, le=1000), NoBoolean] = Field(
         default=10, description="how many of the best splats to list"
@@ -336,7 +336,7 @@ class Threshold(Value):
         float,
         BeforeValidator(lambda value: math.inf if value is None else value),
         PlainSerializer(_finite, return_type=float | None, when_used="json"),
-        Field(description="null when no score stands out, or nothing asked for is there"),
+        Field(description="null if no score is clearly higher, or the target is absent"),
     ]
     method: str
     explanation: str = Field(description="one sentence on how it was found")
@@ -371,7 +371,7 @@ class Candidate(Value):
     set: str = Field(description="its notation, for sets")
     kind: NodeKind
     splats: int = Field(description="how many")
-    share: float = Field(description="of what is shown there, by weight; of words, of the thing, by total weight")
+    share: float = Field(description="share of the weight at the pixel; for words, of the object's total weight")
     confidence: float | None = Field(description="of the views that see it, the share that has a mask of the whole")
 
 
@@ -388,7 +388,7 @@ class WordMatch(Value):
 
     old_names: ClassVar[Mapping[str, str]] = {"how": "match"}
     text: str
-    word: str = Field(description="of a part: the part of the thing that it is looked for within")
+    word: str = Field(description="for a part: that part of the object in which it is searched")
     match: Literal["spelling", "qualifier", "synonym", "number", "head", "part"] = Field(
         description="the kind of match: letters, a word that says which is meant, meaning, one or several, the "
         "head of a phrase, or a part that it names"
@@ -420,7 +420,7 @@ class Answer(SelectionSummary):
     text: list[str]
     like: list[str] = Field(description="the examples, in their notation; vectors by their length")
     wording: tuple[WordMatch, ...] = Field(
-        default=(), description="texts that were asked as another word; one that the table has is asked as it is"
+        default=(), description="texts that another word stands for; words of the table stand for themselves"
     )
     rivals: tuple[str, ...] = Field(
         default=(),
@@ -430,8 +430,8 @@ class Answer(SelectionSummary):
     top: tuple[TopSplat, ...] = ()
     candidates: tuple[Candidate, ...] = Field(
         default=(),
-        description="of clicks: the nested things that they may mean, the smallest first; of a part that no word "
-        "stands for: the parts of its thing, the largest first",
+        description="for clicks: the nested objects that they may mean, the smallest first; for a part that no word "
+        "stands for: the parts of its object, the largest first",
     )
     box: Box | None = Field(default=None, description="around all selected splats, outliers too: see objects")
     _query: Query = PrivateAttr()
@@ -481,7 +481,7 @@ add_deprecated_properties(Answer, {"dropped": "is_dropped"})
 class WithUnits(Value):
     """World frame and unit of sizes and distances: metres if the length of a scene unit is known."""
 
-    world: WorldFrame = Field(description="which way is up and how long a scene unit is, as far as somebody said it")
+    world: WorldFrame = Field(description="up axis and length of a scene unit, as far as they are known")
     unit: Literal["metres", "scene units"] = Field(
         description="of sizes and gaps; places and boxes are in scene units"
     )
@@ -526,7 +526,7 @@ class NamedSplats(Value):
     """A present word, with its splats and its value and colour in pictures."""
 
     word: str
-    row: int = Field(description="among the words that were asked")
+    row: int = Field(description="index among the words of the query")
     value: int = Field(description="of its splats and pixels in labels and maps; 0 is none")
     colour: tuple[int, int, int] = Field(description="sRGB, 0 to 255, in pictures")
     splats: int = Field(description="how many it names")
@@ -578,7 +578,7 @@ class SceneObject(Value):
     size: Point = Field(description="the sides of its box, in `unit`")
     views: tuple[str, ...] = Field(description="that show most of it, the best first")
     feature: tuple[float, ...] | None = Field(
-        default=None, description="where it is asked for: the mean of its unit features [F], unit"
+        default=None, description="if requested: the normalised mean of its unit features, [F]"
     )
 
 
@@ -616,7 +616,7 @@ class SceneTree(WithUnits):
     explanation: str = Field(description="why there are so many; or why there are none")
     count: int = Field(description="of all pages")
     nodes: tuple[SceneNode, ...]
-    relations: tuple[Relation, ...] = Field(default=(), description="of the objects, where they are asked for")
+    relations: tuple[Relation, ...] = Field(default=(), description="of the objects, if requested")
 
 
 class CoveringRegion(Value):

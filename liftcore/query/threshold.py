@@ -85,7 +85,7 @@ def find_threshold(
 
     Degenerate inputs have a defined result. Without scores it is infinity: nothing is selected. Equal scores give
     that score: a query then selects nothing (`explain_no_selection`). Where a method finds no clear result, Otsu's
-    split is taken, and the explanation says so.
+    split is taken, and the explanation has it.
 
     Args:
         scores: [n] f32, finite.

@@ -68,7 +68,7 @@ class Camera:
         viewmat: [4, 4] world to camera, rigid, of numpy, torch on any device, or nested lists.
         K: [3, 3] pixels, (fx 0 cx; 0 fy cy; 0 0 1), likewise.
         width: pixels. height: pixels.
-        lens: of a distorted photo, which this pinhole stands for; None: the photo is as it says.
+        lens: of a distorted photo, which this pinhole stands for; None: the photo has no distortion.
         face: of a panorama, whose features this pinhole reads; None: of no panorama.
         name: the image's name without its extension; pairs the view with its features. Kept composed (NFC).
 
@@ -326,7 +326,7 @@ class Cameras(Mapping[str, Camera]):
         views: a mapping of names to cameras, whose names win over those of the cameras; or named cameras.
         frame: the name of the file with the transform that was applied, to the frame of the splats; None: none.
         of_nerfstudio: written by nerfstudio's own converter, and not transformed.
-        world: which way is up, where their file says it.
+        world: the up axis, if their file has it.
         warnings: of their reader, also shown by plans and lifts: views that were skipped, files that were not read.
 
     Raises:

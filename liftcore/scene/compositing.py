@@ -24,7 +24,7 @@ MAX_LOG_SCALE = 60.0  # log scales are clamped to +-this, so that squares stay f
 TILE = 16  # px, side of a tile
 LARGEST_EXPONENT = 120.0  # a falloff below 2^-120 counts as none: float32 holds no smaller alphas
 EDGE_ON = 1e-6  # sine of a disc's plane with the ray of its centre; up to this only the low-pass counts (2DGS)
-LARGEST_ALPHA = 0.9999999  # nearer to one, float32 says one, and the ray has no light left to go on with
+LARGEST_ALPHA = 0.9999999  # a larger one may round to 1 in float32, and no transmittance would remain
 MOST_OF_A_RAY = 64  # the largest k of top-k
 
 
@@ -42,7 +42,7 @@ class CompositingParams:
     alpha_cap: float = 0.99  # the largest alpha of a splat on a ray
     transmittance_stop: float = 1e-4  # exclusive: the splat that would bring T to it or below adds nothing
     antialiased: bool = False  # the mip filter's opacity compensation, 3DGS only
-    stride: int = 1  # region weights look at every n-th pixel in x and in y; renders at all of them
+    stride: int = 1  # region weights sample every n-th pixel in x and in y; renders have all pixels
     offset: tuple[int, int] = (0, 0)  # the first such pixel (x, y), each below the stride
 
     def __post_init__(self) -> None:
@@ -76,7 +76,7 @@ class Selection(StrEnum):
 
 @dataclass(frozen=True)
 class Weighting:
-    """The definition of a splat's weight on a ray: some of ``w = alpha T``, to a power."""
+    """The definition of a splat's weight on a ray: a selection of ``w = alpha T``, to a power."""
 
     power: int = 1  # 0, 1 or 2 of what was selected; 0: each kept weight counts one
     selection: Selection = Selection.ALL

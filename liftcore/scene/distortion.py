@@ -199,7 +199,7 @@ class Lens:
         """The largest rectangle within the photo.
 
         Raises:
-            ValueError: the rectangle is empty or covers hardly any of the photo; the message says why.
+            ValueError: the rectangle is empty or covers hardly any of the photo; the message has the reason.
         """
         rectangle = self._within_reach(self._ends_of_sides(INWARDS))
         if rectangle.left >= rectangle.right or rectangle.top >= rectangle.bottom:

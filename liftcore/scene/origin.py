@@ -1,6 +1,6 @@
 """The local origin of scenes in map coordinates, about which float32 keeps what their files hold.
 
-A position of UTM, (500000, 5400000, 300), lies where float32 tells half a metre apart. Such splats are kept about an
+A position of UTM, (500000, 5400000, 300), lies where float32 has steps of half a metre. Such splats are kept about an
 origin near them, in float64, and everything that meets them is made relative to it in float64 first: a camera by
 ``Camera.about``, before any of its numbers is rounded. Positions that leave the program have it added again
 (``Splats.positions``).

@@ -1,8 +1,8 @@
 """Render mode of splats: how they were trained, from their files, and so how to render them.
 
-Trainers and editors say it in four places: comments of a PLY (``SplatRenderMode: default | mip | 2dgs`` of Brush,
+Trainers and editors record it in four places: comments of a PLY (``SplatRenderMode: default | mip | 2dgs`` of Brush,
 gsplat, nerfstudio and splat-transform, ``antialiased 0 | 1`` of Postshot), a flag of an SPZ, ``model`` in the
-``meta.json`` of a SOG, and the configuration that a trainer leaves beside its checkpoints. Files that say nothing are
+``meta.json`` of a SOG, and the configuration that a trainer leaves beside its checkpoints. Files without it are
 classic ones, as nearly all were before.
 """
 
@@ -25,7 +25,7 @@ class RenderModel(StrEnum):
 
     CLASSIC = "classic"  # Gaussians with the low-pass alone
     ANTIALIASED = "antialiased"  # and their opacity lowered as the low-pass widens them (the mip filter)
-    DISCS = "2dgs"  # discs, whatever their third scale says
+    DISCS = "2dgs"  # discs; a third scale is ignored
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class RenderMode:
     """A render mode, and its source."""
 
     model: RenderModel
-    source: str  # what says so, in words that go before "says"; "" of values in memory
+    source: str  # what records it, as the subject of a sentence; "" of values in memory
 
 
 _BY_NAME = {  # as comments and ``meta.json`` spell them

@@ -92,11 +92,11 @@ class Splats:
     header: tuple[str, ...]
     """the file's header lines verbatim; () = made from the layout"""
     render_mode: RenderMode | None
-    """how they were trained, where that is said; of a str, the model's name"""
+    """how they were trained, if known; a str is the model's name"""
     origin: Origin
     """[3] f64, world frame, scene units; zeros but for scenes in map coordinates"""
     world: WorldFrame
-    """which way is up and how long a unit is, as far as their file says it"""
+    """up axis and length of a unit, as far as their file has them"""
     warnings: tuple[str, ...]
     """of what in these splats, or in their file, is not as it should be"""
 
@@ -189,7 +189,7 @@ class Splats:
             activated: whether scales and opacities are lengths and opacities, not logarithms and logits.
 
         Raises:
-            InvalidSplats: scales or opacities cannot be what ``activated`` says, colours come twice, or an array has
+            InvalidSplats: scales or opacities contradict ``activated``, colours come twice, or an array has
                 another shape; the error names it. What may be and is unlikely is in ``warnings``.
         """
         scales, opacities = _floats("scales", scales), _floats("opacities", opacities)

@@ -39,7 +39,7 @@ def view_names(images: Sequence[str]) -> list[str]:
     than its first.
 
     Raises:
-        InvalidCameras: a name with control characters, or with half of a surrogate pair, which no UTF-8 can say.
+        InvalidCameras: a name with control characters, or with half of a surrogate pair, which UTF-8 cannot encode.
     """
     for image in images:
         require_name(image, "image name", InvalidCameras)

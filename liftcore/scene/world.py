@@ -1,6 +1,6 @@
 """Direction of up in a scene, and length of its unit, as far as they are known.
 
-Splats and COLMAP's models say neither. glTF and USD say both, nerfstudio's frames which way is up; people can say it
+Splats and COLMAP's models have neither. glTF and USD have both, nerfstudio's frames the up axis; users can set it
 (``--up``, ``--metres-per-unit``, a distance that they know). Nothing is estimated. Without it sizes and distances are
 in scene units, and no object is on another.
 """

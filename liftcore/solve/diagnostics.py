@@ -50,7 +50,9 @@ class ViewMeasures:
     betas: np.ndarray  # [rows] f64; NaN where the ray hits no splat
 
 
-def certify(measures: ViewMeasures, sums: np.ndarray, total_weight: Tensor, settings: LiftSettings) -> dict[str, Any]:
+def compute_diagnostics(
+    measures: ViewMeasures, sums: np.ndarray, total_weight: Tensor, settings: LiftSettings
+) -> dict[str, Any]:
     """Summarise the measures of the sampled rays.
 
     Args:

@@ -481,7 +481,7 @@ def reference(
         solution = part.project(features) + block.step
         optimum[:, part.begin : part.end] = solution
         lifted += block.losses[0]
-        best += rays.gradient(solution, part.project)[1]  # computed anew, not by recurrence
+        best += rays.gradient(solution, part.project)[1]  # recomputed, not by recurrence
         gradient = max(gradient, block.gradient)
         steps, converged = max(steps, block.steps), converged and block.converged
         progress("reference", (number + 1) * STEPS, len(parts) * STEPS, "steps")

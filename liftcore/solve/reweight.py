@@ -86,7 +86,7 @@ class Reweighting:
     confidence: Tensor | None  # [P] f32 in 0..1; None after no step
     view_consistency: (
         Tensor | None
-    )  # [P] f32 in 0..1, how well a splat's own feature explains what views say; None likewise
+    )  # [P] f32 in 0..1, how well a splat's own feature agrees with its views; None likewise
     reliability: float | None = None  # r, the median over regions; None if not requested
 
 

@@ -127,14 +127,14 @@ def smooth(
         has_feature[rows] = True
     count, channels = X.shape
     squares, steps, residual = np.zeros((2, channels)), list[Step](), 0.0
-    card = None if device.kind == "cpu" else system.on_card(device.place)
-    block = BLOCK if card is None else min(card.channels, channels)
+    gpu_system = None if device.kind == "cpu" else system.on_card(device.place)
+    block = BLOCK if gpu_system is None else min(gpu_system.channels, channels)
     with ThreadPoolExecutor(threads or cores()) as pool:
         if smoothness and has_weight.any():
             _, steps, residual = _conjugate_gradients(system, _probe(X, graph.order, has_weight, pool), pool)
             staged = torch.empty(count, block, dtype=X.dtype)  # a block in the graph's order, in X's dtype
             source, target = _in_words(X, staged)
-            values, *iterates = (np.zeros((count, block), np.float32) for _ in range(3 if card is None else 1))
+            values, *iterates = (np.zeros((count, block), np.float32) for _ in range(3 if gpu_system is None else 1))
             for begin in range(0, channels, block):
                 width = min(block, channels - begin)
 
@@ -150,11 +150,11 @@ def smooth(
 
                 lows, highs = zip(*_map_rows(read, count, pool), strict=True)
                 low, high = np.min(lows, axis=0), np.max(highs, axis=0)
-                if card is None:
+                if gpu_system is None:
                     solution = _descend(system, values, iterates, steps, pool)
                 else:
                     start = torch.from_numpy(values[:, :width]).to(device.place).double()
-                    solution = card.descend(start, [(float(length), float(turn)) for length, turn in steps])
+                    solution = gpu_system.descend(start, [(float(length), float(turn)) for length, turn in steps])
                     solution = solution.float().cpu().numpy()
                 arguments = system.weights, values, low, high, solution
                 squares[:, begin : begin + width] = _row_sums(clip_rows, arguments, (2, width), count, pool)

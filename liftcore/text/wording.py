@@ -78,7 +78,7 @@ class PartPhrase(NamedTuple):
 
     object_phrase: str
     part: str
-    sure: bool  # True if the grammar says so; two nouns in a row, as in "mug handle", may mean something else
+    sure: bool  # True if the grammar is unambiguous; two nouns in a row, as in "mug handle", may mean something else
 
     def __str__(self) -> str:
         return f"{self.part} of the {self.object_phrase}"

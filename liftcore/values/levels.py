@@ -2,7 +2,7 @@
 
 Composite regions are the distinct tuples of labels that pixels carry over the levels. Each becomes one row of a new
 codebook, the sum of the embeddings of its labels, normalised; an unlabelled level adds nothing. So a pixel reads one
-row, as dense maps of summed embeddings have it, and the walk still meets no channel.
+row, as dense maps of summed embeddings have it, and rasterization still reads no channel.
 """
 
 from typing import Literal

@@ -18,7 +18,7 @@ ViewValues = Mapping[str, ViewFeatures] | Iterable[tuple[str, ViewFeatures]]
 
 @dataclass(frozen=True)
 class LiftViews:
-    """The views of a lift, features and cameras paired by name; each view is read when it is asked for."""
+    """The views of a lift, features and cameras paired by name; each view is read at its access."""
 
     cameras: Cameras
     features: Views  # paired with the cameras

@@ -1,9 +1,9 @@
-"""Views of features by name: from feature packs, from values in memory or from an iterator, read alike.
+"""Views of features by name: from feature packs, from values in memory or from an iterator, behind one protocol.
 
 A feature pack is a ``.safetensors`` file of what 2D encoders saw: it can be mapped and holds no code. A view ``V``
 is either regions, ``V/labels`` [L, h, w] (u8 with 255 for none, i16 or i32 with -1) with ``V/codebook`` [M, F], or a
 grid, ``V/grid`` [h, w, F]. A pack may bring its words: ``embeddings`` [n, F] and the metadata ``words``, as a table
-of text embeddings has them; a lift of it is asked in these without an encoder.
+of text embeddings has them; a lift of it needs no encoder for queries by these.
 """
 
 import errno
@@ -60,7 +60,7 @@ class _Source(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Views(Mapping[str, ViewFeatures]):
-    """View name -> `Regions` or `FeatureGrid`, names sorted; each view is read and checked when it is asked for.
+    """View name -> `Regions` or `FeatureGrid`, names sorted; each view is read and checked at its access.
 
     Of packs, headers are checked at once. Reading a view raises InvalidFeatures where there is none of that name, a
     label is out of the codebook, or a feature is not finite. Paired with cameras (`pair`), a view is what the
@@ -68,7 +68,7 @@ class Views(Mapping[str, ViewFeatures]):
     """
 
     channels: int  # F
-    encoder: str  # the 2D encoder as the packs tell it, "" when they do not
+    encoder: str  # name of the 2D encoder in the packs, "" if they have none
     text_space: str  # the text encoder that shares the space; "" unknown, "none" when there is none
     normalised: bool | None  # whether codebook rows and grid cells are unit vectors; None: unknown
     _sources: Mapping[str, _Source] = field(repr=False)

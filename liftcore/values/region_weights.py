@@ -60,7 +60,7 @@ class RegionWeights:
     offsets: Tensor
     """[V + 1] i64, on the CPU: the first region of each view, and how many there are in all"""
     views: tuple[str, ...] = ()
-    """their names, in the order of the offsets; () where nobody named them"""
+    """their names, in the order of the offsets; () if unnamed"""
 
     def __repr__(self) -> str:
         sizes = {"splats": self.splats.shape[0], "regions": int(self.offsets[-1]), "entries": self.region.shape[0]}
@@ -281,9 +281,9 @@ def _stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None) -
             weight.scatter_(0, to, part.weight[entries].to(place))
             cursors.index_add_(0, rows, lengths)
 
-    ranges = [(0, splats)]  # on a card, which takes longer to be asked for a piece than to move it
+    ranges = [(0, splats)]  # on a GPU, where a copy in pieces takes longer than one
     if place.type == "cpu":
-        ranges = row_blocks(lengths.numpy(), max(splats, 1), max(1 << 20, total >> 5))  # each asks every view
+        ranges = row_blocks(lengths.numpy(), max(splats, 1), max(1 << 20, total >> 5))  # each block reads all views
     run_each(fill, ranges, threads)
     hit_rows = torch.nonzero(total_weight)[:, 0]
     ends = [part.offsets[1:] + base for part, base in zip(parts, bases, strict=False)]

@@ -43,7 +43,7 @@ NEAREST = 3  # settings that are named where one is unknown
 
 
 class Preset(StrEnum):
-    """Ours, which trusts no single mask, or a published choice of weights on the same ray walk."""
+    """Choice of weights: the default, which trusts no single mask, or a published one, on the same rasterization."""
 
     DEFAULT = "default"  # row-sum, reweighted by mask consensus, by region reliability and by view consistency
     ROW_SUM = "row-sum"  # x_j = sum w b / sum w, Eq. 6
@@ -55,7 +55,7 @@ class Preset(StrEnum):
     MEAN = "mean"  # the same ray, and the plain mean over the views that see the splat (Semantic Gaussians)
 
 
-_REWEIGHTED = {"reliability": "auto", "consensus": "auto", "aggregation_guard": True}  # what asks for a robust step
+_REWEIGHTED = {"reliability": "auto", "consensus": "auto", "aggregation_guard": True}  # they need a robust step
 _PRESETS: dict[Preset, dict[str, Any]] = {
     Preset.DEFAULT: {"robust_steps": 1, **_REWEIGHTED, "aggregation_clusters": "auto"},
     Preset.ROW_SUM: {},
@@ -163,7 +163,7 @@ class LiftSettings(PlainModel):
     antialiased: bool | Literal["auto"] = Field(
         "auto",
         description="true: `alpha~ = sigmoid(gain theta) sqrt(det(cov) / det(cov + low-pass))`, for 3DGS scenes "
-        "that were trained so; refused for 2DGS and DBS. `auto`: true where the file says so, else "
+        "that were trained so; refused for 2DGS and DBS. `auto`: true if the file's metadata has it, else "
         "false. The lift's metadata have what was used, and every answer uses the same",
     )
     stride: int = Field(
@@ -252,7 +252,7 @@ class LiftSettings(PlainModel):
     )
     aggregation_cluster_size: int = Field(500, ge=2, le=10_000_000, description="splats at least in a cluster")
     aggregation_neighbours: int = Field(
-        10, ge=1, le=1_000, description="neighbours that the density at a splat looks at (HDBSCAN's `min_samples`)"
+        10, ge=1, le=1_000, description="neighbours that the density at a splat depends on (HDBSCAN's `min_samples`)"
     )
     aggregation_sample: int = Field(
         10_000, ge=2, le=50_000, description="splats that HDBSCAN sees; the others join the nearest cluster"
@@ -280,9 +280,9 @@ class LiftSettings(PlainModel):
         0.0,
         description="lambda of the term that draws the features of splats near in place and colour together: 0 is "
         "off; `auto` takes the strength that halves of the views ask for, off among them. A strength "
-        "of your own loses on maps that vary within things. Masks weaken edges that they know. "
-        "`splatlift refine` does it to a lift that is there, with a number and without its masks. On a card it "
-        "runs on the processor. Refused with an `engine`, and with `aggregation_resolve`",
+        "of your own loses on maps that vary within objects. Edges between objects of masks are weakened. "
+        "`splatlift refine` does it to a lift that is there, with a number and without its masks. On a GPU it "
+        "runs on the CPU. Refused with an `engine`, and with `aggregation_resolve`",
     )
     cg_steps: int = Field(
         0,
@@ -313,11 +313,11 @@ class LiftSettings(PlainModel):
     )
     kernel: Literal["auto", "3dgs", "2dgs", "dbs"] = Field(
         "auto",
-        description="`3dgs`, `2dgs` or `dbs`; `auto` tells by the file's properties, or by what the file says. A "
-        "2DGS scene with three scales that says nothing looks like 3DGS: name `2dgs`",
+        description="`3dgs`, `2dgs` or `dbs`; `auto` decides by the file's properties and metadata. A "
+        "2DGS scene with three scales and without metadata looks like 3DGS: set `2dgs`",
     )
     device: Literal["auto", "cpu", "cuda"] = Field(
-        "auto", description="`cpu`, `cuda`, or `auto` for a card where one can be used"
+        "auto", description="`cpu`, `cuda`, or `auto` for a GPU where one can be used"
     )
 
     @model_validator(mode="wrap")
@@ -331,7 +331,10 @@ class LiftSettings(PlainModel):
         preset, speed = values.get("preset", Preset.DEFAULT), values.get("speed", Speed.EXACT)
         weights = _PRESETS[Preset(preset)] if isinstance(preset, str) and preset in set(Preset) else {}
         effort = _SPEEDS[Speed(speed)] if isinstance(speed, str) and speed in set(Speed) else {}
-        if values.get("robust_steps") in (0, "0"):  # what comes in with a step goes with it, unless it is asked for
+        if values.get("robust_steps") in (
+            0,
+            "0",
+        ):  # settings that need a step are off without it, unless they are set
             weights = {name: value for name, value in weights.items() if name not in _REWEIGHTED}
         settings = handler({**weights, **effort, **values})
         settings.model_fields_set.intersection_update(values)  # what a caller set, which stays when a preset changes
@@ -395,7 +398,7 @@ class LiftSettings(PlainModel):
                 file, in errors.
 
         Raises:
-            InvalidSettings: ``antialiased`` is asked for, and the splats are no 3D Gaussians.
+            InvalidSettings: ``antialiased`` is true, and the splats are not 3D Gaussians.
             InvalidSplats: the file lacks a property.
         """
         from liftcore.io.splats import require_kernel
@@ -425,7 +428,7 @@ class LiftSettings(PlainModel):
         """Return True if objects are looked for, where views have masks or not.
 
         Raises:
-            InvalidSettings: objects, or clusters that masks make, are asked for, and no view has masks.
+            InvalidSettings: objects, or clusters from masks, are required, and no view has masks.
         """
         graph = self.aggregation and self.aggregation_clusters == "graph"
         for name, requested in (("objects", self.objects is True), ("aggregation_clusters", graph)):
@@ -434,11 +437,11 @@ class LiftSettings(PlainModel):
                 raise InvalidSettings(name, expected=expected, got=NO_MASKS, hint="take auto")
         return masks and bool(self.objects or self.clusters_by_masks)
 
-    def asks_consensus(self, masks: bool) -> bool:
+    def uses_consensus(self, masks: bool) -> bool:
         """Return True if masks are compared with one another, where views have masks or not.
 
         Raises:
-            InvalidSettings: consensus is asked for, and no view has masks.
+            InvalidSettings: consensus is true, and no view has masks.
         """
         if self.consensus is True and not masks:
             expected = "views with masks: cells of a grid say nothing of what they show"
@@ -475,7 +478,7 @@ class LiftSettings(PlainModel):
             )
 
     def _compositing(self, opacity_logit_scale: float) -> CompositingParams:
-        antialiased = self.antialiased is True  # auto stands for splats that say nothing, before `for_splats`
+        antialiased = self.antialiased is True  # before `for_splats`, auto is that of splats without metadata
         return CompositingParams(opacity_logit_scale, self.alpha_cap, self.transmittance_stop, antialiased)
 
     @staticmethod
@@ -494,10 +497,10 @@ class LiftSettings(PlainModel):
 
     @classmethod
     def or_default(cls, settings: Self | None) -> Self:
-        """Settings as they are; the default ones for None.
+        """Return settings as they are, or the default ones for None.
 
         Raises:
-            InvalidSettings: they are something else.
+            InvalidSettings: ``settings`` are something else.
         """
         if settings is not None and not isinstance(settings, cls):
             expected, hint = "LiftSettings, or None", "LiftSettings.of(**values) makes them"
@@ -543,7 +546,7 @@ class LiftSettings(PlainModel):
 
     @classmethod
     def _build_checked(cls, build: Callable[[], Self]) -> Self:
-        """Return the settings that are made, or what is wrong with them in the project's own words."""
+        """Build and check settings; an error of pydantic becomes an `InvalidSettings`."""
         try:
             settings = build()
         except ValidationError as error:
@@ -554,11 +557,11 @@ class LiftSettings(PlainModel):
         return settings
 
 
-add_deprecated_properties(LiftSettings, {"chosen": "from_preset"})
+add_deprecated_properties(LiftSettings, {"chosen": "from_preset", "asks_consensus": "uses_consensus"})
 
 
 def _settings_error(error: ValidationError, known_names: Iterable[str]) -> InvalidSettings:
-    """Return the first thing that is wrong, with all that its setting may be."""
+    """Return the error of the first invalid setting, with the values that it may have."""
     first, *remaining = error.errors()
     name, branches = "settings", [first]
     if first["loc"]:

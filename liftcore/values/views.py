@@ -184,10 +184,10 @@ def label_levels(masks: Sequence[np.ndarray], location: str) -> np.ndarray:
 
     The largest mask comes first, of equals the one that was given first, and each goes to the first level on which
     none of its pixels is taken. No pixel of any mask is lost, and what lies alone is on level 0. A lift that takes
-    levels as rows of their own asks only which masks lie on a pixel, so there their level does not matter.
+    levels as rows of their own needs only the masks of a pixel, so there their level does not matter.
 
     Args:
-        masks: [h, w] bool each, at least one, all of one size; each is asked for twice. where: named in the error.
+        masks: [h, w] bool each, at least one, all of one size; each is read twice. where: named in the error.
 
     Raises:
         InvalidFeatures: they take more than MAX_LEVELS levels.

@@ -82,7 +82,7 @@ def serving(data: Path, encoder: str, log: Path) -> Iterator[str]:
     """Run ``splatlift serve`` on a free port during the block; yield its address.
 
     Args:
-        data: the service's directory. encoder: its text encoder. log: where what it says goes.
+        data: the service's directory. encoder: its text encoder. log: the file of its output.
 
     Raises:
         Unavailable: the service does not start; the message holds the end of its log.
@@ -346,7 +346,7 @@ SHIPPED = Path(__file__).with_name("tabletop")
 _CAMERA_FILES = ("cameras.json", "transforms.json", "cameras.zip")
 _TABLE = "text_table.safetensors"
 _ENCODERS = {space: encoder for encoder, space in BUILT_IN.items()}
-_PHRASES = 3  # queries if nobody names any
+_PHRASES = 3  # queries by default
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from service.store.store import Store
 
 LOST_FILES_HINT = (
     "what the database alone held is not made again: keys, owners (what was added is of admins alone), trade-offs,"
-    " selections, names of things, jobs without a lift, histories of jobs"
+    " selections, names of objects, jobs without a lift, histories of jobs"
 )
 
 

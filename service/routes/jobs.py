@@ -292,7 +292,7 @@ def check_settings(settings: LiftSettings, features: Sequence[AssetRecord], *, i
     """
     masks = any(pack.counts.get("region_maps", 1) for pack in features)  # without a count the job decides
     settings.finds_objects(masks)
-    settings.asks_consensus(masks)
+    settings.uses_consensus(masks)
     if in_blocks:
         settings.check_blocks(masks)
 

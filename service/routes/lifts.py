@@ -57,7 +57,7 @@ PHOTO: dict[int | str, dict[str, Any]] = {200: {"content": {"image/jpeg": _BYTES
 View = Annotated[str, Query(min_length=1, max_length=models.VIEW_CHARACTERS, description="the name of a camera")]
 ViewsCursor = Annotated[int, Query(ge=0, le=10**9, description="the `next` of the page before")]
 Pixel = Annotated[int, Query(ge=0, le=10**9, description="of the photo: x from the left, y from the top")]
-Level = Annotated[int, Query(ge=0, le=10**9, description="as GET /lifts/{lift}/regions tells it")]
+Level = Annotated[int, Query(ge=0, le=10**9, description="as in GET /lifts/{lift}/regions")]
 ObjectId = Annotated[int, Path(alias="object", ge=0, le=10**9, description="the id of an object of the lift")]
 ShareId = Annotated[str, Path(pattern=r"^[0-9a-f]{12}$", description="the id of a share of the lift")]
 Layer = Annotated[
@@ -102,7 +102,7 @@ async def create_lift(
 ) -> Response:
     """Order a lift with a JSON body, as POST /lift does; or upload a lift file of the command line.
 
-    The Content-Type tells which of the two it is: application/json is an order, any other a file. ``Idempotency-Key``
+    The Content-Type decides between the two: application/json is an order, any other a file. ``Idempotency-Key``
     is of orders; ``sha256`` and ``cameras`` are of files.
 
     A file is checked whole. Its splats and its file of cameras must be assets (404 names the missing one), its

@@ -61,7 +61,7 @@ MEDIA_TYPES = {
 
 # The body is read before this listens, as both listen to the client.
 async def query_process(request: Request, deps: Deps) -> AsyncIterator[Callable[[dict[str, Any]], Frame]]:
-    """Ask the query process for this caller, who may leave: a query that waits then is not answered."""
+    """Yield a function that calls the query process; if the client disconnects, a waiting query is dropped."""
     waiter = Waiter(deps.caller.key or "")
 
     async def listen() -> None:
@@ -91,7 +91,7 @@ def tagged_answer(
     decides = {name: value for name, value in worker_request.items() if name != "names"}
     decides |= {"lift": lift.sha256, "version": __version__}
     etag = f'"{hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()}"'
-    not_modified = unchanged(request, etag, exists=False)  # nobody has looked whether the view is there
+    not_modified = unchanged(request, etag, exists=False)  # whether the view exists is not known yet
     if not_modified is not None:
         return not_modified
     answer = binary_response(deps, worker_request, lift, ask, cache_headers(etag))
@@ -337,7 +337,7 @@ def render(parameters: RenderRequest, request: Request, deps: Deps, ask: Ask) ->
     """The splats from a view, in their colours or in those of their features or clusters, or their depth: a PNG.
 
     Depths are those of the splats' centres along the camera's axis, weighted as the colours are. They are grey, near
-    bright. The PNG's texts `depth-near` and `depth-far` tell the depths of its levels 255 and 1 (1st and 99th
+    bright. The PNG's texts `depth-near` and `depth-far` have the depths of its levels 255 and 1 (1st and 99th
     percentile), in scene units, with even steps between; what lies beyond has these levels too. 0 is where no splat
     is. In a body a camera of your own may stand in place of the view.
     """

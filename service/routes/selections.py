@@ -1,4 +1,4 @@
-"""/lifts/{lift}/selections: sets of splats that are corrected by hand; and names of the lift's things."""
+"""/lifts/{lift}/selections: sets of splats that are corrected by hand; and names of the lift's objects."""
 
 from __future__ import annotations
 

@@ -82,8 +82,8 @@ class AssetStore:
         """Store a checked upload.
 
         Returns:
-            The asset, and whether its owner did not have it before. That somebody else did, nobody learns: the bytes
-            take the same way to the disk.
+            The asset, and True if its owner did not have it before. That another owner had it stays private: the
+            bytes are written in either case.
 
         Raises:
             OverQuota: it would be more than the owner may store.
@@ -172,7 +172,7 @@ class AssetStore:
         return self.page(owner, sys.maxsize - 1).records
 
     def delete(self, owner: Owner, asset: str) -> None:
-        """Remove an asset from its owner, or from all owners if an admin asks. The bytes go with the last owner.
+        """Remove an asset from its owner, or from all owners for an admin. The bytes go with the last owner.
 
         Raises:
             NotFound: there is none.

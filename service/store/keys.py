@@ -93,7 +93,7 @@ class KeyStore:
             maker: the secret of the key that shares the lifts, with whose end it ends.
 
         Returns:
-            The key, and its secret, which nobody can ask for again.
+            The key, and its secret, which is not stored and cannot be read again.
 
         Raises:
             InvalidRequest: it is given lifts without that scope, or has that scope with another, or without lifts.

@@ -119,7 +119,7 @@ class TradeoffRecord:
 
 # A result belongs to its job's owner: one statement, so that no result is without its job.
 FEATURES = "(SELECT json_group_array(asset) FROM (SELECT asset FROM job_features WHERE job = jobs.id ORDER BY place))"
-NAMES_OF_VIEWS = ("views_without_camera", "views_without_splats")  # in a diagnostics
+NAMES_OF_VIEWS = ("views_without_camera", "views_without_splats")  # in the diagnostics
 SHOWN_BYTES = 64 << 10  # of metadata; longer lists of views are given in pages
 LONG = ("views", "words")  # left out of long metadata
 VISIBLE = (
@@ -235,7 +235,7 @@ class LiftStore:
             NotFound: there is no such lift, or there are no such photos.
         """
         with self._database.write(is_counted=True) as connection:
-            self.get(owner, lift)  # within the transaction, where nobody can delete it
+            self.get(owner, lift)  # within the transaction, so that it is not deleted meanwhile
             photos = changes.get("photos")
             if photos is not None:
                 self._own_photos(connection, owner, lift, photos)
@@ -256,7 +256,7 @@ class LiftStore:
         sync_directory(path.parent)
 
     def _own_photos(self, connection: sqlite3.Connection, owner: Owner, lift: str, photos: str) -> None:
-        """Add the lift's owner to assets, within a write transaction, whoever requested it."""
+        """Add the lift's owner to assets, within a write transaction, also if an admin requested it."""
         row = connection.execute(
             "SELECT 1 FROM assets JOIN asset_owners ON asset = id"
             f" WHERE id = :photos AND kind = 'photos' AND {OWNER_CLAUSE}",

@@ -2,7 +2,7 @@
 
 A backup is laid out as a data directory, without work and drafts: the database and every file that it knows, whole or
 absent. Files never change once they are stored, so they are linked where the file system can, and copied where it
-cannot. A lost database is made anew of what the files tell of themselves.
+cannot. A lost database is rebuilt from the files.
 """
 
 from __future__ import annotations

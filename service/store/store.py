@@ -56,11 +56,11 @@ class Store:
         Args:
             root: the directory.
             floor_bytes: free disk that new work must leave.
-            new: where the database is gone or older than the files, move these to quarantine and begin an empty one.
-            rebuilding: let it be so: `splatlift store rebuild` mends it.
+            new: if the database is gone or older than the files, move these to quarantine and begin an empty one.
+            rebuilding: accept such a database: `splatlift store rebuild` mends it.
 
         Raises:
-            StaleDatabase: it is so, and neither was asked for.
+            StaleDatabase: the database is gone or older than the files, and neither argument is set.
             Misconfigured: another server holds it, a release of another schema wrote it, its database is none, or it
                 is to begin anew and is the right one.
         """

@@ -236,7 +236,7 @@ class InBlocks(LiftSteps[Job]):
             dtype = getattr(torch, settings.dtype)
             if dtype == torch.float16 and not steps.codebook_of(job).fits_float16():
                 dtype = torch.float32
-            related = settings.finds_objects(statistics.masks) or settings.asks_consensus(statistics.masks)
+            related = settings.finds_objects(statistics.masks) or settings.uses_consensus(statistics.masks)
             job = replace(job, dtype=dtype, related=related)
             self._gather(job)
         return job, statistics

@@ -106,7 +106,7 @@ def scene_warnings(
     return *splats.warnings, *rendering, *cameras.warnings, *distortion_warning(views)
 
 
-@deprecated_names(told="input_warnings", there="available_views")
+@deprecated_names(told="input_warnings", there="available_views", kept_on_card="gpu_weight_bytes")
 @dataclass(frozen=True)
 class Plan(PlannedScene):
     """The plan of a lift. Plain values: the same inputs and settings give the same plan."""
@@ -124,7 +124,7 @@ class Plan(PlannedScene):
     memory: Mapping[str, int]  # bytes a part at the peak, about
     weight_bytes: int  # of W of all views, about
     device: Device  # of rasterization and solve
-    kept_on_card: int  # bytes of W that may stay on a GPU between the phases
+    gpu_weight_bytes: int  # bytes of W that may stay on a GPU between the phases
     features_room: int | None  # bytes of this machine's memory that X may take today; None for no limit
     seconds: float | None  # estimate for the geometry of all views on this machine now; None for few views
     warnings: tuple[str, ...]  # of this machine, today
@@ -144,7 +144,7 @@ class Plan(PlannedScene):
     @property
     def in_files(self) -> int:
         """Bytes of W beyond those that stay in memory, about."""
-        return max(0, self.weight_bytes - MEMORY_LIMIT - self.kept_on_card)
+        return max(0, self.weight_bytes - MEMORY_LIMIT - self.gpu_weight_bytes)
 
     def facts(self) -> dict[str, Any]:
         """Return plain values for the diagnostics, without those that depend on this machine alone."""
@@ -246,8 +246,8 @@ def plan_lift(
     entries = _entries(visible, cameras, features, names, settings, hit_share)
     weights = weight_bytes(visible, entries, settings)
     parts = memory_parts(splats, visible, cameras, features, names, settings, entries)
-    free, on_card = (None, None) if in_workers else (free_memory(), None if short else device.free_bytes())
-    device_weights = 0 if on_card is None else min(weights, int(DEVICE_SPARE * on_card) // 4)
+    free, gpu_bytes = (None, None) if in_workers else (free_memory(), None if short else device.free_bytes())
+    device_weights = 0 if gpu_bytes is None else min(weights, int(DEVICE_SPARE * gpu_bytes) // 4)
     in_files = 0 if in_workers else max(0, weights - MEMORY_LIMIT - device_weights)
     lifted = set(names)
     return Plan(
@@ -265,7 +265,7 @@ def plan_lift(
         memory=parts,
         weight_bytes=weights,
         device=device,
-        kept_on_card=device_weights,
+        gpu_weight_bytes=device_weights,
         features_room=features_room(parts, free),
         seconds=seconds,
         warnings=(*short, *check_memory(parts, free), *check_weights(in_files)),

@@ -54,7 +54,7 @@ _SCRATCH = tl.constexpr(PARTS * PART)
 _COLUMNS, _BLOCK = tl.constexpr(COLUMNS), tl.constexpr(BLOCK)
 _INT32 = 1 << 31
 MARKS = 12  # largest weights of a ray for which a launch may have all its tiles; with more, fewer tiles
-_WIDE = 32  # largest weights of a ray from which on more warps share a tile, for want of registers
+_WIDE = 32  # largest weights of a ray from which on more warps share a tile, as registers are few
 _LARGEST, _FRONT = tl.constexpr(LARGEST), tl.constexpr(FRONT)
 
 
