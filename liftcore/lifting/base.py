@@ -32,7 +32,7 @@ class WeightStatistics:
     plan: Plan  # with the warnings and the time that the first views gave
     levels: np.ndarray  # [M] i8, of each region in its view; -1: a cell of a grid, or regions that are tuples
     entries: int  # of W
-    blind: tuple[str, ...]  # views that meet no splat
+    blind: tuple[str, ...]  # views whose rays hit no splat
 
     @property
     def masks(self) -> bool:

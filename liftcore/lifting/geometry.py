@@ -33,7 +33,7 @@ class Geometry:
     weights: RegionWeights  # of all views, with a row for every splat
     codebook: Codebook  # the features of its regions
     samples: tuple[SampledRays, ...]  # for the diagnostics, one a view
-    blind: tuple[str, ...]  # views that meet no splat
+    blind: tuple[str, ...]  # views whose rays hit no splat
     levels: np.ndarray  # [M] i8, of each region in its view; -1: a cell of a grid, or regions that are tuples
 
     @property

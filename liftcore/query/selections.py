@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera
 
 MOST_HISTORY = 100  # steps in the history of a selection
-SURFACE_OPACITY = 0.75  # accumulated opacity of a ray from which it has met a surface
+SURFACE_OPACITY = 0.75  # accumulated opacity of a ray from which it has hit a surface
 RAYS = 1 << 15  # that are traced at once
 NEAR = 0.01  # depth from which splats are in front of a camera, scene units
 ROUNDING = 1e-6  # pixels beyond a stroke's edge that count as on it

@@ -41,7 +41,7 @@ _BEYOND = {"opacity_logits": (True, True), "log_scales": (True, False)}  # wheth
 ROUNDED = 0.25  # of a splat's size: a coarser float32 has moved splats visibly
 WIDEST = 4.0  # spacings of splats that lie spread over a square as wide as their scene
 MIN_SAMPLE = 100  # splats: what all of so many have in common is no accident
-_GEOMETRY = ("means", "quats", "log_scales", "opacity_logits", "beta")  # what rays meet; all else is colour
+_GEOMETRY = ("means", "quats", "log_scales", "opacity_logits", "beta")  # that rays depend on; all else is colour
 
 
 @dataclass(frozen=True, init=False)

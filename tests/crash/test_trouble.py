@@ -81,7 +81,7 @@ def test_trouble_while_a_job_runs_ends_nothing(
         until((work / "waiting").exists)
         with fault(store):
             (work / "go on").mkdir()  # it speaks, answers and ends, and nothing of that can be noted
-            until(lambda: "tells cannot be noted yet" in caplog.text and "the end of a job cannot" in caplog.text)
+            until(lambda: "cannot be stored yet" in caplog.text and "the end of a job cannot" in caplog.text)
         record = wait_until_ended(store, job)
     assert (record.state, record.attempt) == (JobState.SUCCEEDED, 1)
     assert record.plan == {"summary": ["one splat"], "warnings": [], "splats": 1} and record.progress is not None

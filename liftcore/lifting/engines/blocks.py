@@ -118,7 +118,7 @@ class ViewFiles(NamedTuple):
     sample: SampledRays
     levels: np.ndarray  # [M] i8, as `Geometry` has them
     entries: int  # of its W
-    blind: bool  # True if it meets no splat
+    blind: bool  # True if its rays hit no splat
 
 
 class WeightBlock(NamedTuple):
@@ -130,7 +130,7 @@ class WeightBlock(NamedTuple):
     weight: np.ndarray  # [nnz] f32
     total_weight_splats: np.ndarray  # [m] i32 ascending
     total_weight_starts: np.ndarray  # [m + 1] i64
-    total_weight: np.ndarray  # [e] f32, of each view that meets the splat
+    total_weight: np.ndarray  # [e] f32, of each view that sees the splat
 
 
 # ---- weighing
