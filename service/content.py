@@ -43,7 +43,7 @@ FILE: dict[int | str, dict[str, Any]] = TAGGED | {
     416: {**PROBLEM, "description": "A range beyond the end"},
 }
 
-Limit = Annotated[int, Query(ge=1, le=models.PAGE, description="how many to list")]
+Limit = Annotated[int, Query(ge=1, le=models.PAGE, description="number of items to list")]
 Cursor = Annotated[str | None, Query(pattern=CURSOR, description="the `next` of the page before")]
 
 

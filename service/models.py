@@ -190,7 +190,7 @@ class Asset(BaseModel):
     id: AssetId
     kind: AssetKind
     bytes: int
-    counts: dict[str, Any] = Field(description="what is in it: splats, views, channels and so on")
+    counts: dict[str, Any] = Field(description="counts of its content: splats, views, channels and so on")
     warnings: list[str]
     created: Seconds
     created_at = iso_of("created")
@@ -354,15 +354,15 @@ class LiftResult(BaseModel):
     text_space: str = Field(description="the text space that the features share")
     words: list[str] = Field(description="from its packs, for queries without an encoder")
     views: list[str] = Field(description="the views that were lifted; very many are at links.views alone")
-    view_count: int = Field(description="how many these are")
+    view_count: int = Field(description="number of these")
     origin: list[float] = Field(
         [0.0, 0.0, 0.0],
         min_length=3,
         max_length=3,
         description="of the positions of its `.splat` and `.spz`; zeros but in map coordinates",
     )
-    world: WorldFrame = Field(description="which way is up and how long a scene unit is, as far as it is known")
-    diagnostics: dict[str, Any] = Field(description="what the lift measured of itself, and its warnings")
+    world: WorldFrame = Field(description="up axis and length of a scene unit, as far as they are known")
+    diagnostics: dict[str, Any] = Field(description="measures of the lift's quality, and its warnings")
     timings: dict[str, float] = Field(description="seconds a stage")
     created: Seconds
     created_at = iso_of("created")
@@ -382,7 +382,7 @@ class PackChange(Body):
     """Names of a feature pack; fields that are left out stay as in the pack."""
 
     model_config = BODY_CONFIG
-    encoder: SettingText | None = Field(None, description="what made the features")
+    encoder: SettingText | None = Field(None, description="the encoder of the features")
     text_space: SettingText | None = Field(
         None, description="the text encoder that shares their space; 'none' for none"
     )
@@ -403,7 +403,7 @@ class LiftChange(Body):
     ) = Field(None, description="for people; null or an empty one takes the name away")
     photos: AssetId | None = Field(None, description="an asset of kind photos; null takes them away")
     world: WorldUpdate | None = Field(
-        None, description="which way is up and how long a scene unit is, in place of all that is known; null: neither"
+        None, description="up axis and length of a scene unit, in place of all known values; null: neither"
     )
 
 
@@ -418,8 +418,8 @@ class View(BaseModel):
     """A camera of a lift's scene, in gsplat's conventions: OpenCV axes, pixel centres at +0.5."""
 
     name: str
-    lifted: bool = Field(description="whether its features were lifted")
-    photo: bool = Field(description="whether the lift's photos have one of it")
+    lifted: bool = Field(description="true if its features were lifted")
+    photo: bool = Field(description="true if the lift's photos include it")
     width: int = Field(description="pixels")
     height: int
     fx: float = Field(description="pixels, like fy, cx and cy")
@@ -468,7 +468,7 @@ class Ready(BaseModel):
     """The service can work."""
 
     status: str
-    checks: list[str] = Field(description="what was looked at")
+    checks: list[str] = Field(description="the checks that ran")
 
 
 class Version(BaseModel):
@@ -568,12 +568,12 @@ class ExportRequest(Words):
     of: Annotated[
         Literal["questions", "words", "objects"],
         BeforeValidator(lambda of: "objects" if of == "things" else of),  # the old name
-    ] = Field("objects", description="what the labels are")
+    ] = Field("objects", description="the labels of the content")
     questions: Annotated[list[NamedQuestion], Field(max_length=QUESTIONS, fail_fast=True)] = Field(
         [], description="of `questions`: each is a class of the labels"
     )
     view: str | None = Field(
-        None, min_length=1, max_length=VIEW_CHARACTERS, description="whose masks alone are made; else of all"
+        None, min_length=1, max_length=VIEW_CHARACTERS, description="the view of the masks; else all views"
     )
 
 
@@ -581,16 +581,16 @@ class NearestWordsRequest(Words):
     """Example for which the nearest words are requested."""
 
     model_config = BODY_CONFIG
-    example: AnExample = Field(description="what is meant")
-    top: Annotated[int, Field(ge=1, le=1000), NoBoolean] = Field(5, description="how many words")
+    example: AnExample = Field(description="the example")
+    top: Annotated[int, Field(ge=1, le=1000), NoBoolean] = Field(5, description="number of words")
 
 
 class SuggestedWordsRequest(LiftQuestion):
     """Text for which completions are requested."""
 
     model_config = BODY_CONFIG
-    text: str = Field("", max_length=200, description="what was typed of a word; empty: what is here alone")
-    limit: int = Field(8, ge=1, le=100, description="how many words at most")
+    text: str = Field("", max_length=200, description="the beginning of a word; empty: words of the scene alone")
+    limit: int = Field(8, ge=1, le=100, description="number of words at most")
 
 
 class RenderRequest(Picture):
@@ -656,7 +656,7 @@ class NewSelection(Body):
 
     model_config = BODY_CONFIG
     name: SelectionName = Field(description="for people")
-    edit: EditRequest | None = Field(None, description="how, of no splats, it begins; left out, it has none")
+    edit: EditRequest | None = Field(None, description="first edit of the empty selection; none if left out")
 
 
 class SelectionChange(Body):
@@ -692,7 +692,7 @@ class ListedSelection(OfLift):
     name: str
     count: int = Field(description="splats")
     box: Box | None = Field(description="of its large groups of splats that touch; null of none")
-    step: int = Field(description="where in its history it is")
+    step: int = Field(description="its current step in the history")
     first: int = Field(description="the steps that it can go to, by PATCH")
     last: int
     version: int = Field(description="its ETag, for If-Match")
@@ -738,7 +738,7 @@ class Selections(BaseModel):
 class OwnKey(BaseModel):
     """Rights of a key."""
 
-    name: str | None = Field(description="whose it is, or what for; null where no key is needed")
+    name: str | None = Field(description="its owner or purpose; null where no key is needed")
     scopes: list[str]
     lifts: list[JobId] = Field(description="of the scope `shared`: those that it was given")
     expires: Seconds | None = Field(description="null for never")
@@ -788,7 +788,7 @@ class NodesRequest(BaseModel):
         max_length=200,
         description="a text space that the operator set up as a table, the lift's own, or default: likewise",
     )
-    limit: int = Field(100, ge=1, le=1000, description="how many to list")
+    limit: int = Field(100, ge=1, le=1000, description="number of items to list")
     cursor: int = Field(0, ge=0, le=10**9, description="the `next` of the page before")
 
 
@@ -799,7 +799,7 @@ UP = rf"^(cameras|{NUMBER},{NUMBER},{NUMBER})$"
 class TreeRequest(NodesRequest):
     """Nodes to list, with or without relations of objects."""
 
-    relations: bool = Field(False, description="how the objects lie to each other, with numbers")
+    relations: bool = Field(False, description="relations of the objects in space, with numbers")
     up: str | None = Field(
         None,
         pattern=UP,
@@ -821,7 +821,7 @@ class LiftTree(SceneTree, OfLift):
     Of the relations those whose `node` is on the page.
     """
 
-    encoder: str | None = Field(description="what named them, without its file; null for nothing")
+    encoder: str | None = Field(description="the text encoder of their names, without its file; null if unnamed")
     next: int | None = Field(description="the cursor of the page after this one; null at the end")
 
 
@@ -836,5 +836,5 @@ class SceneObjects(ListedObjects, OfLift):
 
     objects: tuple[NamedObject, ...]  # pyright: ignore[reportIncompatibleVariableOverride]
 
-    encoder: str | None = Field(description="what named them, without its file; null for nothing")
+    encoder: str | None = Field(description="the text encoder of their names, without its file; null if unnamed")
     next: int | None = Field(description="the cursor of the page after this one; null at the end")

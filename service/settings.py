@@ -70,7 +70,7 @@ class ServiceSettings(BaseSettings):
     log_format: Literal["json", "text"] = Field("json", description="of the log on stderr: json or text")
     commit: str | None = Field(None, description="the git commit that this was built from, for /version")
     notice_seconds: float = Field(
-        0, ge=0, le=600, description="how long a stopping server still listens, for a load balancer to notice"
+        0, ge=0, le=600, description="time that a stopping server still listens, so that a load balancer notices"
     )
     stop_seconds: float = Field(10, gt=0, le=600, description="time that open requests have to end in a stop")
 
@@ -95,16 +95,14 @@ class ServiceSettings(BaseSettings):
         256 * MiB, ge=0, description="free disk that uploads and jobs must leave; else they are answered 507"
     )
     garbage_seconds: float = Field(3600, gt=0, description="time between collections of garbage; one is at start-up")
-    garbage_grace_seconds: float = Field(3600, ge=0, description="how long a file without an owner is left alone")
-    quarantine_seconds: float = Field(
-        604_800, ge=0, description="how long it is then kept in quarantine/ before it is removed"
-    )
+    garbage_grace_seconds: float = Field(3600, ge=0, description="age up to which a file without an owner is left")
+    quarantine_seconds: float = Field(604_800, ge=0, description="time in quarantine/ before it is removed")
 
     keep_jobs_seconds: float | None = Field(
-        None, ge=0, description="how long a job without a result is kept after its end; not set = until it is deleted"
+        None, ge=0, description="time that a job without a result is kept; not set = until it is deleted"
     )
     keep_jobs: int | None = Field(
-        None, ge=0, description="how many of these, the latest, are kept for each key; not set = all"
+        None, ge=0, description="number of these, the latest, kept for each key; not set = all"
     )
 
     lift_threads: int | None = Field(
@@ -112,7 +110,7 @@ class ServiceSettings(BaseSettings):
     )
     engine: Literal["local", "ray"] | None = Field(
         None,
-        description="who makes lifts in blocks, of bounded memory: local or ray (a cluster); not set = in memory, as "
+        description="engine of lifts in blocks, of bounded memory: local or ray (a cluster); not set = in memory, as "
         "the runs of trade-offs always are",
     )
     ray_address: str = Field("auto", description="of that cluster, host:port; auto takes RAY_ADDRESS")

@@ -191,9 +191,7 @@ class Query(Viewpoint):
         description=f"{', '.join(METHODS)} or a number from -1 to 1: how to find it, or the score from which a splat "
         "counts as found",
     )
-    instances: Count | None = Field(
-        default=None, description="how many there are: so many objects are kept, the best"
-    )
+    instances: Count | None = Field(default=None, description="number of objects to keep, the best ones")
     min_size: Annotated[int, Field(ge=1, le=10**9), NoBoolean] = Field(
         default=1, description="objects of fewer splats are outliers"
     )
@@ -209,7 +207,7 @@ class Query(Viewpoint):
         "(`evidence`), or that times its confidence",
     )
     top: Annotated[int, Field(ge=0, le=1000), NoBoolean] = Field(
-        default=10, description="how many of the best splats to list"
+        default=10, description="number of best splats to list"
     )
 
     @classmethod
@@ -347,8 +345,8 @@ class Presence(Value):
     """Presence of the target in the scene."""
 
     old_names: ClassVar[Mapping[str, str]] = {"why": "reason"}
-    present: bool | None = Field(description="whether it is there; null when not known or not sure")
-    presence: float | None = Field(description="how sure that is, in 0..1: there from 0.5 on; null when not known")
+    present: bool | None = Field(description="true if the target is in the scene; null if unknown or uncertain")
+    presence: float | None = Field(description="its probability, 0..1, present from 0.5 on; null if unknown")
     reason: str = Field(description="one sentence on how it is known whether it is there, or why it is not")
     why = old_field("reason", str)
 
@@ -358,7 +356,7 @@ class SelectionSummary(Presence):
 
     threshold: Threshold
     count: int = Field(description="splats that were selected")
-    clear: bool = Field(description="whether what was found stands apart")
+    clear: bool = Field(description="true if the selection is clearly separate from the rest")
 
 
 NodeKind = Literal["object", "part", "group"]
@@ -370,7 +368,7 @@ class Candidate(Value):
     id: int
     set: str = Field(description="its notation, for sets")
     kind: NodeKind
-    splats: int = Field(description="how many")
+    splats: int = Field(description="number of splats")
     share: float = Field(description="share of the weight at the pixel; for words, of the object's total weight")
     confidence: float | None = Field(description="of the views that see it, the share that has a mask of the whole")
 
@@ -400,7 +398,7 @@ class SuggestedWord(Value):
     """A word that completes a text."""
 
     word: str
-    typed: str = Field(description="what begins as the text does: the word itself, or a synonym of it")
+    typed: str = Field(description="the match of the text: the word itself, or a synonym")
 
 
 class SuggestedWords(Value):
@@ -490,7 +488,7 @@ class WithUnits(Value):
 class SelectedObject(Value):
     """A group of touching selected splats."""
 
-    splats: int = Field(description="how many")
+    splats: int = Field(description="number of splats")
     share: float = Field(description="of the total weight of all selected splats, or of the weights of `weight_by`")
     score: float = Field(description="the mean of its splats' scores, by the same")
     centre: Point = Field(description="the middle of its box: x y z, world frame")
@@ -529,7 +527,7 @@ class NamedSplats(Value):
     row: int = Field(description="index among the words of the query")
     value: int = Field(description="of its splats and pixels in labels and maps; 0 is none")
     colour: tuple[int, int, int] = Field(description="sRGB, 0 to 255, in pictures")
-    splats: int = Field(description="how many it names")
+    splats: int = Field(description="number of its splats")
     share: float = Field(description="of the total weight of all seen splats")
     score: float = Field(description="the mean cosine of its splats, by total weight")
     margin: float = Field(description="the mean of how much nearer they are to it than to the nearest other word")
@@ -571,7 +569,7 @@ class SceneObject(Value):
     id: int = Field(description="the same for the same lift; 0 has the largest total weight")
     name: str | None = Field(description="the nearest word of the vocabulary; null without one")
     score: float | None = Field(description="its cosine with the object's mean feature")
-    splats: int = Field(description="how many")
+    splats: int = Field(description="number of splats")
     share: float = Field(description="of the total weight of all splats")
     centre: Point = Field(description="the middle of its box: x y z, frame of the splat file")
     box: Box = Field(description="of its large groups of splats that touch, without outliers elsewhere")

@@ -28,8 +28,8 @@ MAX_DIGITS = 20  # of a Content-Length: h11 accepts no more
 
 router = APIRouter(prefix="/assets", tags=["assets"], route_class=JsonRoute)
 # OpenAPI takes two templates of the same paths as one path given twice, so the parameter has one name.
-AssetKind = Annotated[models.AssetKind, Path(alias="asset", description="what it is")]
-KindParameter = Annotated[models.AssetKind, Query(description="what it is")]
+AssetKind = Annotated[models.AssetKind, Path(alias="asset", description="its kind")]
+KindParameter = Annotated[models.AssetKind, Query(description="its kind")]
 AssetId = Annotated[str, Path(description="sha256: and the digest of the bytes, in hex")]
 Sha256 = Annotated[str | None, Query(pattern="^[0-9a-fA-F]{64}$", description="of the content; checked if given")]
 NamesCursor = Annotated[int, Query(ge=0, le=10**9, description="the `next` of the page before")]
