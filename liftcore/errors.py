@@ -37,7 +37,7 @@ class SplatliftError(Exception):
         argument: the argument, file or field at fault, by the name that the user knows.
         expected: a valid value.
         got: the actual value.
-        hint: what to do; empty if the first three are enough.
+        hint: a remedy; empty if the first three are enough.
         nearest: for an unknown word, known words near to it, the likeliest first; None for
             any other error.
     """

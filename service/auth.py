@@ -208,7 +208,7 @@ class Hosts:
     Args:
         bound: the address that the service listens on. When that is all of them, every address in digits is this
             service: rebinding needs a name.
-        allowed: more names, for those who come through a proxy or by a name of this machine.
+        allowed_hosts: other names of this server, such as that of a proxy.
         readers: origins of other sites whose pages may read, `*` for all.
     """
 
@@ -223,7 +223,7 @@ class Hosts:
 
         Args:
             method, headers: of the request.
-            only_reads: whether it changes nothing, though its method may: a question with a body.
+            only_reads: True if it changes nothing although its method may: a query with a body.
 
         Raises:
             Misdirected: the Host is another.

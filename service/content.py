@@ -48,12 +48,12 @@ Cursor = Annotated[str | None, Query(pattern=CURSOR, description="the `next` of 
 
 
 def unchanged(request: Request, etag: str, *, exists: bool = True) -> Response | None:
-    """304 when the client has this entity already, else None.
+    """Return 304 if the client already has this entity, else None.
 
     Args:
-        request: what may have an If-None-Match.
+        request: with an If-None-Match, or without.
         etag: of the entity.
-        found: whether it is known to exist; ``*`` means any entity that does.
+        exists: True if the entity is known to exist; ``*`` matches any that does.
     """
     header = request.headers.get("if-none-match")
     if header is None:
@@ -220,8 +220,8 @@ class EventStreams:
     """Open streams, with a limit for each key. Used from the event loop only.
 
     Args:
-        limit: how many there may be.
-        of_a_key: how many of these one key may have; never all of them.
+        limit: their maximum number.
+        of_a_key: the maximum number for one key, below the limit.
     """
 
     def __init__(self, limit: int, of_a_key: int) -> None:

@@ -120,8 +120,8 @@ class Answers:
 
         Args:
             request: the query.
-            ahead: the requests that follow it. Questions among them to the same lift are answered in the same pass
-                over its features, which costs little more than one question alone, and kept for their turn.
+            lookahead: the requests that follow it. Queries of the same lift among them are answered in the same pass
+                over its features, which costs little more than a single query, and are cached.
 
         Raises:
             SplatliftError: the request cannot be answered.
@@ -492,7 +492,7 @@ def view_of(request: dict[str, Any]) -> str | Camera:
     """Return the camera of a picture: a view of the scene, or the camera in the request.
 
     Raises:
-        InvalidCameras: what came is none.
+        InvalidCameras: it is not a camera.
     """
     return Viewpoint(view=request.get("view"), camera=request.get("camera")).seen_from()
 

@@ -136,7 +136,7 @@ class _BoundedRequest(Request):
         Raises:
             UnsupportedEncoding: it is compressed.
             TooLarge: it is too long. A client that is still sending when its connection closes never reads the
-                answer: what is a few times too long is read to its end and let go.
+                answer: a body that is a few times too long is read to its end and dropped.
             InvalidRequest: it holds too many values, or is not what the route takes.
             UnreadableBody: it cannot be parsed as JSON.
         """

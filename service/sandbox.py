@@ -35,7 +35,7 @@ IMPORTED = [
     "liftcore.cli.__main__",  # a task imports again the module that started the server's process
 ]
 CONTEXT.set_forkserver_preload(IMPORTED)
-TICK_SECONDS = 0.5  # how soon the end of the server is noticed
+TICK_SECONDS = 0.5  # delay after which the end of the server is noticed
 GONE_SECONDS = 5.0  # for a task to exit after its result, and for its template to report the exit
 IMPORT_SECONDS = 300.0  # for the first fork of a template, which does its imports first
 FORK_SECONDS = 30.0  # for each later one

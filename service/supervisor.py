@@ -57,7 +57,7 @@ class Supervisor:
 
     Args:
         store: that holds the jobs.
-        limits: what they may take.
+        limits: of their resources.
         command: of their processes.
         clock: by which leases are measured.
     """
@@ -177,8 +177,8 @@ class Lease:
     """Lease of a child: it must write or compute now and then.
 
     Args:
-        seconds: how long it may do neither.
-        clock: what these seconds are measured by.
+        seconds: the longest time without either.
+        clock: of these seconds.
     """
 
     def __init__(self, seconds: float, clock: Clock = time.monotonic) -> None:
@@ -196,7 +196,7 @@ class Lease:
         """Return True if the lease is over; called several times in a lease.
 
         Args:
-            processor_seconds: what the child has taken. One call into a library (HDBSCAN on many splats) may keep
+            processor_seconds: CPU time of the child. One call into a library (HDBSCAN on many splats) may keep
                 all its threads from speaking.
         """
         now = self._clock()
@@ -261,7 +261,7 @@ class Attempt:
     Args:
         job: as it was claimed.
         store: that holds it.
-        limits: what it may take.
+        limits: of its resources.
         command: of the child, before the path of its order.
         clock: by which the child's lease is measured.
     """

@@ -152,7 +152,7 @@ def check(kind_name: str, file: str, *arguments: str) -> dict[str, Any]:
     """Check one file of a kind: ``valid`` with its description, or ``invalid`` with the error.
 
     Args:
-        more: of a lift, the path of its cameras where these have another digest than it remembers.
+        arguments: of a lift, the path of its cameras if these have another digest than the lift has stored.
     """
     kind: UploadKind = LIFT if kind_name == LIFT else AssetKind(kind_name)
     path = Path(file)

@@ -106,7 +106,7 @@ class Intake(ABC, Generic[Record]):
         """Finish after the last byte: check the digest and the file, and store it.
 
         Args:
-            promised: the sha256 in hex that the client sent, if any.
+            declared_digest: the sha256 in hex that the client sent, if any.
 
         Returns:
             What there is, when its owner has these very bytes already.
@@ -126,7 +126,7 @@ class Intake(ABC, Generic[Record]):
 
         Raises:
             InvalidInput, ProcessDied, ServiceUnavailable: as `check` has it.
-            NotFound: what it is checked beside is not here.
+            NotFound: the asset to check it with is missing.
         """
         assert self._draft is not None
         with self._store.files.scratch() as scratch:
@@ -216,7 +216,7 @@ def check(kind: UploadKind, path: Path, scratch: Path, limits: SandboxLimits, *f
     """Check a whole file in a child process, which writes to ``scratch`` and ends with this process.
 
     Args:
-        beside: of a lift, cameras that must see what its own saw.
+        files_beside: of a lift, cameras that must see the same as its own.
 
     Raises:
         InvalidInput: the file is malformed, or it takes more time or memory than it may.

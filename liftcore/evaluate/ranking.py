@@ -29,7 +29,7 @@ def accuracy_of(accuracies: Mapping[str, Any]) -> dict[str, float | None]:
     """Compute the figures of one run over all its views; None without a view.
 
     Args:
-        judged: ``centred_cosine``, a figure a view; ``intersections`` and ``unions``, pixels [V, K] of masks and
+        accuracies: ``centred_cosine``, a figure a view; ``intersections`` and ``unions``, pixels [V, K] of masks and
             labels of K classes; ``phrase_iou``, a figure for each phrase and view.
     """
     figures = {
@@ -60,7 +60,7 @@ def choose(runs: Sequence[Mapping[str, Any]], accuracies: Sequence[Mapping[str, 
 
     Args:
         runs: the first of them exact; ``name``, ``options``, ``cpu_s``, ``cosine`` and the figures of `accuracy_of`.
-        judged: of each run, as `accuracy_of` takes it.
+        accuracies: of each run, as in `accuracy_of`.
 
     Returns:
         ``recommended``: True if one is; ``name`` and ``options`` of it, else of the exact run; ``accuracy``: the

@@ -100,7 +100,7 @@ class FileKind:
 
     kind: str | None  # splats, cameras, photos (a zip or folder), features, masks, table or lift; None: none of these
     name: str  # as errors have it behind "got"
-    hint: str = ""  # what to do with it
+    hint: str = ""  # remedy
     format: SplatFormat | None = None  # of splats
     splats: tuple[str, ...] = ()  # splat files in a folder or zip, the one (or the folder of all ranks) to give first
     recognised: bool = True  # False: only its first bytes are known
@@ -720,5 +720,5 @@ __all__ = [
     "keys_of", "kind_of", "page_table", "splat_format", "wrong_kind",
 ]  # fmt: skip
 
-if __name__ == "__main__":  # what `make web` builds the page with
+if __name__ == "__main__":  # run by `make web` to build the page
     print(json.dumps(page_table(), indent=1, sort_keys=True))

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 ORIENTATION = 0x0112  # EXIF's tag
 MAX_LISTED = 3  # photos in a warning
 UPRIGHT, LARGEST_TAG, LEAST_SIDEWAYS = 1, 8, 5  # its values; from 5 on, rotation swaps width and height
-UNREAD = {  # what to do with images that Pillow does not open
+UNREAD = {  # hints for images that Pillow does not open
     **dict.fromkeys((".heic", ".heif"), "convert HEIC to JPEG, without a turn of its own: heif-convert IN OUT.jpg"),
     **dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw"), "develop raw photos to JPEG or PNG"),
     ".exr": "convert it to 8 bits, with the colours that the splats were trained on",
@@ -72,7 +72,7 @@ def orientation_warnings(readings: Mapping[str, Reading], counterparts: str) -> 
     """Return warnings of how photos with an EXIF orientation were read.
 
     Args:
-        readings: of all photos, by view. what: made of the same pixels: their cameras, or masks.
+        readings: of all photos, by view. counterparts: values of the same pixels: their cameras, or masks.
     """
     advice = {
         Reading.STORED: "were read as stored, without the turn that their EXIF asks for: "

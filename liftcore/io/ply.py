@@ -176,7 +176,7 @@ def some_rows(path: Path, mask: np.ndarray) -> Iterator[bytes]:
 
     Args:
         path: the file.
-        kept: [P] bool, the rows to keep, in the order of the file.
+        mask: [P] bool, the rows to keep, in the order of the file.
 
     Yields:
         The bytes of the copy, in blocks.

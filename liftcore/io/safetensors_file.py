@@ -55,10 +55,10 @@ def check_header(path: Path, name: str, fault: type[InvalidInput], *, expected: 
 
     Args:
         path: the file.
-        name: what errors call it.
-        fault: what is raised.
-        expected: what the file should have been.
-        hint: how to make one.
+        name: of the file, in errors.
+        fault: type of the error.
+        expected: description of a valid file.
+        hint: command that writes one.
     """
     try:
         with open_regular(path) as handle:

@@ -67,7 +67,7 @@ UNDISTORT = (
     "and lift on them, and write their fl_x, fl_y, cx and cy without distortion"
 )
 LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])  # of a rigid pose
-OF_NERFSTUDIO = ("applied_transform", "ply_file_path")  # what its own converter writes, and others do not
+OF_NERFSTUDIO = ("applied_transform", "ply_file_path")  # fields that only its own converter writes
 EXPORTED = ("file_path", "transform")  # of each camera of an export
 FOCALS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 
@@ -80,7 +80,7 @@ def parse_transforms(document: Any, source: str, photos: PhotosBeside | None = N
 
     Args:
         document: as JSON has it. source: its file, for errors.
-        photos: where the sizes of photos are looked up that the document does not have; None: nowhere.
+        photos: source of sizes that the document does not have; None: none.
 
     Raises:
         InvalidCameras: a key is missing or malformed, or a camera is distorted in a way that is not read.

@@ -154,7 +154,7 @@ def nearer_counts(
 
     Args:
         features: [n, F] f16 or f32. norms: [n] f32. mean: [F] f32, of unit features.
-        directions: [p, F] f32, unit, the words. others: [m, F] f32, unit.
+        directions: [p, F] f32, unit, the words. references: [m, F] f32, unit.
 
     Returns:
         [n] i64 twice.

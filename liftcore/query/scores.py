@@ -194,7 +194,7 @@ def combine(similarities: np.ndarray, positives: int) -> np.ndarray:
     Args:
         similarities: [P, n] f32, cosines to the positives, then to the negatives; about the scene's mean for examples
             (`cosines_about`).
-        positives: how many of the n are positives, at least one.
+        positives: number of positives among the n, at least one.
 
     Returns:
         [P] f32 in -1..1.
@@ -210,7 +210,7 @@ def relevancy(similarities: np.ndarray, positives: int) -> np.ndarray:
 
     Args:
         similarities: [P, n] f32, cosines to the positives, then to the negatives, at least one of either.
-        positives: how many of the n are positives.
+        positives: number of positives among the n.
     """
     nearest, against = similarities[:, :positives].max(axis=1), similarities[:, positives:].max(axis=1)
     return 1 / (1 + np.exp(RELEVANCY_SHARPNESS * (against - nearest)))

@@ -96,7 +96,7 @@ def find_threshold(
         least: ``auto`` takes no lower score, unless too few lie above it.
 
     Raises:
-        InvalidQuery: what `check_method` refuses, or scores that are not finite.
+        InvalidQuery: as in `check_method`, or scores that are not finite.
     """
     check_method(method)
     if isinstance(method, int | float):

@@ -438,7 +438,7 @@ def viewmat_of(camera_to_world: np.ndarray, centre: np.ndarray) -> np.ndarray:
     """Return [4, 4] f64 of a camera's axes in the world, [3, 3], and its centre, [3]; a ``Camera`` validates it."""
     pose = np.eye(4)
     pose[:3, :3] = camera_to_world.T
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is not finite, and is refused as such
+    with np.errstate(over="ignore", invalid="ignore"):  # an overflow is not finite, and is refused as such
         pose[:3, 3] = -camera_to_world.T @ centre
     return pose
 

@@ -80,7 +80,7 @@ class SplatGraph:
     starts: np.ndarray  # [P + 1] i64, of the rows' entries
     neighbours: np.ndarray  # [E] i32, rows, ascending within a row
     affinities: np.ndarray  # [E] f32, above LEAST_AFFINITY / 2, at most 1
-    coloured: bool  # whether the splats have colours
+    coloured: bool  # True if the splats have colours
 
     @classmethod
     def of(cls, splats: Splats, threads: int | None = None) -> Self:

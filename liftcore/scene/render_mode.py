@@ -33,7 +33,7 @@ class RenderMode:
     """A render mode, and its source."""
 
     model: RenderModel
-    source: str  # what records it, as the subject of a sentence; "" of values in memory
+    source: str  # its source, as the subject of a sentence; "" of values in memory
 
 
 _BY_NAME = {  # as comments and ``meta.json`` spell them
@@ -76,7 +76,7 @@ def mode_of_word(word: object, source: str) -> tuple[RenderMode | None, tuple[st
     """Return the mode that a word of a file names, and a warning where it names none.
 
     Args:
-        source: where the word stands, such as ``'model' in meta.json``.
+        source: location of the word, such as ``'model' in meta.json``.
     """
     model = _BY_NAME.get(word.strip().lower()) if isinstance(word, str) else None
     if model is None:

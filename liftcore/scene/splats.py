@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 SH_ROWS = (1, 4, 9, 16, 25)  # (degree + 1)^2
-_BEYOND = {"opacity_logits": (True, True), "log_scales": (True, False)}  # whether -inf and +inf have a meaning
+_BEYOND = {"opacity_logits": (True, True), "log_scales": (True, False)}  # True if -inf and +inf have a meaning
 ROUNDED = 0.25  # of a splat's size: a coarser float32 has moved splats visibly
 WIDEST = 4.0  # spacings of splats that lie spread over a square as wide as their scene
 MIN_SAMPLE = 100  # splats: what all of so many have in common is no accident
@@ -186,7 +186,7 @@ class Splats:
             colors: [P, 3] RGB in 0..1, or [P, K, 3] spherical harmonics; or in place of it
             sh0, shN: [P, 1, 3] and [P, K - 1, 3], gsplat's; or features_dc, features_rest: [P, 3] and [P, K - 1, 3],
                 nerfstudio's.
-            activated: whether scales and opacities are lengths and opacities, not logarithms and logits.
+            activated: True if scales and opacities are lengths and opacities, not logarithms and logits.
 
         Raises:
             InvalidSplats: scales or opacities contradict ``activated``, colours come twice, or an array has
@@ -261,7 +261,7 @@ class Splats:
         origin = None
         if self.origin == FILE_ORIGIN:
             fields["means"] = torch.from_numpy(move.points(self.positions().astype(np.float64))).to(place)
-        else:  # what is near the origin stays near it, and loses no digit
+        else:  # values near the origin stay near it, and lose no digit
             fields["means"] = (move.scale * (self.means.double() @ turn.T.to(place))).float()
             origin = move.points(np.array([self.origin]))[0].tolist()
         if move.rotation.tolist() != np.eye(3).tolist():

@@ -139,7 +139,7 @@ def encoder_of_space(text_space: str, hint: str = "", *, stand_in: bool = False)
 
     Args:
         hint: the advice of an error.
-        stand_in: where the weights are not available, use the shipped table of this encoder, which encodes only its
+        stand_in: if the weights are not available, use the shipped table of this encoder, which encodes only its
             own words.
 
     Raises:

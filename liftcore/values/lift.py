@@ -72,7 +72,7 @@ class LiftMetadata(AliasedModel):
     poses: str = ""  # of their cameras (`liftcore.values.lift_file.poses_of`); "" in older lifts
     origin: Origin = FILE_ORIGIN  # of the splats (`Splats.origin`), and of the positions in ``.splat`` and ``.spz``
     world: WorldFrame = UNKNOWN  # of the splats: as their file, else that of the cameras says it, or somebody later
-    landmarks: tuple[Landmark, ...] = ()  # where some splats lie, by which their rows are known; () in older lifts
+    landmarks: tuple[Landmark, ...] = ()  # positions of some splats, to verify their rows; () in older lifts
     diagnostics: dict[str, Any]
     timings: dict[str, float]  # seconds a stage
 

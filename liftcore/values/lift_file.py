@@ -316,7 +316,7 @@ def _candidates_beside(lift: Path, path: Path) -> Iterator[Path]:
 
 def _in_store(lift: Path, sha256: str) -> Iterator[Path]:
     """Yield the places of an input beside ``lifts/ID.safetensors`` of a service: ``blobs/ab/abcd....ply``."""
-    if DIGEST.fullmatch(sha256):  # what another lift remembers may be no digest but a pattern
+    if DIGEST.fullmatch(sha256):  # the stored value of another lift may be a pattern, not a digest
         yield from Path(os.path.abspath(lift)).parent.parent.glob(f"blobs/{sha256[:2]}/{sha256}.*")
 
 

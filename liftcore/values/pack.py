@@ -70,7 +70,7 @@ class Views(Mapping[str, ViewFeatures]):
     channels: int  # F
     encoder: str  # name of the 2D encoder in the packs, "" if they have none
     text_space: str  # the text encoder that shares the space; "" unknown, "none" when there is none
-    normalised: bool | None  # whether codebook rows and grid cells are unit vectors; None: unknown
+    normalised: bool | None  # True if codebook rows and grid cells are unit vectors; None: unknown
     _sources: Mapping[str, _Source] = field(repr=False)
     table: TableEncoder | None = None  # the packs' own words
     paths: tuple[Path, ...] = ()  # of the packs that it reads; () where views come from elsewhere

@@ -58,7 +58,7 @@ class RegionWeights:
     total_weight: Tensor
     """[m] f32, sum of plain weights w (opacity_logit_scale 1, power 1), each ray once"""
     offsets: Tensor
-    """[V + 1] i64, on the CPU: the first region of each view, and how many there are in all"""
+    """[V + 1] i64, on the CPU: the first region of each view, and their number"""
     views: tuple[str, ...] = ()
     """their names, in the order of the offsets; () if unnamed"""
 
@@ -180,7 +180,7 @@ class RegionWeights:
         """Write one safetensors file, whole or not at all: its tensors by name, and ``views`` in the metadata.
 
         Args:
-            others: tensors that lie beside, under names of their own.
+            extra_tensors: stored beside W, by other names.
         """
         metadata = {"format": FORMAT, "views": json.dumps(self.views)}
         write_tensors(Path(path), self.tensors() | dict(extra_tensors or {}), metadata)
@@ -251,7 +251,7 @@ def _stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None) -
     place = places.pop() if len(places) == 1 else torch.device("cpu")
     lengths = torch.zeros(splats, dtype=torch.int64, device=place)
     total_weight = torch.zeros(splats, dtype=torch.float64, device=place)
-    for part in parts:  # whose splats are different ones, so that no two threads of a device add to one
+    for part in parts:  # of different splats, so that no two threads of a device add to the same
         lengths.index_add_(0, part.splats.to(place), part.indptr.diff().to(place))
         total_weight.index_add_(0, part.total_weight_splats.to(place), part.total_weight.to(place).double())
     indptr = from_zero(lengths)

@@ -337,7 +337,7 @@ class LiftSettings(PlainModel):
         ):  # settings that need a step are off without it, unless they are set
             weights = {name: value for name, value in weights.items() if name not in _REWEIGHTED}
         settings = handler({**weights, **effort, **values})
-        settings.model_fields_set.intersection_update(values)  # what a caller set, which stays when a preset changes
+        settings.model_fields_set.intersection_update(values)  # set by the caller; they stay when the preset changes
         return settings
 
     @model_validator(mode="after")
@@ -452,7 +452,7 @@ class LiftSettings(PlainModel):
         """Refuse what no engine can work on in blocks of views and splats.
 
         Args:
-            masks: whether any view has masks, which make clusters in blocks.
+            masks: True if any view has masks, which make clusters in blocks.
 
         Raises:
             InvalidSettings: least squares, smoothness, or an aggregation by HDBSCAN.

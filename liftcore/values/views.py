@@ -187,7 +187,7 @@ def label_levels(masks: Sequence[np.ndarray], location: str) -> np.ndarray:
     levels as rows of their own needs only the masks of a pixel, so there their level does not matter.
 
     Args:
-        masks: [h, w] bool each, at least one, all of one size; each is read twice. where: named in the error.
+        masks: [h, w] bool each, at least one, all of one size; each is read twice. location: the argument, in errors.
 
     Raises:
         InvalidFeatures: they take more than MAX_LEVELS levels.

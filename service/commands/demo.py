@@ -189,7 +189,7 @@ class Finding:
 
     phrase: str
     present: bool | None  # the scene has it; None: unknown or uncertain
-    reason: str  # how that is known
+    reason: str  # of the presence
     object: str | None  # name of the object that the masks show most, if names are known
     splats: int  # selected
     score: float  # the best cosine
@@ -206,7 +206,7 @@ def show(subject: DemoScene, url: str, out: Path, say: Callable[[str], None]) ->
     """Upload, lift and query; write pictures to ``out`` and sentences to ``say``.
 
     Returns:
-        What was done and found, as plain numbers.
+        The results, as plain values.
 
     Raises:
         InvalidInput: the service refused the scene. Unavailable: it failed.
@@ -424,9 +424,9 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path, pack: Path |
     Args:
         folder: holds splats (``.ply``, ``.sog``, ``.spz`` or ``.splat``), cameras (``cameras.json``,
             ``transforms.json``, ``sparse/0``) and a pack.
-        phrases: what to ask; empty = what ``truth.json`` says, else the three of its objects that fill most of the
+        phrases: of the queries; empty = those in ``truth.json``, else the three of its objects that fill most of the
             pictured view, and nothing where the features have no words.
-        scratch: where to put the zipped model.
+        scratch: the folder for the zipped model.
         pack: the feature pack; None takes ``features.safetensors``, else the first by name.
 
     Raises:

@@ -48,7 +48,7 @@ EXPORT_BYTES = 16  # of a splat's labels
 ROW_BYTES, SCORE_BYTES = 32, 4  # of a splat in the .splat format, and in an array
 NUMBER_BYTES = 24  # of a number in JSON, at most
 NO_ENCODER: dict[str, Any] = {"encoder": None, "encoder_version": None}  # of a question without words
-REGION, SELECTION = "region:", "selection:"  # what needs the lift's packs, or a selection of it, begins so
+REGION, SELECTION = "region:", "selection:"  # prefixes of terms that need the lift's packs, or a selection of it
 NPY_TYPE, PNG_TYPE, JSON_TYPE = "application/x-npy", "image/png", "application/json"
 MEDIA_TYPES = {
     **dict.fromkeys(("scores", "selection", "layer", "word_labels"), NPY_TYPE),

@@ -68,7 +68,7 @@ def edit_selection(
     record = deps.store.lifts.get(deps.owner, lift)
     before = deps.store.selections.get(deps.owner, record.id, selection, _versions(match))
     splats = _apply_edit(parameters, record, deps, ask, deps.store.selections.bits(before))
-    try:  # what was worked on is the version that was read: another that came meanwhile is not overwritten
+    try:  # the change is of the version that was read: one stored meanwhile is not overwritten
         after = deps.store.selections.extend(deps.owner, record.id, selection, splats, frozenset({before.version}))
     except VersionMismatch as error:
         if _versions(match) is not None:

@@ -48,7 +48,7 @@ class Database:
 
     Args:
         path: the file; made when it is not there.
-        rebuilding: whether it may be gone or older than the files beside it.
+        rebuilding: True if it may be gone or older than the files beside it.
 
     Raises:
         StaleDatabase: it is, and may not; then it is left as it was.
@@ -114,7 +114,7 @@ class Database:
         """Run one write transaction: committed at the end of the block, rolled back after an exception.
 
         Args:
-            counted: a start must not go on without what it writes, so the data directory remembers its generation.
+            is_counted: True counts the write in the data directory, so that an older database is noticed.
 
         Raises:
             sqlite3.OperationalError: busy, full, or the file is no longer the one that was opened.
@@ -188,7 +188,7 @@ class Database:
         """Require that a new connection would find a database, which an open connection does not notice.
 
         Args:
-            seconds: how long its pages are looked through; 0 = not at all.
+            seconds: time to check its pages; 0 = no check.
 
         Only SQLite may open the file: a process that closes it in any other way gives up all of SQLite's locks on it
         (POSIX), and the next program that closes the database takes the WAL for its own and removes it.
@@ -373,7 +373,7 @@ def insert(
         connection: of the transaction.
         table: that gets it.
         values: by column.
-        on_conflict: what to do with a row that is there already: ``ABORT`` or ``IGNORE``.
+        on_conflict: action for a row that exists already: ``ABORT`` or ``IGNORE``.
     """
     columns, places = ", ".join(values), ", ".join("?" * len(values))
     connection.execute(f"INSERT OR {on_conflict} INTO {table} ({columns}) VALUES ({places})", list(values.values()))
@@ -410,9 +410,9 @@ def page_of(
 
     Args:
         connection: to read with.
-        listed: a SELECT of all of them, with columns ``created`` and ``id``.
+        query: a SELECT of all records, with columns ``created`` and ``id``.
         terms: for the names in it.
-        limit: how many at most.
+        limit: maximum number of records.
         cursor: of the page before, None for the first one.
         record: a row as a record.
 

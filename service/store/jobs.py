@@ -287,7 +287,7 @@ class JobStore:
 
         Args:
             before: seconds since 1970; those that ended earlier go.
-            most: how many stay of each owner, the latest.
+            limit: number of jobs to keep for each owner, the latest.
 
         Returns:
             How many went.
@@ -380,8 +380,8 @@ class JobStore:
         Args:
             job: its id.
             attempt: its number.
-            why: for the job's log.
-            error: what the job fails with in the end, instead of having crashed.
+            reason: for the job's log.
+            error: the job's problem after its last attempt, in place of that of a crash.
         """
         with self._database.write() as connection:
             row = _owned_row(connection, job, attempt)

@@ -88,8 +88,8 @@ class KeyStore:
         Args:
             name: for people.
             scopes, quota: what it may do, and fill.
-            expires: when it ends; None = never.
-            lifts: what it is given, with the scope `shared`, which it then has alone.
+            expires: its end; None = never.
+            lifts: shared with the key, whose only scope is then `shared`.
             maker: the secret of the key that shares the lifts, with whose end it ends.
 
         Returns:
@@ -145,7 +145,7 @@ class KeyStore:
         """Give a key a new secret; its assets and lifts stay its own.
 
         Args:
-            named: its id, or its name where no other valid key has it.
+            name: its id, or its name if no other valid key has it.
             grace: seconds for which the secret before counts, too. The one before that ends now.
             keep_shares: let keys that it shared lifts with stay. Otherwise each ends with the secret that made it, as
                 whoever else has that secret may have made it.

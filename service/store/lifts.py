@@ -179,8 +179,8 @@ class LiftStore:
 
         Args:
             owner: whose it is.
-            order: what it was made of; the assets are here.
-            made: of a draft that was checked.
+            order: its inputs, which are in the store.
+            result: of a checked draft.
 
         Raises:
             OverQuota: it would be more than the owner may store.
@@ -199,8 +199,8 @@ class LiftStore:
         Args:
             owner: of the job, if there is none.
             job: its id.
-            order: what it was made of; the assets are here.
-            made: of the draft, or of the file itself.
+            order: its inputs, which are in the store.
+            result: of the draft, or of the file itself.
         """
         path, status = self._files.lift(job), result.draft.stat()
         with self._database.write(is_counted=True) as connection:
