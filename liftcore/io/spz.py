@@ -192,7 +192,7 @@ def _version_4(head: tuple[Any, ...], extensions: bytes, sections: list[bytes]) 
 
 
 def _encode(rows: GaussianRows, bits: int, higher: int) -> tuple[np.ndarray, ...]:
-    """Return the sections of some splats, as `_decoded` reads those of version 3."""
+    """Return the sections of some splats, as `_decode` reads those of version 3."""
     means = np.round(rows.means * (1.0, -1.0, -1.0) * 2.0**bits).astype(np.int32)
     with np.errstate(divide="ignore"):
         scales = np.round((np.log(rows.scales.astype(np.float64)) + 10) * 16)

@@ -28,16 +28,16 @@ T = TypeVar("T")
 def map_nearest(
     means: np.ndarray, work: Callable[[np.ndarray, np.ndarray], T], threads: int | None = None
 ) -> list[T]:
-    """Call ``work(own, near)`` for all points in pieces, with the NEIGHBOURS nearest others of each.
+    """Call ``work(rows, near)`` for all points in pieces, with the NEIGHBOURS nearest others of each.
 
     Args:
         means: [n, 3] f64, n at least one.
-        work: takes ``own`` [m] i32, the numbers of points that lie near one another, and ``near`` [m, k] i32 with
+        work: takes ``rows`` [m] i32, of points that are near one another, and ``near`` [m, k] i32 with
             ``k = min(NEIGHBOURS + 1, n)``, the nearest first: each point is among its own.
         threads: None uses the cores of this process. The result is bitwise identical for any number.
 
     Returns:
-        What ``work`` returned, in an order that depends on the points alone.
+        The results of ``work``, in an order that depends on the points alone.
     """
     from scipy.spatial import KDTree
 
