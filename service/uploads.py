@@ -109,7 +109,7 @@ class Intake(ABC, Generic[Record]):
             declared_digest: the sha256 in hex that the client sent, if any.
 
         Returns:
-            What there is, when its owner has these very bytes already.
+            The asset, if its owner already has these bytes.
 
         Raises:
             DigestMismatch: the bytes are others.

@@ -363,7 +363,7 @@ class Cameras(Mapping[str, Camera]):
             self._by_name[camera.name] = camera
 
     def __getitem__(self, name: str) -> Camera:
-        """Return the view of a name, or of one that pairs with it (`cameras_of_views`), as older lifts name rigs otherwise.
+        """Return the view of a name, or of one that pairs with it (`cameras_of_views`): older lifts have other names.
 
         Raises:
             NotFound: no view has it; the error, which is a KeyError, names the nearest ones.

@@ -150,7 +150,7 @@ class RegionWeights:
             starts: [B + 1] i64, where the rows begin. region: [n] i32, of their entries.
 
         Returns:
-            Where runs begin among the entries [R + 1] i64, and the row of each [R] i64.
+            The first entry of each run [R + 1] i64, and the row of each [R] i64.
         """
         view = torch.searchsorted(self.offsets[1:], region, right=True)
         is_start = torch.ones_like(view, dtype=torch.bool)

@@ -145,7 +145,7 @@ class DataDirectory:
         """Move files and folders to quarantine, to be removed after a time or moved back.
 
         Returns:
-            What was moved, where it was.
+            The former paths of moved files.
         """
         # A folder for each call, so that nothing is replaced.
         now = datetime.now(UTC).strftime(QUARANTINE_TIME)

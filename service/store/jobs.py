@@ -216,7 +216,7 @@ class JobStore:
         """Cancel a job. A queued one is canceled at once, a running one when its processes have ended.
 
         Returns:
-            Whether something changed; a job that is canceled, or is being, may be canceled again.
+            True if something changed; a job that is canceled, or canceling, may be canceled again.
 
         Raises:
             NotFound: there is none.
@@ -290,7 +290,7 @@ class JobStore:
             limit: number of jobs to keep for each owner, the latest.
 
         Returns:
-            How many went.
+            The number of removed jobs.
         """
         count = 0
         while True:

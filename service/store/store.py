@@ -132,7 +132,7 @@ def collect(store: Store, older_than: float) -> list[Path]:
         older_than: seconds since 1970; what was changed later stays.
 
     Returns:
-        What was moved or removed.
+        The files that were moved or removed.
     """
     files, quarantined = store.files, []
     files.make_folders()

@@ -174,7 +174,7 @@ def level_scores(levels: Sequence[np.ndarray], words: np.ndarray, has_weight: np
     """[P, n] f32: how near splats are to each word in the level of its own that answers it best.
 
     Args:
-        levels: [P, F] unit, of each level's lift. words: [n, F] unit. counted: [P] bool, the splats that choose.
+        levels: [P, F] unit, of each level's lift. words: [n, F] unit. has_weight: [P] bool, the splats that choose.
     """
     tables, margins = [features @ words.T for features in levels], []
     for table in tables:
@@ -200,7 +200,7 @@ def word_iou(scores: np.ndarray, owners: np.ndarray, has_weight: np.ndarray) -> 
     """Mean IoU of words, each at its best threshold.
 
     Args:
-        scores: [P, n]. owners: [P] int, the word of each splat. counted: [P] bool, the splats that count.
+        scores: [P, n]. owners: [P] int, the word of each splat. has_weight: [P] bool, the splats that count.
     """
     ious, counts = [], np.arange(1, has_weight.sum() + 1)
     for word, column in enumerate(scores[has_weight].T):

@@ -57,7 +57,7 @@ def best_iou(attention: np.ndarray, hit: np.ndarray, truth: Tensor) -> float:
     """The largest IoU that any threshold on the attention gives, over the distinct scores of the met pixels.
 
     Args:
-        attention: [H, W] f32. met: [H, W] bool, the pixels that a mask may take. truth: [H, W] bool.
+        attention: [H, W] f32. hit: [H, W] bool, the pixels that a mask may take. truth: [H, W] bool.
     """
     hit_mask = torch.from_numpy(hit)
     scores, order = torch.sort(torch.from_numpy(attention)[hit_mask], descending=True)
