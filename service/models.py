@@ -166,7 +166,7 @@ FIRST_MOMENT, LAST_MOMENT = (datetime(*day, tzinfo=UTC).timestamp() for day in (
 
 
 def within_calendar(seconds: float) -> float:
-    """Seconds since 1970, or the nearest that ISO 8601 has a date for: a database may hold any number."""
+    """Return seconds since 1970, clipped to dates of ISO 8601: a database may hold any number."""
     return max(FIRST_MOMENT, min(LAST_MOMENT, seconds))
 
 
@@ -174,7 +174,7 @@ Seconds = Annotated[float, Field(description="seconds since 1970"), AfterValidat
 
 
 def iso_of(name: str, *, optional: bool = False) -> Any:
-    """A field for the moment of the field of that name, which are `Seconds`: ISO 8601, in UTC."""
+    """Return a field with the time of a field of `Seconds` as ISO 8601, in UTC."""
 
     def moment(self: BaseModel) -> datetime | None:
         seconds = getattr(self, name)
@@ -489,7 +489,7 @@ THE_LIFT = "the lift; may be left out when there is exactly one"
 
 
 def at_most(characters: int) -> AfterValidator:
-    """Bounds a list of texts by what they have together."""
+    """Limit a list of texts by their total length."""
 
     def check(texts: list[str]) -> list[str]:
         if (got := sum(map(len, texts))) > characters:

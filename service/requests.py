@@ -244,7 +244,7 @@ class Parameters(Generic[M]):
         return [*self.names, *(old for old, new in self.model.old_names.items() if new in self.names)]
 
     def openapi_schema(self) -> dict[str, Any]:
-        """The parameters as OpenAPI describes them."""
+        """Describe the parameters for OpenAPI."""
         parameters = []
         for name in self._names():
             schema = {key: value for key, value in self.schema["properties"][name].items() if key != "description"}

@@ -135,7 +135,7 @@ class Intake(ABC, Generic[Record]):
         return CheckedUpload(self._draft, self._kind, digest, report.suffix, report.counts, report.warnings)
 
     def _files_beside(self) -> tuple[Path, ...]:
-        """Files that are needed for the check."""
+        """Return other files that the check needs."""
         return ()
 
     @abstractmethod

@@ -107,7 +107,7 @@ def require_folder(folder: Path) -> None:
 
 
 def settings_of(options: argparse.Namespace) -> LiftSettings:
-    """Settings of ``--preset``, ``--speed``, ``--device`` and ``--set key=value``.
+    """Return the settings of ``--preset``, ``--speed``, ``--device`` and ``--set key=value``.
 
     Raises:
         InvalidSettings: a pair without ``=``, an unknown name, one with two values or a value out of range.

@@ -240,7 +240,7 @@ def _header(start: bytes, path: Path) -> tuple[int, int, int, int, int, int]:
 
 
 def _section_bytes(version: int, count: int, degree: int) -> list[int]:
-    """Bytes of means, opacities, colours, log scales, quaternions and harmonics."""
+    """Return the bytes of means, opacities, colours, log scales, quaternions and harmonics."""
     higher = (degree + 1) ** 2 - 1
     return [count * size for size in (6 if version == 1 else 9, 1, 3, 3, 4 if version >= 3 else 3, 3 * higher)]
 

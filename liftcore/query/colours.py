@@ -22,7 +22,7 @@ _HUES = 72
 
 
 def colour_map() -> np.ndarray:
-    """[256, 3] u8 sRGB, an arc through OKLab (Ottosson 2020) of evenly rising lightness."""
+    """Return [256, 3] u8 sRGB, an arc through OKLab (Ottosson 2020) of evenly rising lightness."""
     step = np.linspace(0.0, 1.0, _MAP_STEPS)
     lightness = np.interp(step, (0, 1), _MAP_LIGHTNESS)
     hue = np.interp(step, (0, 1), _MAP_HUE)

@@ -75,7 +75,7 @@ class Similarity:
         return cls(scale, _proper("matrix", matrix[:3, :3] / scale), matrix[:3, 3].copy())
 
     def points(self, points: np.ndarray) -> np.ndarray:
-        """Points [n, 3] f64 of the old frame in the new one."""
+        """Transform points [n, 3] f64 to the new frame."""
         return self.scale * (points @ self.rotation.T) + self.translation
 
 
@@ -87,7 +87,7 @@ def _is_positive(scale: Any) -> bool:
 
 
 def _numbers(name: str, values: Any, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
-    """Values as f64 of one of the shapes, on the CPU."""
+    """Return values as f64 of one of the shapes, on the CPU."""
     if hasattr(values, "detach"):
         values = values.detach().cpu().numpy()
     expected = f"finite numbers {' or '.join(str(list(shape)) for shape in shapes)}"

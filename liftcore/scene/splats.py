@@ -173,7 +173,7 @@ class Splats:
         features_rest: Array | None = None,
         render_mode: RenderMode | str | None = None,
     ) -> Splats:
-        """Splats of the tensors of gsplat or nerfstudio, by their names there.
+        """Return splats of the tensors of gsplat or nerfstudio, by their names there.
 
         With ``activated=False`` they are parameters of a training: ``from_gsplat(**splats, activated=False)`` of
         gsplat's trainer, ``from_gsplat(**model.gauss_params, activated=False)`` of nerfstudio's splatfacto. With
@@ -335,7 +335,7 @@ def _move_to_origin(
 
 
 def _activation_warnings(columns: Mapping[str, Tensor]) -> list[str]:
-    """Warnings of numbers that look activated already: a file keeps logits of opacities, and logarithms of scales.
+    """Return warnings of numbers that look activated: files have logits of opacities and logarithms of scales.
 
     In a small unit all scales may be above 1. They are no logarithms where their exponentials are much larger than so
     many splats need to cover a scene of that extent.

@@ -42,7 +42,7 @@ class _Block:
     view_share: Tensor  # [n] f64 in 0..1, p: the share of the entry's view
 
     def line_sums(self, values: Tensor) -> Tensor:
-        """Sums [lines] f64 of values of the entries [n] f64."""
+        """Return sums [lines] f64 of values of the entries [n] f64."""
         return segment_sums(segment_sums(values, self.starts), self.line_starts)
 
 

@@ -32,7 +32,7 @@ def as_pinhole_sees(observation: ViewFeatures, camera: Camera) -> ViewFeatures:
 
 
 def grid_sides(height: int, width: int, camera: Camera) -> tuple[int, int]:
-    """Rows and columns of a grid [height, width] of the camera's photo, as its pinhole sees it."""
+    """Return rows and columns of a grid [height, width] of the camera's photo, as its pinhole sees it."""
     photo = camera.lens or camera.face
     if photo is None:
         return height, width
@@ -41,7 +41,7 @@ def grid_sides(height: int, width: int, camera: Camera) -> tuple[int, int]:
 
 
 def photo_as_pinhole_sees(photo: np.ndarray, camera: Camera) -> np.ndarray:
-    """[height, width, C], the nearest pixels of a photo [h, w, C]; itself where the camera's picture is the photo."""
+    """Return [height, width, C], the nearest pixels of a photo [h, w, C]; the photo itself if it is undistorted."""
     if camera.lens is None and camera.face is None:
         return photo
     places = _label_places(_pinhole(camera), *photo.shape[:2]).numpy()
@@ -56,7 +56,7 @@ def _labels(labels: Tensor, camera: Camera) -> Tensor:
 
 @lru_cache(maxsize=KEPT_PINHOLES)
 def _label_places(pinhole: "_Pinhole", height: int, width: int) -> Tensor:
-    """[H * W] i32, of a huge map i64: the place among the photo's labels [height, width] that each pixel reads."""
+    """Return [H * W] i32, i64 of huge maps: the index in labels [height, width] of the photo for each pixel."""
     places = np.empty((pinhole.height, pinhole.width), np.int32 if height * width < 1 << 31 else np.int64)
     band = max(1, BAND_PIXELS // pinhole.width)
     columns = np.arange(pinhole.width) + 0.5

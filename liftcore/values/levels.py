@@ -100,7 +100,7 @@ def label_tuples(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _unit_sums(tuples: np.ndarray, codebook: torch.Tensor) -> torch.Tensor:
-    """[n, F]: the unit sums of the embeddings of each tuple [L, n], zero where they cancel; the codebook's dtype."""
+    """Return [n, F] in the codebook's dtype: the normalised sum of the embeddings of each tuple [L, n], or zeros."""
     largest = codebook.abs().amax().double().clamp_min(torch.finfo(torch.float64).tiny)  # squares cannot overflow
     output = torch.empty(tuples.shape[1], codebook.shape[1], dtype=codebook.dtype)
     for block in torch.arange(len(output)).split(max(1, BLOCK_FLOATS // codebook.shape[1])):

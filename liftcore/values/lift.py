@@ -271,7 +271,7 @@ class Lift:
 
 
 def renumbered(labels: Tensor, table: Tensor) -> tuple[Tensor, Tensor]:
-    """Labels [n] of rows of a table [K, ..], -1 for none, and the table without rows that no label names."""
+    """Return labels [n] of rows of a table [K, ..], -1 for none, and the table without unused rows."""
     import torch
 
     present, numbers = torch.unique(labels, return_inverse=True)

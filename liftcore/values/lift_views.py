@@ -27,7 +27,7 @@ class LiftViews:
 
     @classmethod
     def of(cls, views: ViewValues, cameras: Cameras | Mapping[str, Camera], settings: LiftSettings) -> "LiftViews":
-        """Views paired with cameras by name, every ``view_stride``-th of them.
+        """Pair views with cameras by name, every ``view_stride``-th of them.
 
         Raises:
             InvalidFeatures: no view has a camera, or views are malformed.
@@ -78,5 +78,5 @@ class LiftViews:
         )
 
     def camera(self, number: int) -> Camera:
-        """Of the view of that number."""
+        """Return the camera of the view of that number."""
         return self.cameras[self.names[number]]

@@ -340,7 +340,7 @@ def _spooled(pairs: Iterable[tuple[str, ViewFeatures]], scratch: Path | None) ->
 
 
 def _composed_names(names: Iterable[Any]) -> dict[str, str]:
-    """Composed name (NFC) -> the name as it came."""
+    """Return the original names by composed ones (NFC)."""
     originals: dict[str, str] = {}
     for name in names:
         if not isinstance(name, str):

@@ -114,7 +114,7 @@ class RegionWeights:
         return sums
 
     def blocks(self, rows: int = BLOCK_ROWS, entries: int = BLOCK_ENTRIES) -> list[tuple[int, int]]:
-        """(first, last) of rows that go together, of about so many rows or entries, whichever is less."""
+        """Return (first, last) of blocks of rows, of about so many rows or entries, whichever is less."""
         return row_blocks(self.indptr.diff().cpu().numpy(), rows, entries)
 
     def take(self, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -296,7 +296,7 @@ def _stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None) -
 
 
 def row_blocks(lengths: np.ndarray, rows: int, entries: int) -> list[tuple[int, int]]:
-    """(first, last) of rows that go together: at most about so many rows and entries, at least one row.
+    """Return (first, last) of blocks of rows: at most about so many rows and entries, at least one row.
 
     Args:
         lengths: [n] i64, entries of each row.
@@ -323,7 +323,7 @@ def from_zero(lengths: Tensor) -> Tensor:
 
 
 def segment_sums(values: Tensor, starts: Tensor) -> Tensor:
-    """Sums [n] f64 of values between ``starts`` [n + 1] i64, each in its order."""
+    """Return sums [n] f64 of values between ``starts`` [n + 1] i64, each in its order."""
     if values.numel() == 0:
         return torch.zeros(starts.shape[0] - 1, dtype=torch.float64, device=values.device)
     return torch.segment_reduce(values.double(), "sum", offsets=starts, initial=0)

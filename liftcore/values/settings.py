@@ -488,7 +488,7 @@ class LiftSettings(PlainModel):
 
     @classmethod
     def of(cls, /, **values: Any) -> Self:
-        """Settings from keyword arguments, of which texts may stand for numbers, as on a command line.
+        """Return settings from keyword arguments; texts may stand for numbers, as on a command line.
 
         Raises:
             InvalidSettings: an unknown name or a value out of range.
@@ -533,7 +533,7 @@ class LiftSettings(PlainModel):
 
     @classmethod
     def of_json(cls, values: Mapping[str, Any]) -> Self:
-        """Settings from JSON, where a number is a number and a boolean no number.
+        """Return settings from JSON, where a boolean is no number.
 
         Raises:
             InvalidSettings: an unknown name, or a value of another type or out of range.

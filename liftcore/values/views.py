@@ -77,7 +77,7 @@ class Regions:
         *,
         context: str = "",
     ) -> Self:
-        """Regions of masks that may overlap, as SAM gives them, with a vector each.
+        """Return regions of masks that may overlap, as those of SAM, with a vector each.
 
         A pixel under several masks has a label of each, on a level of its own: it reads all their vectors, and none
         of them is lost. An empty mask is on no pixel.
@@ -125,7 +125,7 @@ class Regions:
 
     @classmethod
     def unchecked(cls, labels: Tensor, codebook: Tensor) -> Self:
-        """Regions of tensors that are right by how they were made."""
+        """Return regions of tensors that are valid by construction."""
         instance = object.__new__(cls)
         object.__setattr__(instance, "labels", labels)
         object.__setattr__(instance, "codebook", codebook)

@@ -361,7 +361,7 @@ class Truth:
     phrases: tuple[str, ...]  # phrases to query
 
     def mask_of(self, phrase: str, view: str) -> np.ndarray | None:
-        """[H, W] bool, where the phrase's objects are; None when the phrase or the view has no truth."""
+        """Return [H, W] bool, True at the phrase's objects; None if the phrase or the view has no truth."""
         names = self.objects_of_phrases.get(_bare(phrase))
         if names is None or view not in self.masks:
             return None

@@ -101,8 +101,9 @@ def tagged_answer(
 def binary_response(
     deps: AppState, worker_request: dict[str, Any], lift: LiftRecord, ask: Ask, headers: dict[str, str]
 ) -> Response:
-    """The answer itself. What is large the query process writes to a draft, so that no client, however slowly it
-    reads, keeps it in memory.
+    """Run a request in the query process and return its bytes.
+
+    Large answers are streamed from a file, so that slow clients keep none in memory.
     """
     files, name, size = deps.store.files, None, 0
     match worker_request["operation"]:
@@ -131,7 +132,7 @@ def binary_response(
 
 
 def find_lift(lift: str | None, deps: AppState) -> LiftRecord:
-    """The lift that is meant; left out, the only one."""
+    """Return the lift of an id; the only lift if it is left out."""
     return deps.store.lifts.only(deps.owner) if lift is None else deps.store.lifts.get(deps.owner, lift)
 
 
@@ -155,7 +156,7 @@ def scene_request(operation: str, lift: LiftRecord, deps: AppState) -> dict[str,
 
 
 def query_request(operation: str, parameters: models.Question, lift: LiftRecord, deps: AppState) -> dict[str, Any]:
-    """The same with a query; texts bring their encoder, and examples of regions the lift's feature packs."""
+    """Return the worker's request of a query, with the encoder of its texts and the packs of its regions."""
     request: dict[str, Any] = scene_request(operation, lift, deps)
     selection_ids = [
         str(item).removeprefix(SELECTION)
@@ -180,12 +181,12 @@ def _selects(example: object) -> bool:
 
 
 def bits_of(bits: bytes) -> str:
-    """The splats of a selection, as the query process takes them."""
+    """Return the splats of a selection for the query process."""
     return base64.b64encode(bits).decode()
 
 
 def seen_from(parameters: models.Viewpoint) -> dict[str, Any]:
-    """The camera of a picture: a view of the lift, or one of the client's own.
+    """Return the camera of a picture: a view of the lift, or a camera of the request.
 
     Raises:
         InvalidRequest: neither is there, or both are.
@@ -197,7 +198,7 @@ def seen_from(parameters: models.Viewpoint) -> dict[str, Any]:
 
 
 def with_packs(request: dict[str, Any], lift: LiftRecord, deps: AppState, argument: str) -> dict[str, Any]:
-    """The request with the lift's feature packs, which have its regions.
+    """Add the lift's feature packs, which have its regions, to a request.
 
     Raises:
         InvalidRequest: they are not all here.
@@ -218,7 +219,7 @@ def _with_packs_here(request: dict[str, Any], lift: LiftRecord, deps: AppState) 
 def with_encoder(
     request: dict[str, Any], parameters: models.LiftQuestion | models.NodesRequest, lift: LiftRecord, deps: AppState
 ) -> dict[str, Any]:
-    """The request with the encoder of its words: an uploaded table, the lift's, or one of the operator.
+    """Add the encoder of its words to a request: an uploaded table, the lift's, or one of the operator.
 
     Raises:
         InvalidRequest: there is none of the lift's space, or of two names.
@@ -334,7 +335,7 @@ def query_splats(parameters: Question, request: Request, deps: Deps, ask: Ask, w
 
 @get_and_post(router, "/render", PICTURE, responses=PNG, response_class=Response)
 def render(parameters: RenderRequest, request: Request, deps: Deps, ask: Ask) -> Response:
-    """The splats from a view, in their colours or in those of their features or clusters, or their depth: a PNG.
+    """Render a view: colours of splats, of their features or of clusters, or depth, as a PNG.
 
     Depths are those of the splats' centres along the camera's axis, weighted as the colours are. They are grey, near
     bright. The PNG's texts `depth-near` and `depth-far` have the depths of its levels 255 and 1 (1st and 99th
@@ -377,7 +378,7 @@ def _answer_links(parameters: Question, lift: LiftRecord, view: str | None, *, h
 
 
 def example_text(example: str | tuple[float, ...]) -> str:
-    """An example as an answer names it."""
+    """Return the text of an example in answers."""
     return example if isinstance(example, str) else f"a vector of {len(example)} channels"
 
 
@@ -404,14 +405,14 @@ def segment(parameters: SegmentRequest, deps: Deps, ask: Ask) -> Response:
 
 @router.post("/query/segment/labels", responses=NPY, response_class=Response)
 def segment_labels(parameters: SegmentRequest, deps: Deps, ask: Ask) -> Response:
-    """The value of every splat's word, 0 for none: .npy, int32 [P]."""
+    """Return the value of every splat's word, 0 for none: .npy, int32 [P]."""
     lift = find_lift(parameters.lift, deps)
     return binary_response(deps, _word_request("word_labels", parameters, lift, deps), lift, ask, {})
 
 
 @router.post("/query/segment/map", responses=PNG, response_class=Response)
 def segment_map(parameters: SegmentRequest, deps: Deps, ask: Ask) -> Response:
-    """The values of a view's pixels in colours, with a palette: a PNG whose text `legend` has the words by value."""
+    """Return the word values of a view's pixels: a PNG with a palette, whose text `legend` has the words by value."""
     lift = find_lift(parameters.lift, deps)
     return binary_response(
         deps, _word_request("word_map", parameters, lift, deps) | seen_from(parameters), lift, ask, {}
@@ -420,7 +421,7 @@ def segment_map(parameters: SegmentRequest, deps: Deps, ask: Ask) -> Response:
 
 @router.post("/query/segment/picture", responses=PNG, response_class=Response)
 def segment_picture(parameters: SegmentRequest, deps: Deps, ask: Ask) -> Response:
-    """A view tinted with the colours of its words, beside a drawn legend: a PNG."""
+    """Render a view tinted with the colours of its words, with a legend: a PNG."""
     lift = find_lift(parameters.lift, deps)
     return binary_response(
         deps, _word_request("word_picture", parameters, lift, deps) | seen_from(parameters), lift, ask, {}
@@ -429,7 +430,7 @@ def segment_picture(parameters: SegmentRequest, deps: Deps, ask: Ask) -> Respons
 
 @router.post("/query/export", responses=bytes_of("application/zip"), response_class=Response)
 def export(parameters: ExportRequest, deps: Deps, ask: Ask) -> Response:
-    """All of it in one ZIP: splats with labels, names, colours, boxes and counts, and masks of the views.
+    """Return one ZIP: splats with labels, names, colours, boxes and counts, and masks of the views.
 
     It holds `labels.ply`, `labels.json`, `instances.csv`, `legend.png`, `masks/VIEW.png`, `masks.json` (COCO) and
     `truth.safetensors` (masks for a trade-off).
@@ -455,7 +456,7 @@ def export(parameters: ExportRequest, deps: Deps, ask: Ask) -> Response:
 
 
 def _by_name(questions: list[models.NamedQuestion]) -> dict[str, models.NamedQuestion]:
-    """Questions by what files call them; one whose name another has gets a number."""
+    """Return queries by their names in files; a repeated name gets a number."""
     by_name = dict[str, models.NamedQuestion]()
     for question in questions:
         name = first = question.name or ", ".join(map(example_text, (*question.text, *question.like, *question.sets)))

@@ -33,7 +33,7 @@ router = APIRouter(tags=["selections"], route_class=JsonRoute)
 
 @router.get("/lifts/{lift}/selections", response_model=models.Selections)
 def list_selections(lift: str, deps: Deps) -> models.Selections:
-    """The selections of a lift, newest first."""
+    """List the selections of a lift, newest first."""
     record = deps.store.lifts.get(deps.owner, lift)
     selections = deps.store.selections.all(deps.owner, record.id)
     return models.Selections(selections=[_summary(selection) for selection in selections])
@@ -55,7 +55,7 @@ def get_selection(
     deps: Deps,
     bits: Annotated[bool, Query(description="with its splats, a bit for each of the lift's")] = False,
 ) -> Response:
-    """One selection: what it holds, and the steps that made it."""
+    """Return one selection: its content, and the steps of its history."""
     record = deps.store.lifts.get(deps.owner, lift)
     return _answer(deps.store.selections.get(deps.owner, record.id, selection), deps, bits=bits)
 
@@ -114,7 +114,7 @@ def change_object_label(
 def _apply_edit(
     parameters: models.EditRequest | None, lift: LiftRecord, deps: AppState, ask: Ask, before: bytes
 ) -> SplatSet:
-    """The splats after an edit of those before, by the query process; without one those."""
+    """Apply an edit to a selection in the query process; without an edit, return it as it is."""
     if parameters is None:
         return SplatSet({"operation": "set"}, 0, None, before)
     if parameters.query is None:
@@ -134,7 +134,7 @@ def _apply_edit(
 
 
 def _versions(match: str | None) -> frozenset[int] | None:
-    """The versions that an If-Match names; None for any."""
+    """Return the versions of an If-Match; None for any."""
     if match is None or match.strip() == "*":
         return None
     return frozenset(int(digits) for digits in re.findall(r'"(\d{1,15})"', match))

@@ -83,31 +83,31 @@ class Job:
         return -(-self.splats // self.rows)
 
     def view_file(self, number: int) -> Path:
-        """The file of a view's codebook and sampled rays; ``number`` is of the view."""
+        """Return the file of a view's codebook and sampled rays; ``number`` is of the view."""
         return self.folder / f"view-{number:05}.safetensors"
 
     def weights_file(self, piece: int) -> Path:
-        """The file of W of a piece of views."""
+        """Return the file of W of a piece of views."""
         return self.piece_file("weights", piece)
 
     def views_of(self, piece: int) -> range:
-        """The numbers of the views of a piece."""
+        """Return the numbers of the views of a piece."""
         return range(PIECE_VIEWS * piece, min(PIECE_VIEWS * (piece + 1), len(self.names)))
 
     def piece_file(self, step: str, number: int) -> Path:
-        """The file of a step of that piece."""
+        """Return the file of a step of that piece."""
         return self.folder / f"{step}-{number:05}.safetensors"
 
     def solved_file(self, number: int) -> Path:
-        """The file of X of a block of splats from the solve, before splats take features of clusters."""
+        """Return the file of X of a block of splats from the solve, before splats take features of clusters."""
         return self.piece_file("solved", number) if self.clusters else self.features_file(number)
 
     def features_file(self, number: int) -> Path:
-        """The file of the final X of a block of splats."""
+        """Return the file of the final X of a block of splats."""
         return self.folder / "lift" / features_file(number)
 
     def columns_file(self, number: int) -> Path:
-        """The file of the other columns of these splats."""
+        """Return the file of the other columns of these splats."""
         return self.folder / f"columns-{number:05}.safetensors"
 
 
@@ -182,7 +182,7 @@ def _weigh_views(job: Job, numbers: list[int], threads: int | None) -> None:
 
 
 def _entries_file(job: Job, number: int) -> Path:
-    """The file of W of a view, until W of its piece is written."""
+    """Return the file of W of a view, which exists until W of its piece is written."""
     return job.piece_file("entries", number)
 
 
