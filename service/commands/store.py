@@ -24,7 +24,7 @@ LOST_FILES_HINT = (
 def add_arguments(parser: Parser, shared: Parser) -> None:
     """Add the options of the command."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=Parser)
-    rebuild = actions.add_parser("rebuild", parents=[shared], help="rows for files that the database does not know")
+    rebuild = actions.add_parser("rebuild", parents=[shared], help="rebuild rows of files that the database lacks")
     backup = actions.add_parser("backup", parents=[shared], help="copy a data directory, beside a server that runs")
     backup.add_argument("directory", type=Path, metavar="DIR", help="the backup, which is not there yet")
     restore = actions.add_parser("restore", parents=[shared], help="make a data directory of a backup")
