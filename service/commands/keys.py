@@ -37,9 +37,9 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
     """Add the options of the command."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=Parser)
     create = actions.add_parser("create", parents=[shared], help="make a key and show it, once")
-    create.add_argument("--name", required=True, metavar="NAME", help="whose it is, or what for")
-    create.add_argument("--scopes", metavar="SCOPES", help="read,write,metrics,admin: what it may do")
-    create.add_argument("--lifts", metavar="IDS", help="in place of scopes: the only lifts that it may read and query")
+    create.add_argument("--name", required=True, metavar="NAME", help="its owner or purpose")
+    create.add_argument("--scopes", metavar="SCOPES", help="its rights: read,write,metrics,admin")
+    create.add_argument("--lifts", metavar="IDS", help="in place of scopes: lifts that it may read and query")
     create.add_argument("--expires", metavar="WHEN", help="after 30d, 12h or 90m, or at a date (UTC); else never")
     for name, limit in QUOTAS.items():
         option = f"--{name.replace('_', '-')}"
