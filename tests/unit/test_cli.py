@@ -1,4 +1,4 @@
-"""The command line: one JSON object or one line of error, and the exit status says whose fault it was."""
+"""The command line: one JSON object or one line of error; the exit status is 2 for wrong input, 1 for our faults."""
 
 from __future__ import annotations
 
@@ -56,9 +56,9 @@ def test_scene_is_lifted_inspected_and_queried(scene: Path, capsys: pytest.Captu
     words = '["left", "right"]'
     save_file({"embeddings": torch.eye(2, 3)}, str(scene / "table"), metadata={"words": words})
     files = {kind: scene / name for kind, name in (("mask", "m.png"), ("attention", "a.png"), ("scores", "s.npy"))}
-    written = [part for kind, path in files.items() for part in (f"--{kind}", path)]
+    options = [part for kind, path in files.items() for part in (f"--{kind}", path)]
     question = ["query", scene / "lift.safetensors", "left", "--table", scene / "table", "--threshold", "0.5"]
-    status, out, err = run(capsys, *question, "--view", "front", "--top", 1, "--json", *written)
+    status, out, err = run(capsys, *question, "--view", "front", "--top", 1, "--json", *options)
     assert (status, err) == (0, "")
     document = json.loads(out)
     assert document["selected"] == 1
@@ -76,12 +76,9 @@ def test_scene_is_lifted_inspected_and_queried(scene: Path, capsys: pytest.Captu
     assert re.search(r"  splat 0: score \S+ at \(\S+, \S+, \S+\)\n  splat 1: ", out)
     assert "\n  object 1: 1 splats, 100.0% of the selection, score 0.9" in out and "in no object" not in out
     status, out, err = run(capsys, *question, "--objects", "--json")
-    (thing,) = json.loads(out)["objects"]
-    assert (
-        thing["splats"] == 1
-        and thing["box"] == [thing["centre"]] * 2
-        and json.loads(out)["answer"]["unassigned_splats"] == 0
-    )
+    (obj,) = json.loads(out)["objects"]
+    assert obj["splats"] == 1 and obj["box"] == [obj["centre"]] * 2
+    assert json.loads(out)["answer"]["unassigned_splats"] == 0
     status, out, err = run(capsys, "inspect", scene / "lift.safetensors", "--json")
     assert json.loads(out)["kind"] == "lift"
     diagnostics, timings = run(capsys, *lift_arguments(scene, "--verbose"))[1].split("timings:\n")
@@ -94,7 +91,7 @@ def test_scene_is_lifted_inspected_and_queried(scene: Path, capsys: pytest.Captu
 
 
 @pytest.mark.parametrize(
-    ("more", "message"),
+    ("options", "message"),
     [
         (["--set", "power=3"], "power"),
         (["--set", "nonsense=1"], "--set: expected a setting of a lift, got the unknown 'nonsense'; nearest: "),
@@ -107,21 +104,21 @@ def test_scene_is_lifted_inspected_and_queried(scene: Path, capsys: pytest.Captu
     ],
 )
 def test_wrong_settings_exit_2_with_one_line(
-    more: list[str], message: str, scene: Path, capsys: pytest.CaptureFixture[str]
+    options: list[str], message: str, scene: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    status, out, err = run(capsys, *lift_arguments(scene, *(text.format(scene=scene) for text in more), "--json"))
+    status, out, err = run(capsys, *lift_arguments(scene, *(text.format(scene=scene) for text in options), "--json"))
     assert (status, out) == (2, "")
     assert message in err
     assert_one_line(err)
     assert not (scene / "lift.safetensors").exists()
 
 
-def test_files_in_each_others_place_are_told_as_that(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_files_in_each_others_place_are_named_in_the_error(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
     splats, cameras, pack, maps = (
         scene / name for name in ("splats.ply", "cameras.json", "pack.safetensors", "maps")
     )
     maps.mkdir()
-    for arguments, told in (
+    for arguments, message in (
         (["plan", cameras, splats, pack], "splats as SPLATS, got cameras; the order is SPLATS CAMERAS FEATURES"),
         (["plan", splats, pack, cameras], "pack.safetensors: expected cameras as CAMERAS, got features"),
         (["plan", splats, cameras, cameras], "cameras.json: expected features as FEATURES, got cameras"),
@@ -130,17 +127,17 @@ def test_files_in_each_others_place_are_told_as_that(scene: Path, capsys: pytest
         (["query", scene / "none", "word", "--splats", pack], "expected splats as --splats, got features"),
     ):
         status, out, err = run(capsys, *arguments)
-        assert (status, out) == (2, "") and told in err
+        assert (status, out) == (2, "") and message in err
         assert_one_line(err)
 
 
 def test_a_lift_takes_its_files_as_texts_and_its_packs_as_a_list(scene: Path) -> None:
     files = [str(scene / name) for name in ("splats.ply", "cameras.json", "pack.safetensors")]
-    made = lift_files(files[0], files[1], files[2:], LiftSettings.of())
-    assert made.metadata.splats.path == str((scene / "splats.ply").resolve())
-    for alone in (files[2], scene / "pack.safetensors"):
+    lift = lift_files(files[0], files[1], files[2:], LiftSettings.of())
+    assert lift.metadata.splats.path == str((scene / "splats.ply").resolve())
+    for single in (files[2], scene / "pack.safetensors"):
         with pytest.raises(InvalidFeatures, match="a list of feature packs"):
-            lift_files(files[0], files[1], alone, LiftSettings.of())  # pyright: ignore[reportArgumentType]
+            lift_files(files[0], files[1], single, LiftSettings.of())  # pyright: ignore[reportArgumentType]
 
 
 def test_settings_are_json_or_words() -> None:
@@ -173,10 +170,10 @@ def test_inspect_speaks_to_people_and_programs(
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_help_and_names_its_choices(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     status, out, err = run(capsys, command, "--help")
-    said = " ".join(out.split())
-    assert (status, err) == (0, "") and f"splatlift {command}" in said
-    assert command not in ("query", "evaluate") or f"{', '.join(METHODS)} or a number" in said
-    assert command not in ("lift", "plan") or all(preset in said for preset in Preset)
+    text = " ".join(out.split())
+    assert (status, err) == (0, "") and f"splatlift {command}" in text
+    assert command not in ("query", "evaluate") or f"{', '.join(METHODS)} or a number" in text
+    assert command not in ("lift", "plan") or all(preset in text for preset in Preset)
 
 
 @pytest.mark.parametrize(
@@ -217,8 +214,8 @@ def test_closed_pipe_is_no_complaint(scene: Path) -> None:
     os.close(read_end)
     command = [sys.executable, "-m", "liftcore.cli", "inspect", str(scene / "splats.ply")]
     with os.fdopen(write_end, "wb") as closed:
-        done = subprocess.run(command, check=False, stdout=closed, stderr=subprocess.PIPE)
-    assert done.stderr == b""
+        process = subprocess.run(command, check=False, stdout=closed, stderr=subprocess.PIPE)
+    assert process.stderr == b""
 
 
 def test_replies_are_strict_json_and_errors_one_line(capsys: pytest.CaptureFixture[str]) -> None:
@@ -231,28 +228,29 @@ def test_replies_are_strict_json_and_errors_one_line(capsys: pytest.CaptureFixtu
 def test_progress_is_drawn_only_on_a_terminal(
     scene: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for watched in (False, True):
-        monkeypatch.setattr(sys.stderr, "isatty", lambda watched=watched: watched)
+    for is_terminal in (False, True):
+        monkeypatch.setattr(sys.stderr, "isatty", lambda is_terminal=is_terminal: is_terminal)
         with progress_bars() as progress:
             progress("compile", 0, 1, "steps")
-            assert ("compile:   0%" in capsys.readouterr().err) is watched
+            assert ("compile:   0%" in capsys.readouterr().err) is is_terminal
             progress("compile", 1, 1, "steps")
-            assert capsys.readouterr().err.endswith("\r") is watched  # an empty line, before anything else is said
-            for done in range(4):
-                progress("geometry", done, 3, "views")
+            # An empty line, before other output.
+            assert capsys.readouterr().err.endswith("\r") is is_terminal
+            for count in range(4):
+                progress("geometry", count, 3, "views")
         captured = capsys.readouterr()
         assert captured.out == ""
-        assert ("geometry" in captured.err) is watched
-        assert captured.err.endswith("\n") is watched
+        assert ("geometry" in captured.err) is is_terminal
+        assert captured.err.endswith("\n") is is_terminal
     assert "save:   0%" in run(capsys, *lift_arguments(scene, "--json"))[2]
 
 
 @pytest.fixture
 def little_memory(monkeypatch: pytest.MonkeyPatch) -> str:
-    """What a machine has to say whose memory is short."""
-    told = "the rest of the lift may take 9.0 GiB and 1.0 GiB are free"
-    monkeypatch.setattr("liftcore.lifting.planning.plan.check_memory", lambda parts, free: [told])
-    return told
+    """The warning of a plan on a machine with too little memory."""
+    warning = "the rest of the lift may take 9.0 GiB and 1.0 GiB are free"
+    monkeypatch.setattr("liftcore.lifting.planning.plan.check_memory", lambda parts, free: [warning])
+    return warning
 
 
 def test_plan_is_printed_alone_and_before_a_lift_and_kept_with_it(
@@ -268,12 +266,12 @@ def test_plan_is_printed_alone_and_before_a_lift_and_kept_with_it(
     status, out, _ = run(capsys, *arguments, "--explain", "--speed", "draft", "--set", "stride=1")
     summary = "plan: 2 splats (3dgs), 100.0% in some view's field; 1 of 1 views"
     assert status == 0 and out.startswith(f"{summary}\n")
-    made = load_lift(scene / "lift.safetensors").metadata
-    assert (made.settings.speed, made.settings.stride, made.settings.view_cosine) == ("draft", 1, 0.98)
-    assert made.diagnostics["plan"]["memory_bytes"] == plan["memory_bytes"]
+    metadata = load_lift(scene / "lift.safetensors").metadata
+    assert (metadata.settings.speed, metadata.settings.stride, metadata.settings.view_cosine) == ("draft", 1, 0.98)
+    assert metadata.diagnostics["plan"]["memory_bytes"] == plan["memory_bytes"]
     status, out, err = run(capsys, *arguments)
-    told, _, rest = out.partition(f"{scene / 'lift.safetensors'}: ")
-    first, channels, memory, warning = told.splitlines()
+    plan_text, _, rest = out.partition(f"{scene / 'lift.safetensors'}: ")
+    first, channels, memory, warning = plan_text.splitlines()
     assert (status, err, first, channels) == (0, "", summary, "  3 channels, stored as float16")
     assert memory.startswith("  about ") and " MiB at the peak, on " in memory
     assert warning == f"warning: {little_memory}" and little_memory not in rest
@@ -287,8 +285,8 @@ def test_plan_is_printed_alone_and_before_a_lift_and_kept_with_it(
 def test_what_the_plan_warned_of_is_said_once(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
     square = FeatureGrid(torch.ones(16, 16, 3))
     write_pack(scene / "pack.safetensors", {"front": square}, {"encoder": "toy", "text_space": "none"})
-    for more in (["--explain"], []):
-        assert run(capsys, *lift_arguments(scene), *more)[1].count("maps of another aspect") == 1
+    for options in (["--explain"], []):
+        assert run(capsys, *lift_arguments(scene), *options)[1].count("maps of another aspect") == 1
     document = json.loads(run(capsys, *lift_arguments(scene), "--explain", "--json")[1])
     assert sum("maps of another aspect" in warning for warning in document["warnings"]) == 1
 
@@ -308,9 +306,9 @@ def test_commands_and_the_page_of_a_missing_service_say_what_to_install(
 
 
 def test_a_second_lift_of_a_checkpoint_gives_the_same_bits(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    kept, features = scene / "kept" / "here", []
+    checkpoint, features = scene / "kept" / "here", []
     for _ in range(2):
-        assert run(capsys, *lift_arguments(scene, "--checkpoint", kept, "--device", "cpu"))[0] == 0
+        assert run(capsys, *lift_arguments(scene, "--checkpoint", checkpoint, "--device", "cpu"))[0] == 0
         features.append(load_lift(scene / "lift.safetensors").features.clone())
-        assert list(kept.glob("*.safetensors"))
+        assert list(checkpoint.glob("*.safetensors"))
     assert torch.equal(*features)

@@ -1,4 +1,4 @@
-"""``splatlift encode`` from photos to a lift that words can be asked of, with weights that know nothing."""
+"""``splatlift encode`` from photos to a lift that can be queried by words, with random weights."""
 
 from __future__ import annotations
 
@@ -83,17 +83,17 @@ def test_masks_get_vectors_of_their_crops(
     np.save(masks / "left_masks.npy", planes)
     Image.fromarray(ids).save(masks / "middle.png")
     np.save(masks / "right_masks.npy", np.pad(np.full((4, 4), 1, np.uint8), 10))  # ids: 0 around, and 1
-    asked = ["pack", "masks", masks, "-o", pack, "--unlabelled", 255]
-    asked += ["--encoder", f"open_clip:ViT-S-32-alt@{weights}"]
-    status, out, err = run(capsys, *asked, "--photos", photos, "--json")
+    command = ["pack", "masks", masks, "-o", pack, "--unlabelled", 255]
+    command += ["--encoder", f"open_clip:ViT-S-32-alt@{weights}"]
+    status, out, err = run(capsys, *command, "--photos", photos, "--json")
     assert (status, err) == (0, "")
     document = json.loads(out)
     assert (document["views"], document["channels"], document["normalised"]) == (3, 256, True)
     assert document["text_space"] == f"open_clip:ViT-S-32-alt@{weights}" and "crops of masks" in document["encoder"]
     import open_clip
 
-    made: Any = open_clip.create_model_and_transforms("ViT-S-32-alt", pretrained=str(weights))
-    model, _, prepare = made
+    model_and_transforms: Any = open_clip.create_model_and_transforms("ViT-S-32-alt", pretrained=str(weights))
+    model, _, prepare = model_and_transforms
     model.eval()
     packs = read_features(pack)
     for view, suffix, number, inside in [
@@ -101,34 +101,36 @@ def test_masks_get_vectors_of_their_crops(
         ("middle", "jpg", 0, ids == 0),
     ]:
         with Image.open(photos / f"{view}.{suffix}") as photo:
-            alone = np.where(inside[..., None], np.asarray(photo.convert("RGB")), 0)
+            masked_photo = np.where(inside[..., None], np.asarray(photo.convert("RGB")), 0)
         rows, columns = np.flatnonzero(inside.any(1)), np.flatnonzero(inside.any(0))
-        crop = Image.fromarray(alone[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1])
+        crop = Image.fromarray(masked_photo[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1])
         with torch.no_grad():
             vector = model.encode_image(prepare(ImageOps.pad(crop, (224, 224)))[None])[0]
-        own = packs[view].codebook[number].float()
-        assert torch.allclose(own, torch.nn.functional.normalize(vector, dim=0), atol=2e-3)
+        actual = packs[view].codebook[number].float()
+        assert torch.allclose(actual, torch.nn.functional.normalize(vector, dim=0), atol=2e-3)
     tagged, exif = tmp_path / "tagged", Image.Exif()
     tagged.mkdir()
     exif[ExifTags.Base.Orientation] = 6  # of photos whose masks and cameras are of stored pixels
     for path in photos.iterdir():
         with Image.open(path) as photo:
             photo.save(tagged / f"{path.stem}.png", exif=exif)
-    status, out, _ = run(capsys, *asked[:4], tmp_path / "again.safetensors", *asked[5:], "--photos", tagged, "--json")
+    status, out, _ = run(
+        capsys, *command[:4], tmp_path / "again.safetensors", *command[5:], "--photos", tagged, "--json"
+    )
     assert status == 0 and "3 of 3 photos (" in json.loads(out)["warnings"][0]
-    again = read_features(tmp_path / "again.safetensors")
-    assert all(torch.equal(again[view].codebook, packs[view].codebook) for view in ("left", "right"))
-    for more, message in (
-        (asked, "--photos"),
-        ([*asked, "--photos", photos / "right.png"], "a photo with the name of each view"),
-        ([*asked[:-2], "--photos", photos], "--encoder"),
-        ([*asked, "--photos", photos, "--no-normalised"], "--no-normalised"),
-        ([*asked[:-1], "timm:resnet18", "--photos", photos], "open_clip:MODEL/TAG"),
+    tagged_pack = read_features(tmp_path / "again.safetensors")
+    assert all(torch.equal(tagged_pack[view].codebook, packs[view].codebook) for view in ("left", "right"))
+    for arguments, message in (
+        (command, "--photos"),
+        ([*command, "--photos", photos / "right.png"], "a photo with the name of each view"),
+        ([*command[:-2], "--photos", photos], "--encoder"),
+        ([*command, "--photos", photos, "--no-normalised"], "--no-normalised"),
+        ([*command[:-1], "timm:resnet18", "--photos", photos], "open_clip:MODEL/TAG"),
     ):
-        status, _, err = run(capsys, *more)
+        status, _, err = run(capsys, *arguments)
         assert status == 2 and message in err
     np.save(masks / "left.npy", np.ones((3, 4), np.float32))
-    assert "without vectors" in run(capsys, *asked, "--photos", photos)[2]
+    assert "without vectors" in run(capsys, *command, "--photos", photos)[2]
 
 
 def test_backbones_without_words_say_so(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -146,7 +148,7 @@ def test_backbones_without_words_say_so(photos: Path, tmp_path: Path, capsys: py
 
 
 @pytest.mark.parametrize(
-    ("more", "message"),
+    ("options", "message"),
     [
         (["--encoder", "maskclip:ViT-B-32"], "tag or a file"),
         (["--encoder", "magic"], "one of maskclip"),
@@ -158,10 +160,10 @@ def test_backbones_without_words_say_so(photos: Path, tmp_path: Path, capsys: py
     ],
 )
 def test_what_cannot_be_encoded_exits_2_with_one_line(
-    more: list[str], message: str, photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    options: list[str], message: str, photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = [text.format(photos=photos) for text in more]
-    status, out, err = run(capsys, "encode", photos, "-o", tmp_path / "pack.safetensors", *given)
+    arguments = [text.format(photos=photos) for text in options]
+    status, out, err = run(capsys, "encode", photos, "-o", tmp_path / "pack.safetensors", *arguments)
     assert (status, out) == (2, "")
     assert message in err
     assert_one_line(err)

@@ -1,4 +1,4 @@
-"""``splatlift evaluate`` on labels in the layouts of LeRF-OVS and 3D-OVS: a lift that is right scores near one."""
+"""``splatlift evaluate`` on labels in the layouts of LeRF-OVS and 3D-OVS: a correct lift scores near one."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from .command_line import run
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A lift and both kinds of labels; tests only read them."""
-    made = tmp_path_factory.mktemp("evaluate")
-    write_lift(made)
-    write_lerf_labels(made)
-    write_3d_ovs_labels(made)
-    save_file({"embeddings": torch.eye(4)}, str(made / "other.table"), metadata={"words": '["a", "b", "c", "d"]'})
-    return made
+    path = tmp_path_factory.mktemp("evaluate")
+    write_lift(path)
+    write_lerf_labels(path)
+    write_3d_ovs_labels(path)
+    save_file({"embeddings": torch.eye(4)}, str(path / "other.table"), metadata={"words": '["a", "b", "c", "d"]'})
+    return path
 
 
 def evaluate(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
@@ -51,16 +51,16 @@ def test_a_right_lift_scores_near_one_in_every_protocol_of_lerf_ovs(
     assert [row["protocol"] for row in document["measured"]] == ["P1", "P2", "P3", "own"]
     for row in document["measured"]:
         assert row["scene"] == "kitchen" and row["frames"] == list(FRAMES) and row["lifted_frames"] == [LIFTED]
-        found = row["means"]["all labelled"]
-        assert (found["frames"], found["objects"]) == (2, 4)
-        assert min(found["object_micro"], found["frame_macro"], found["class_pooled"]) > 0.9
-        assert (found["accuracy_25"], found["accuracy_50"]) == (1, 1)
-        assert found["localised"] == (None if row["protocol"] in ("P2", "own") else 1)
+        means = row["means"]["all labelled"]
+        assert (means["frames"], means["objects"]) == (2, 4)
+        assert min(means["object_micro"], means["frame_macro"], means["class_pooled"]) > 0.9
+        assert (means["accuracy_25"], means["accuracy_50"]) == (1, 1)
+        assert means["localised"] == (None if row["protocol"] in ("P2", "own") else 1)
         assert row["means"]["held out"]["frames"] == 1
-        assert {thing["lifted"] for thing in row["objects"] if thing["view"] == LIFTED} == {True}
+        assert {obj["lifted"] for obj in row["objects"] if obj["view"] == LIFTED} == {True}
         assert row["classes"].keys() == {"red apple", "book"}
         mean = document["mean_of_scenes"][row["protocol"]]
-        assert mean["all labelled"]["object_micro"] == found["object_micro"]
+        assert mean["all labelled"]["object_micro"] == means["object_micro"]
     assert document["warnings"] == [f"kitchen: 1 of 2 judged frames were lifted: {LIFTED}"]
     assert document["settings"]["threshold"] == "auto"
 
@@ -83,11 +83,11 @@ def test_3d_ovs_pools_the_pixels_of_a_class(folder: Path, capsys: pytest.Capture
     (row,) = document["measured"]
     assert row["classes"].keys() == {"red apple", "book"}  # the unicorn is nowhere
     for name, pooled in row["classes"].items():
-        things = [thing for thing in row["objects"] if thing["category"] == name]
-        assert pooled == sum(t["intersection"] for t in things) / sum(t["union"] for t in things) > 0.9
-    found = row["means"]["all labelled"]
-    assert found["class_pooled"] == pytest.approx(sum(row["classes"].values()) / 2)
-    assert found["objects"] == 4
+        objects = [obj for obj in row["objects"] if obj["category"] == name]
+        assert pooled == sum(t["intersection"] for t in objects) / sum(t["union"] for t in objects) > 0.9
+    means = row["means"]["all labelled"]
+    assert means["class_pooled"] == pytest.approx(sum(row["classes"].values()) / 2)
+    assert means["objects"] == 4
     assert any("unicorn" in warning for warning in document["warnings"])
 
 
@@ -118,7 +118,8 @@ def test_categories_that_a_table_lacks_are_left_out_and_none_at_all_are_named(
     options = ["--data", folder / "lerf_ovs", "--table", few, "--protocol", "P3"]
     document = evaluate(capsys, "lerf-ovs", lift, *options)
     (row,) = document["measured"]
-    assert len(row["classes"]) == 1 and any("lacks" in told and "left out" in told for told in document["warnings"])
+    assert len(row["classes"]) == 1
+    assert any("lacks" in warning and "left out" in warning for warning in document["warnings"])
     assert not any(row["scenes"] for row in document["published"])  # kitchen is none of the papers' scenes
     (tmp_path / "frame_00001.json").write_text(json.dumps(isat([("griffin", rectangle(0, 0, 9, 9))])))
     status, _, err = run(capsys, "evaluate", "lerf-ovs", lift, "--data", tmp_path)
@@ -143,8 +144,8 @@ def test_published_rows_stand_beside_and_never_in_a_mean(
     assert set(kinds) == {"measured", "published", "warning:"} and kinds == sorted(kinds)
     measured = [line for line in lines if line.startswith("measured")]
     assert all(" P3 " in line for line in measured)
-    ours = next(line for line in lines if "62.3" in line)
-    assert ours.split()[:5] == ["published", "P3", "mIoU", "62.3", "Splat"]
+    published_line = next(line for line in lines if "62.3" in line)
+    assert published_line.split()[:5] == ["published", "P3", "mIoU", "62.3", "Splat"]
 
 
 def test_frames_without_cameras_or_objects_are_named(
@@ -166,7 +167,7 @@ def test_frames_without_cameras_or_objects_are_named(
 
 
 @pytest.mark.parametrize(
-    ("more", "message"),
+    ("options", "message"),
     [
         (["nothing.safetensors"], "nothing at"),
         (["{folder}/kitchen.lift.safetensors", "kitchen={folder}/kitchen.lift.safetensors"], "one lift a scene"),
@@ -180,10 +181,10 @@ def test_frames_without_cameras_or_objects_are_named(
     ],
 )
 def test_what_cannot_be_judged_exits_2_with_one_line(
-    more: list[str], message: str, folder: Path, capsys: pytest.CaptureFixture[str]
+    options: list[str], message: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = [text.format(folder=folder) for text in more]
-    status, out, err = run(capsys, "evaluate", "lerf-ovs", *given, "--data", folder / "lerf_ovs")
+    arguments = [text.format(folder=folder) for text in options]
+    status, out, err = run(capsys, "evaluate", "lerf-ovs", *arguments, "--data", folder / "lerf_ovs")
     assert (status, out) == (2, "")
     assert message in err and err.count("\n") == 1
 

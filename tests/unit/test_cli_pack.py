@@ -1,4 +1,4 @@
-"""`splatlift pack`: folders of other programs become packs, and what looks wrong in them is said."""
+"""`splatlift pack`: folders of other programs become packs, with warnings about suspicious content."""
 
 from __future__ import annotations
 
@@ -90,11 +90,11 @@ def test_masks_that_do_not_fit_write_nothing(tmp_path: Path, capsys: pytest.Capt
 def test_a_pack_is_named_anew_and_else_kept_to_the_byte(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "maps").mkdir()
     np.save(tmp_path / "maps" / "a.npy", np.arange(60, dtype=np.float32).reshape(3, 4, 5))
-    pack, named = tmp_path / "p.safetensors", tmp_path / "n.safetensors"
+    pack, retagged = tmp_path / "p.safetensors", tmp_path / "n.safetensors"
     assert run(capsys, "pack", "npy", tmp_path / "maps", "-o", pack, "--encoder-name", "toy")[0] == 0
-    status, out, _ = run(capsys, "pack", "retag", pack, "-o", named, "--text-space", "minilm")
+    status, out, _ = run(capsys, "pack", "retag", pack, "-o", retagged, "--text-space", "minilm")
     assert status == 0 and "encoder toy, text space minilm" in out
-    before, after = read_features(pack), read_features(named)
+    before, after = read_features(pack), read_features(retagged)
     assert (before.text_space, after.text_space, after.encoder) == ("", "minilm", "toy")
     assert (after["a"].codebook == before["a"].codebook).all()
     assert re.search("text space +not named", run(capsys, "inspect", pack)[1])
@@ -104,7 +104,7 @@ def test_a_pack_is_named_anew_and_else_kept_to_the_byte(tmp_path: Path, capsys: 
         assert_one_line(err)
 
 
-def test_what_nobody_annotated_or_decided_is_told_and_left_out(
+def test_what_nobody_annotated_or_decided_is_reported_and_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     images = [{"id": k, "file_name": f"{k}.jpg", "width": 4, "height": 3} for k in range(3)]

@@ -1,4 +1,4 @@
-"""``splatlift query``: where its words may stand, what it refuses, and what it writes."""
+"""``splatlift query``: the place of its texts, the queries that it rejects, and the files that it writes."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_the_text_of_a_query_stands_before_between_or_after_options(arguments: l
         (["L", "cat", "--mask", "m.png"], "no --view"),
     ],
 )
-def test_what_a_query_has_no_place_for_is_told(
+def test_what_a_query_has_no_place_for_is_reported(
     arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     status, out, err = run(capsys, "query", *arguments)
@@ -70,7 +70,7 @@ def test_what_a_query_has_no_place_for_is_told(
 
 
 @pytest.mark.parametrize(
-    ("space", "told"),
+    ("space", "message"),
     [
         ("none", "text space is 'none': its"),
         ("", "text space is not recorded"),
@@ -78,14 +78,14 @@ def test_what_a_query_has_no_place_for_is_told(
     ],
 )
 def test_words_to_a_lift_without_a_text_encoder_are_refused_with_its_text_space(
-    space: str, told: str, scene: Path, capsys: pytest.CaptureFixture[str]
+    space: str, message: str, scene: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lift = load_lift(scene / "lift.safetensors")
     lift = replace(lift, metadata=lift.metadata.model_copy(update={"text_space": space}))
     save_lift(lift, scene / "other.safetensors")
     status, out, err = run(capsys, "query", scene / "other.safetensors", "mug")
     assert (status, out) == (2, "")
-    assert told in err and "--like" in err
+    assert message in err and "--like" in err
     assert_one_line(err)
 
 
@@ -121,11 +121,11 @@ def test_overlays_show_what_was_found_and_say_its_share(scene: Path, capsys: pyt
     Image.fromarray(photo).save(scene / "photo.png")
     shares, pictures = [], []
     for number, cut in enumerate((0.5, -1)):  # one of the two splats, and both
-        asked = ["--like", "splat:1", "--threshold", cut, "--view", "front.jpg", "--photo", scene / "photo.png"]
+        options = ["--like", "splat:1", "--threshold", cut, "--view", "front.jpg", "--photo", scene / "photo.png"]
         out = scene / f"{number}.png"
-        status, told, _ = run(capsys, "query", scene / "lift.safetensors", *asked, "--overlay", out, "--json")
+        status, stdout, _ = run(capsys, "query", scene / "lift.safetensors", *options, "--overlay", out, "--json")
         assert status == 0
-        view = json.loads(told)["view"]
+        view = json.loads(stdout)["view"]
         shares.append(view["mask_share"])
         with Image.open(out) as picture:
             pictures.append(np.asarray(picture).astype(int))
@@ -133,18 +133,18 @@ def test_overlays_show_what_was_found_and_say_its_share(scene: Path, capsys: pyt
     assert 0 < shares[0] < shares[1]
     for share, picture in zip(shares, pictures, strict=True):
         assert picture.shape[1] == 32 and picture.shape[0] > 16 and picture[16:].min() < 128  # a caption below
-        shown = picture[:16]
-        tinted, dimmed = shown[..., 0] > 100, shown[..., 0] < 50
+        image = picture[:16]
+        tinted, dimmed = image[..., 0] > 100, image[..., 0] < 50
         assert np.mean(tinted) >= share and np.mean(dimmed) <= 1 - share  # the outline is beside the mask
 
 
 def test_every_term_and_option_is_part_of_the_query(
     scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    asked: list[Query] = []
+    queries: list[Query] = []
 
     def ask(scene: object, query: Query, encoder: object) -> None:
-        asked.append(query)
+        queries.append(query)
         raise KeyboardInterrupt  # what is found is another matter
 
     monkeypatch.setattr("liftcore.query.ask.ask", ask)
@@ -155,12 +155,12 @@ def test_every_term_and_option_is_part_of_the_query(
         ["--instances", "3", "--weight-by", "confidence"],
     ):
         assert run(capsys, *question, *options)[0] == cli.INTERRUPTED
-    told = [(query.threshold, query.keep, query.instances, query.weight_by) for query in asked]
-    plain = "evidence"
-    assert told == [
-        ("auto", "all", None, plain), (0.25, "largest", None, plain), ("auto", "all", 3, "confidence"),
+    choices = [(query.threshold, query.keep, query.instances, query.weight_by) for query in queries]
+    default = "evidence"
+    assert choices == [
+        ("auto", "all", None, default), (0.25, "largest", None, default), ("auto", "all", 3, "confidence"),
     ]  # fmt: skip
-    assert {tuple(map(str, query.terms)) for query in asked} == {("splat:1", "splat:0")}
+    assert {tuple(map(str, query.terms)) for query in queries} == {("splat:1", "splat:0")}
 
 
 def test_what_was_found_is_written_as_splats_and_over_no_input(
@@ -171,20 +171,20 @@ def test_what_was_found_is_written_as_splats_and_over_no_input(
     for name in ("splats.ply", "cameras.json", "pack.safetensors", "lift.safetensors"):
         status, _, err = run(capsys, *question, "--object", scene / name)
         assert status == 2 and ("another file than the inputs" in err or "ending in" in err)
-    nothing = ["--unlike", "splat:1", "--threshold", "1", "--scores", scene / "s.npy", "--object", scene / "o.ply"]
-    status, out, err = run(capsys, *question, *nothing)
+    empty = ["--unlike", "splat:1", "--threshold", "1", "--scores", scene / "s.npy", "--object", scene / "o.ply"]
+    status, out, err = run(capsys, *question, *empty)
     assert (status, out) == (2, "")
     assert "nothing stands out" in err and "lower threshold" in err
     assert_one_line(err)
     assert {path: path.read_bytes() for path in scene.iterdir()} == before
     files = {kind: scene / f"{kind}.ply" for kind in ("object", "coloured")}
-    written = [part for kind, path in files.items() for part in (f"--{kind}", path)]
-    status, out, err = run(capsys, *question, "--json", *written)
+    options = [part for kind, path in files.items() for part in (f"--{kind}", path)]
+    status, out, err = run(capsys, *question, "--json", *options)
     assert (status, err) == (0, "")
     assert json.loads(out)["files"] == {kind: str(path) for kind, path in files.items()}
-    whole = read_splats(scene / "splats.ply")
-    assert torch.equal(read_splats(files["object"]).means, whole.means[1:])
-    assert torch.equal(read_splats(files["coloured"]).means, whole.means)
+    splats = read_splats(scene / "splats.ply")
+    assert torch.equal(read_splats(files["object"]).means, splats.means[1:])
+    assert torch.equal(read_splats(files["coloured"]).means, splats.means)
 
 
 OPTIONS = [
@@ -210,9 +210,9 @@ def test_a_suffix_that_is_not_written_is_refused_before_the_work(
     command: str, option: str, suffix: str, scene: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = scene / f"mug{suffix}"
-    more = ["--like", "splat:1"] if command == "query" else []
+    options = ["--like", "splat:1"] if command == "query" else []
     view = [] if command == "objects" else ["--view", load_lift(scene / "lift.safetensors").metadata.views[0]]
-    status, out, err = run(capsys, command, scene / "lift.safetensors", *more, *view, option, path)
+    status, out, err = run(capsys, command, scene / "lift.safetensors", *options, *view, option, path)
     assert (status, out) == (2, "") and not path.exists() and suffix in err and "ending in ." in err
     if suffix == ".sog":
         assert f"splat-transform mug.ply mug{suffix}" in err
@@ -244,9 +244,9 @@ def test_a_file_of_another_kind_is_never_replaced(scene: Path, capsys: pytest.Ca
     save_file({"embeddings": np.eye(2, 4, dtype="f4")}, scene / "words.safetensors", {"words": '["a", "b"]'})
     save_file({"weight": np.zeros(3, "f4")}, scene / "weights.safetensors")
     before = {path: path.read_bytes() for path in scene.iterdir()}
-    for name, what in (("words", "table"), ("weights", "a safetensors file")):
+    for name, kind in (("words", "table"), ("weights", "a safetensors file")):
         status, _, err = run(capsys, *lift, scene / f"{name}.safetensors")
-        assert status == 2 and what in err
+        assert status == 2 and kind in err
     assert run(capsys, *lift, scene / "lift.sog")[0] == 2
     question = ["query", scene / "lift.safetensors", "--like", "splat:1", "--object", scene / "mug.ply"]
     (scene / "mug.ply").write_bytes(b"\x89PNG\r\n\x1a\n0123")
@@ -267,8 +267,8 @@ def test_rows_of_another_number_of_splats_are_refused_wherever_a_lift_is_asked(
     cropped = replace(lift, **cut)
     save_lift(cropped, scene / "cropped.safetensors")
     question = ["query", scene / "cropped.safetensors", "--like", "splat:0", "--threshold", "-1"]
-    for more in (["--objects"], ["--top", "1"], ["--object", scene / "o.ply"], ["--coloured", scene / "c.ply"]):
-        status, out, err = run(capsys, *question, *more)
+    for options in (["--objects"], ["--top", "1"], ["--object", scene / "o.ply"], ["--coloured", scene / "c.ply"]):
+        status, out, err = run(capsys, *question, *options)
         assert (status, out) == (2, "") and "row" in err and str(len(cropped.features)) in err
     with pytest.raises(InvalidInput, match="row"):
         Scene(cropped).axes  # noqa: B018

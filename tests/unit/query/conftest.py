@@ -14,7 +14,7 @@ from tests.api.tiny_scene import make_scene
 
 @pytest.fixture(scope="session")
 def lift_tiny() -> Callable[..., Path]:
-    """Lifts the tiny scene in a folder; gives the lift's file."""
+    """Function that lifts the tiny scene in a folder and returns the lift's file."""
 
     def lift_in(folder: Path, preset: str = "row-sum", splats: bytes = b"") -> Path:
         tiny = make_scene()
@@ -34,5 +34,5 @@ def tiny_lift(lift_tiny: Callable[..., Path], tmp_path_factory: pytest.TempPathF
 
 @pytest.fixture
 def scene(tiny_lift: Path) -> Scene:
-    """It, opened."""
+    """The lifted tiny scene, open for queries."""
     return Scene(tiny_lift)

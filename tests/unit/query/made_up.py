@@ -1,4 +1,4 @@
-"""Answers that found what a test says."""
+"""Answers with a selection that a test chooses."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 def answer_with(
     answer: Answer, *, selected: np.ndarray | None = None, scores: np.ndarray | None = None, **query: Any
 ) -> Answer:
-    """An answer with other splats [P] bool, other scores [P], or other fields of its query."""
+    """Return the answer with other splats [P] bool, other scores [P], or other fields of its query."""
     fields = {name: getattr(answer, name) for name in (*Presence.model_fields, "threshold", "clear", "statistics")}
     return Answer.of(
         answer.query.model_copy(update=query),

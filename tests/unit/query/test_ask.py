@@ -1,4 +1,4 @@
-"""Questions to a lift: what is selected, by words, examples and vectors, and what is said when it cannot be."""
+"""Queries of a lift by words, examples and vectors: the selection, and the errors of invalid queries."""
 
 import json
 import math
@@ -38,7 +38,7 @@ NAMES = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=1
 
 
 class Axes:
-    """Encodes "x", "y", "z" as the unit axes of the three clusters."""
+    """Text encoder of "x", "y", "z" as the unit axes of the three clusters."""
 
     name = "axes"
 
@@ -52,15 +52,15 @@ class Axes:
 
 
 def of(scene: Scene, rows: np.ndarray, **fields: torch.Tensor) -> Scene:
-    """A lift of other features [P, F], all seen, of total weight one."""
+    """Return the scene with these features [P, F]: every splat has a feature, of total weight one."""
     ones = torch.ones(len(rows))
-    given = {"total_weight": ones, "agreement": ones, "seen": ones > 0} | fields
-    return Scene(replace(scene.lift, features=torch.from_numpy(rows.astype(np.float32)), **given))
+    values = {"total_weight": ones, "agreement": ones, "seen": ones > 0} | fields
+    return Scene(replace(scene.lift, features=torch.from_numpy(rows.astype(np.float32)), **values))
 
 
 @pytest.fixture
 def exact(scene: Scene) -> Scene:
-    """Splats j, j + 3, .. mean the same axis, and the last one nothing."""
+    """Splats j, j + 3, .. have the feature of one axis; the last splat has none."""
     rows = np.eye(CHANNELS)[np.arange(COUNT) % 3] + 0.01
     rows[-1] = 0
     return of(scene, rows, seen=torch.arange(COUNT) < COUNT - 1)
@@ -71,18 +71,18 @@ def test_splats_that_mean_the_text_are_selected_the_best_with_places_and_a_box(e
     assert np.flatnonzero(answer.selected).tolist() == list(range(0, COUNT - 1, 3))
     assert answer.count == len(range(0, COUNT - 1, 3))
     assert answer.statistics["min"] <= answer.statistics["q50"] <= answer.statistics["max"]
-    found, means = locate(exact, answer, 4), exact.splats.means.numpy()
-    assert [best.splat for best in found.top] == [0, 3, 6, 9]  # of equal scores the first in the file
-    assert found.top[0].position == pytest.approx(means[0].tolist())
+    places, means = locate(exact, answer, 4), exact.splats.means.numpy()
+    assert [best.splat for best in places.top] == [0, 3, 6, 9]  # of equal scores the first in the file
+    assert places.top[0].position == pytest.approx(means[0].tolist())
     selected = means[answer.selected]
-    assert found.box == tuple(tuple(end.tolist()) for end in (selected.min(axis=0), selected.max(axis=0)))
-    assert len(locate(exact, answer, 1000).top) == COUNT - 1  # none that was not seen
+    assert places.box == tuple(tuple(end.tolist()) for end in (selected.min(axis=0), selected.max(axis=0)))
+    assert len(locate(exact, answer, 1000).top) == COUNT - 1  # no splat without a feature
     assert locate(exact, ask(exact, Query.of(("x",), ("y",), threshold=1.0), Axes()), 1).box is None
 
 
 def test_negatives_take_away_and_unseen_splats_are_never_selected(exact: Scene) -> None:
-    plain, answer = ask(exact, "x", Axes()), ask(exact, Query.of(("x",), ("y", "z"), threshold=0.5), Axes())
-    assert (answer.scores <= plain.scores).all() and answer.threshold.method == "fixed"
+    positive, answer = ask(exact, "x", Axes()), ask(exact, Query.of(("x",), ("y", "z"), threshold=0.5), Axes())
+    assert (answer.scores <= positive.scores).all() and answer.threshold.method == "fixed"
     assert np.flatnonzero(answer.selected).tolist() == list(range(0, COUNT - 1, 3))
     for negatives in ((), ("x",)):
         all_seen = ask(exact, Query.of(("z",), negatives, threshold=-1.0), Axes())
@@ -92,23 +92,24 @@ def test_negatives_take_away_and_unseen_splats_are_never_selected(exact: Scene) 
 
 @pytest.mark.parametrize("weight_by", ["evidence", "confidence"])
 def test_splats_without_evidence_or_confidence_do_not_decide_the_threshold(exact: Scene, weight_by: str) -> None:
-    plain = ask(exact, "x", Axes())
-    stray = np.zeros((COUNT, CHANNELS))
-    stray[:, 0], stray[:, 1] = 1.0, np.linspace(0.0, 3.0, COUNT)  # scores all over the range
+    reference = ask(exact, "x", Axes())
+    outliers = np.zeros((COUNT, CHANNELS))
+    outliers[:, 0], outliers[:, 1] = 1.0, np.linspace(0.0, 3.0, COUNT)  # scores all over the range
     weights = torch.cat([torch.ones(COUNT), torch.full((COUNT,), 1e-4)])
     crowd = of(
         exact,
-        np.concatenate([exact.features, stray]),
+        np.concatenate([exact.features, outliers]),
         **{{"evidence": "total_weight"}.get(weight_by, weight_by): weights},
     )
     answer = ask(crowd, Query.of(("x",), weight_by=weight_by), Axes())
-    plainly = ask(crowd, Query.of(("x",)), Axes())
-    assert np.array_equal(answer.scores, plainly.scores)
-    assert (answer.threshold.explanation == plainly.threshold.explanation) == (
-        weight_by == "evidence"
-    )  # which tells the share above it
-    assert np.array_equal(answer.selected[:COUNT], plain.selected)
-    assert answer.selected[COUNT] and answer.count > plain.count  # they are selected all the same
+    by_evidence = ask(crowd, Query.of(("x",)), Axes())
+    assert np.array_equal(answer.scores, by_evidence.scores)
+    is_same = (
+        answer.threshold.explanation == by_evidence.threshold.explanation
+    )  # it has the share above the threshold
+    assert is_same == (weight_by == "evidence")
+    assert np.array_equal(answer.selected[:COUNT], reference.selected)
+    assert answer.selected[COUNT] and answer.count > reference.count  # the outliers are selected even so
 
 
 def test_questions_together_have_the_bits_of_each_alone(scene: Scene) -> None:
@@ -118,10 +119,10 @@ def test_questions_together_have_the_bits_of_each_alone(scene: Scene) -> None:
         Query.of((SplatTerm(1),)),
         Query.of(("z", "x")),
     ]
-    asked = [resolve_query(scene, query, Axes()) for query in queries]
-    for together, one in zip(answers(scene, asked), asked, strict=True):
-        (alone,) = answers(scene, [one])
-        assert np.array_equal(together.scores, alone.scores) and together.threshold == alone.threshold
+    resolved_queries = [resolve_query(scene, query, Axes()) for query in queries]
+    for batched, resolved_query in zip(answers(scene, resolved_queries), resolved_queries, strict=True):
+        (single,) = answers(scene, [resolved_query])
+        assert np.array_equal(batched.scores, single.scores) and batched.threshold == single.threshold
 
 
 @pytest.mark.parametrize("module", [ask_module, segment_module])
@@ -131,11 +132,11 @@ def test_questions_use_one_thread_of_linear_algebra(
     libraries = ThreadpoolController().select(user_api="blas").lib_controllers
     find_threshold, numbers = module.find_threshold, set[int]()
 
-    def watched(*given: Any) -> Any:
+    def record_threads(*args: Any) -> Any:
         numbers.update(library.num_threads for library in libraries)
-        return find_threshold(*given)
+        return find_threshold(*args)
 
-    monkeypatch.setattr(module, "find_threshold", watched)
+    monkeypatch.setattr(module, "find_threshold", record_threads)
     with threadpool_limits(3, user_api="blas"):
         if module is ask_module:
             scene.ask("x", encoder=Axes())
@@ -148,7 +149,7 @@ def test_what_cannot_be_asked_is_refused(scene: Scene) -> None:
     def of_space(space: str) -> Scene:
         return Scene(replace(scene.lift, metadata=scene.metadata.model_copy(update={"text_space": space})))
 
-    for refused, message in (
+    for request, message in (
         (lambda: ask(scene, "x", Axes(5)), r"8 channels.*axes with 5"),
         (lambda: ask(of_space(""), "x"), r"text space: not named\), got no encoder"),
         (lambda: ask(of_space("axes"), "x"), r"text space: axes\), got no encoder"),
@@ -163,30 +164,32 @@ def test_what_cannot_be_asked_is_refused(scene: Scene) -> None:
         (lambda: Query.of(("a",), threshold="best"), "threshold: expected"),
     ):
         with pytest.raises(InvalidQuery, match=message):
-            refused()
+            request()
     sure = LiftResult.of(replace(scene.lift, confidence=torch.ones(len(scene.features))))
-    told, plain = (sure.query(np.eye(CHANNELS)[0], weight_by=weight_by) for weight_by in ("confidence", "evidence"))
-    assert torch.equal(told.splats, plain.splats) and told.threshold == plain.threshold
+    by_confidence, by_evidence = (
+        sure.query(np.eye(CHANNELS)[0], weight_by=weight_by) for weight_by in ("confidence", "evidence")
+    )
+    assert torch.equal(by_confidence.splats, by_evidence.splats) and by_confidence.threshold == by_evidence.threshold
 
 
 def test_vectors_are_asked_as_their_words_are(scene: Scene) -> None:
     words = ask(scene, Query.of(("x",), ("y",)), Axes())
     for positive in (torch.eye(CHANNELS)[0], 7 * np.eye(CHANNELS)[:1]):
-        found = LiftResult.of(scene.lift).query(positive, torch.eye(CHANNELS)[1], splats=scene.splats)
-        assert found.scores.numpy().tolist() == words.scores.tolist() and found.threshold == words.threshold.value
-        assert np.array_equal(found.splats.numpy(), words.selected) and found.clear
-        assert found.objects is not None and len(found.objects.objects) == 1
-    alike = LiftResult.of(replace(scene.lift, features=torch.ones(COUNT, CHANNELS)))
-    alone = alike.query(torch.eye(CHANNELS)[0])
-    assert not alone.clear and alone.objects is None
+        answer = LiftResult.of(scene.lift).query(positive, torch.eye(CHANNELS)[1], splats=scene.splats)
+        assert answer.scores.numpy().tolist() == words.scores.tolist() and answer.threshold == words.threshold.value
+        assert np.array_equal(answer.splats.numpy(), words.selected) and answer.clear
+        assert answer.objects is not None and len(answer.objects.objects) == 1
+    uniform_lift = LiftResult.of(replace(scene.lift, features=torch.ones(COUNT, CHANNELS)))
+    uniform_answer = uniform_lift.query(torch.eye(CHANNELS)[0])
+    assert not uniform_answer.clear and uniform_answer.objects is None
     for wrong in (torch.ones(5), torch.zeros(CHANNELS), torch.empty(0, CHANNELS)):
         with pytest.raises(InvalidQuery):
             LiftResult.of(scene.lift).query(wrong)
 
 
 def test_scene_made_of_values_needs_no_files(scene: Scene) -> None:
-    nowhere = scene.metadata.splats.model_copy(update={"path": ""})
-    lift = replace(scene.lift, metadata=scene.metadata.model_copy(update={"splats": nowhere}))
+    file_without_path = scene.metadata.splats.model_copy(update={"path": ""})
+    lift = replace(scene.lift, metadata=scene.metadata.model_copy(update={"splats": file_without_path}))
     bare = Scene(lift, scene.splats, scene.cameras, scene.packs)
     query = Query.of((Pixel("middle", 6, HEIGHT // 2), Region("left", 0, 1)))
     assert np.array_equal(ask(bare, query).selected, ask(scene, query).selected)
@@ -205,8 +208,8 @@ def test_words_of_a_table_are_asked_without_torch(tiny_lift: Path) -> None:
     subprocess.run([sys.executable, "-c", code, str(tiny_lift)], check=True)
 
 
-def test_lift_finds_its_files_beside_it_or_where_told(lift_tiny: Callable[..., Path], tmp_path: Path) -> None:
-    """A folder that moved, a file of another name, a file elsewhere, and one that is nowhere."""
+def test_lift_finds_its_files_beside_it_or_at_given_paths(lift_tiny: Callable[..., Path], tmp_path: Path) -> None:
+    """A folder that moved, a file of another name, a file in another folder, and a missing file."""
     before, after, away = tmp_path / "before", tmp_path / "after", tmp_path / "away"
     for folder in (before, away):
         folder.mkdir()
@@ -217,10 +220,10 @@ def test_lift_finds_its_files_beside_it_or_where_told(lift_tiny: Callable[..., P
     assert scene.splats.count == COUNT and len(scene.cameras) == 3
     assert ask(scene, Query.of((Region("left", 0, 0),))).count > 0
     (after / "another.ply").rename(away / "s.ply")
-    lost = Scene(after / lift)
-    assert ask(lost, Query.of((SplatTerm(0),))).count > 0  # scores need no splats
+    without_splats = Scene(after / lift)
+    assert ask(without_splats, Query.of((SplatTerm(0),))).count > 0  # scores need no splats
     with pytest.raises(InvalidLift, match=r"splats at .*s\.ply, or beside the lift.*--splats"):
-        _ = lost.splats
+        _ = without_splats.splats
     assert Scene(after / lift, splats=away / "s.ply").splats.count == COUNT
 
 
@@ -262,38 +265,38 @@ def test_pixel_is_the_feature_rendered_there(scene: Scene) -> None:
     features = torch.from_numpy(scene.features).float()
     image = scene.raster.render(scene.cameras["middle"], features, scene.compositing)
     for x, y in ((5, 12), (16, 12), (26, 10)):
-        (found,) = directions(scene, Query.of((Pixel("middle", x, y),)), None)
+        (direction,) = directions(scene, Query.of((Pixel("middle", x, y),)), None)
         expected = torch.nn.functional.normalize(image[y, x], dim=0)
-        np.testing.assert_allclose(found, expected.numpy(), atol=1e-5)
+        np.testing.assert_allclose(direction, expected.numpy(), atol=1e-5)
 
 
 def test_box_is_what_is_in_it_and_not_around_it(scene: Scene) -> None:
-    """Half of each neighbour lies in the box, together more than the thing: so it is around a thin thing."""
-    near, thing = np.eye(2, CHANNELS)
-    rows = np.repeat([near, thing, near], SPLATS_A_CLUSTER, axis=0)
+    """Half of each neighbour lies in the box, together more than the object, as around a thin object."""
+    near, target = np.eye(2, CHANNELS)
+    rows = np.repeat([near, target, near], SPLATS_A_CLUSTER, axis=0)
     (boxed,) = directions(of(scene, rows), Query(like=["middle:box:5,2,28,22"]), None)
-    assert boxed @ thing > 0.9
-    (whole,) = directions(of(scene, rows), Query(like=["middle:box:0,0,32,24"]), None)  # nothing is around it
-    assert whole @ near > 0.9
+    assert boxed @ target > 0.9
+    (full_image,) = directions(of(scene, rows), Query(like=["middle:box:0,0,32,24"]), None)  # nothing is around it
+    assert full_image @ near > 0.9
     (within,) = directions(scene, Query(like=["middle:box:15,8,18,15"]), None)  # the same is around it
-    (thing,) = directions(scene, Query(like=["region:left:0:1"]), None)
-    assert within @ thing > 0.9
+    (target,) = directions(scene, Query(like=["region:left:0:1"]), None)
+    assert within @ target > 0.9
 
 
 def test_stroke_may_slip_over_an_edge(scene: Scene) -> None:
-    (drawn,) = directions(scene, Query(like=["middle:stroke:16,4,16,20,26,20"]), None)
+    (stroke,) = directions(scene, Query(like=["middle:stroke:16,4,16,20,26,20"]), None)
     (middle,) = directions(scene, Query(like=["region:left:0:1"]), None)
-    assert drawn @ middle > 0.95
+    assert stroke @ middle > 0.95
 
 
 def test_box_and_stroke_of_one_pixel_are_the_pixel(scene: Scene) -> None:
     query = Query(like=["middle:6,12", "middle:box:6,12,7,13", "middle:stroke:6,12,6,12"])
-    pixel, *others = directions(scene, query, None)
-    assert all(np.allclose(other, pixel, atol=1e-6) for other in others)
+    pixel, *areas = directions(scene, query, None)
+    assert all(np.allclose(area, pixel, atol=1e-6) for area in areas)
 
 
 def test_threshold_of_examples_is_above_a_least_likeness(scene: Scene) -> None:
-    """Ten splats as the example, fifteen a little like it: together they stand apart most from all others."""
+    """Ten splats like the example and fifteen a little like it: the widest gap is between these 25 and the rest."""
     rows = np.zeros((COUNT, CHANNELS))
     rows[:10, 0], rows[10:25, :3], rows[25:, 1] = 1.0, [0.3, 0.3, 0.9], -1.0
     lifted = of(scene, rows + np.random.default_rng(0).normal(0, 0.01, rows.shape))
@@ -302,13 +305,13 @@ def test_threshold_of_examples_is_above_a_least_likeness(scene: Scene) -> None:
     assert by_example.threshold.value > 0.4 and find_threshold(by_example.scores).value < 0.0
     in_words = ask(lifted, Query.of(("x", "y")), Axes())
     assert in_words.threshold.value == find_threshold(in_words.scores).value
-    both = ask(lifted, Query.of((SplatTerm(0), "x")), Axes())
-    assert both.threshold.value == find_threshold(both.scores).value
+    combined = ask(lifted, Query.of((SplatTerm(0), "x")), Axes())
+    assert combined.threshold.value == find_threshold(combined.scores).value
     assert ask(lifted, Query.of((SplatTerm(0),), threshold=0.1)).count == 25
 
 
 @pytest.mark.parametrize(
-    ("example", "error", "said"),
+    ("example", "error", "message"),
     [
         (Pixel("behind", 1, 1), NotFound, "behind"),
         (Pixel("middle", WIDTH, 0), InvalidQuery, rf"0\.\.{WIDTH - 1}"),
@@ -333,9 +336,9 @@ def test_threshold_of_examples_is_above_a_least_likeness(scene: Scene) -> None:
     ],
 )
 def test_term_without_a_feature_says_why_under_its_name(
-    scene: Scene, example: Example, error: type[SplatliftError], said: str
+    scene: Scene, example: Example, error: type[SplatliftError], message: str
 ) -> None:
-    with pytest.raises(error, match=said):
+    with pytest.raises(error, match=message):
         ask(scene, Query.of((example,)))
     if example != "apple":
         query = Query.of((SplatTerm(0),), (example,))
@@ -390,8 +393,8 @@ def test_lift_read_as_arrays_and_as_tensors_is_one(scene: Scene, tmp_path: Path)
     clusters = (torch.arange(COUNT) % 3 - 1).to(torch.int32)
     rows = torch.ones(2, CHANNELS, dtype=scene.lift.features.dtype)
     save_lift(replace(scene.lift, cluster=clusters, cluster_features=rows), tmp_path / "clustered")
-    opened = Scene(tmp_path / "clustered")
-    assert opened.cluster is not None and opened.cluster.tolist() == clusters.tolist()
+    from_file = Scene(tmp_path / "clustered")
+    assert from_file.cluster is not None and from_file.cluster.tolist() == clusters.tolist()
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".splat"])
@@ -410,5 +413,5 @@ def test_a_lift_with_other_rows_than_its_splats_answers_nothing(
     request = {"lift": str(path), "splats": str(splats), "cameras": str(tmp_path / "c.json")}
     with pytest.raises(InvalidLift, match="a row for each of its"):
         open_scene(request)
-    (tmp_path / "s.ply").write_bytes(splats.read_bytes())  # another file lies there now: places alone are lost
+    (tmp_path / "s.ply").write_bytes(splats.read_bytes())  # another file stands there now: only positions are lost
     ask(Scene(path), Query.of((SplatTerm(0),)))

@@ -1,4 +1,4 @@
-"""What a click may mean: the nested things that lie there, the smallest first."""
+"""Candidates of a click: the nested objects and parts at that place, the smallest first."""
 
 from __future__ import annotations
 
@@ -24,18 +24,19 @@ def nested(scene: Scene, tmp_path: Path) -> Scene:
     return Scene(tmp_path / "parts.lift.safetensors", scene.splats, scene.cameras)
 
 
-def meant(scene: Scene, *like: str, unlike: tuple[str, ...] = ()) -> list[tuple[int, str]]:
+def candidates_of(scene: Scene, *like: str, unlike: tuple[str, ...] = ()) -> list[tuple[int, str]]:
+    """Return the id and kind of each candidate."""
     query = Query(like=list(like), unlike=list(unlike))
-    return [(one.id, one.kind) for one in scene.ask(query).candidates]
+    return [(candidate.id, candidate.kind) for candidate in scene.ask(query).candidates]
 
 
 def test_a_splat_means_its_part_and_then_the_whole(nested: Scene) -> None:
     first, second, other = (f"splat:{np.flatnonzero(nested.members(node))[0]}" for node in (3, 4, 1))
-    assert meant(nested, first) == [(3, "part"), (0, "object")]
-    assert meant(nested, other) == [(1, "object")]
-    assert meant(nested, first, second) == [(0, "object")]
-    assert meant(nested, first, other) == []
-    assert meant(nested, first, unlike=(second,)) == [(3, "part")]
+    assert candidates_of(nested, first) == [(3, "part"), (0, "object")]
+    assert candidates_of(nested, other) == [(1, "object")]
+    assert candidates_of(nested, first, second) == [(0, "object")]
+    assert candidates_of(nested, first, other) == []
+    assert candidates_of(nested, first, unlike=(second,)) == [(3, "part")]
 
 
 def test_a_part_that_is_nearly_all_of_its_whole_is_not_offered_beside_it(scene: Scene, tmp_path: Path) -> None:
@@ -45,8 +46,8 @@ def test_a_part_that_is_nearly_all_of_its_whole_is_not_offered_beside_it(scene: 
     node[rows], node[rows[: len(rows) // 10]] = 3, 4
     replace(lift, node=node).save(tmp_path / "parts.lift.safetensors")
     subject = Scene(tmp_path / "parts.lift.safetensors", scene.splats, scene.cameras)
-    assert meant(subject, f"splat:{int(rows[-1])}") == [(0, "object")]
-    assert meant(subject, f"splat:{int(rows[0])}") == [(4, "part"), (0, "object")]
+    assert candidates_of(subject, f"splat:{int(rows[-1])}") == [(0, "object")]
+    assert candidates_of(subject, f"splat:{int(rows[0])}") == [(4, "part"), (0, "object")]
 
 
 def test_a_pixel_means_what_weighs_most_on_its_ray_and_its_set_is_asked_alone(nested: Scene) -> None:
@@ -55,17 +56,19 @@ def test_a_pixel_means_what_weighs_most_on_its_ray_and_its_set_is_asked_alone(ne
     place = nested.splats.means.numpy()[nested.members(1)].mean(axis=0)
     x, y, z = camera.K @ (camera.viewmat[:3, :3] @ place + camera.viewmat[:3, 3])
     answer = nested.ask(Query(like=[f"{view}:{int(x / z)},{int(y / z)}"]))
-    (one,) = answer.candidates
-    assert (one.id, one.set) == (1, "object:1") and one.share > 0.5 and one.splats == int(nested.members(1).sum())
-    alone = nested.ask(Query(sets=[one.set]))
-    np.testing.assert_array_equal(alone.selected, nested.members(1))
+    (candidate,) = answer.candidates
+    assert (candidate.id, candidate.set) == (1, "object:1") and candidate.share > 0.5
+    assert candidate.splats == int(nested.members(1).sum())
+    by_set = nested.ask(Query(sets=[candidate.set]))
+    np.testing.assert_array_equal(by_set.selected, nested.members(1))
 
 
 def test_the_command_names_them(nested: Scene, capsys: pytest.CaptureFixture[str]) -> None:
     row = np.flatnonzero(nested.members(4))[0]
     assert main(["query", str(nested.path), "--like", f"splat:{row}", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)["answer"]["candidates"]
-    assert [(one["id"], one["kind"], one["share"]) for one in told] == [(4, "part", 1.0), (0, "object", 1.0)]
+    candidates = json.loads(capsys.readouterr().out)["answer"]["candidates"]
+    rows = [(candidate["id"], candidate["kind"], candidate["share"]) for candidate in candidates]
+    assert rows == [(4, "part", 1.0), (0, "object", 1.0)]
     assert main(["query", str(nested.path), "--like", f"splat:{row}"]) == 0
     assert "may be object:4, part" in capsys.readouterr().out
 
@@ -76,7 +79,7 @@ def test_a_part_that_no_word_stands_for_may_be_any_part_of_its_thing(nested: Sce
     table = TableEncoder("words", ["apple", "lamp"], words)
     answer = nested.ask("the apple's stalk", encoder=table)
     assert answer.count and [word.match for word in answer.wording] == ["head"]
-    assert sorted((one.id, one.kind) for one in answer.candidates) == [(3, "part"), (4, "part")]
+    assert sorted((candidate.id, candidate.kind) for candidate in answer.candidates) == [(3, "part"), (4, "part")]
     assert "'stalk'" in answer.reason and "all of 'apple'" in answer.reason
-    assert sum(one.share for one in answer.candidates) <= 1 + 1e-6
+    assert sum(candidate.share for candidate in answer.candidates) <= 1 + 1e-6
     assert nested.ask("the apple", encoder=table).candidates == ()

@@ -1,4 +1,4 @@
-"""The objects of a lift, one by one, and what a vocabulary makes of them."""
+"""The list of a lift's objects and parts, with their positions, views and nearest words of a vocabulary."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_a_draft_says_that_it_looked_for_no_objects_and_what_finds_them(scene: S
 
 
 def with_parts(scene: Scene) -> LiftResult:
-    """The lift with its first object in halves, which say something else than it does."""
+    """Return the lift with its first object in two halves, whose features differ from the object's."""
     lift = LiftResult.of(scene.lift.cpu())
     assert lift.object is not None and lift.object_views is not None and lift.node_features is not None
     node, first = lift.object.clone(), torch.nonzero(lift.object == 0)[:, 0]

@@ -22,7 +22,7 @@ from tests.api.tiny_scene import SPLATS_A_CLUSTER, ply, splat_rows
 
 @pytest.fixture
 def scene(lift_tiny: Callable[..., Path], tmp_path: Path) -> Scene:
-    """The tiny scene lifted, and one splat more that no camera sees."""
+    """The lifted tiny scene with one more splat that no camera sees."""
     behind = splat_rows()[:1].copy()
     behind[0, 2] = 40.0
     return Scene(lift_tiny(tmp_path, splats=ply(np.concatenate([splat_rows(), behind]))))

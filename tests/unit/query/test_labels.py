@@ -1,4 +1,4 @@
-"""Labels of all splats in files: the same from words, an answer and the objects of a lift."""
+"""Label files of all splats, in one format for words, an answer and the objects of a lift."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether a thing is there: real CLIP vectors of words on splats, with the noise and the cone of image vectors."""
+"""Presence of an object: real CLIP vectors of words on splats, with the noise and the cone of image vectors."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -25,7 +25,7 @@ from liftcore.text.table import TableEncoder
 from tests.api.tiny_scene import SPLATS_A_CLUSTER
 
 COUNT = 3 * SPLATS_A_CLUSTER
-THINGS = ("cat", "boat", "pizza")
+PRESENT_WORDS = ("cat", "boat", "pizza")
 
 
 @pytest.fixture(scope="module")
@@ -35,9 +35,9 @@ def table() -> TableEncoder:
 
 @pytest.fixture
 def clip(scene: Scene, table: TableEncoder) -> Scene:
-    """The three clusters are a cat, a boat and a pizza, as photos are: .29 like their words, .22 like others."""
+    """Three clusters as photos of a cat, a boat and a pizza: cosine .29 to their own words, .22 to others."""
     rng = np.random.default_rng(0)
-    words = np.repeat(table.encode(THINGS), SPLATS_A_CLUSTER, axis=0)
+    words = np.repeat(table.encode(PRESENT_WORDS), SPLATS_A_CLUSTER, axis=0)
     gap, noise = rng.normal(size=512), rng.normal(size=(COUNT, 512))
     gap -= (
         table.embeddings.mean(axis=0)
@@ -48,50 +48,49 @@ def clip(scene: Scene, table: TableEncoder) -> Scene:
         0.28 * words + 0.9 * gap / np.linalg.norm(gap) + 0.25 * noise / np.linalg.norm(noise, axis=1, keepdims=True)
     )
     ones = torch.ones(COUNT)
-    given = {"total_weight": ones, "agreement": ones, "seen": ones > 0}
-    lifted = replace(scene.lift, features=torch.from_numpy(rows.astype(np.float32)), **given)
+    values = {"total_weight": ones, "agreement": ones, "seen": ones > 0}
+    lifted = replace(scene.lift, features=torch.from_numpy(rows.astype(np.float32)), **values)
     return Scene(lifted, scene.splats, scene.cameras)
 
 
 def test_absent_words_select_nothing_and_present_ones_do(clip: Scene, table: TableEncoder) -> None:
-    others = [word for word in table.words if word not in THINGS]
-    absent = np.random.default_rng(1).choice(others, 60, replace=False).tolist()
-    for word in THINGS:
-        found = ask(clip, word, table)
-        assert found.present and found.count > 0 and "is there" in found.reason
+    other_words = [word for word in table.words if word not in PRESENT_WORDS]
+    absent = np.random.default_rng(1).choice(other_words, 60, replace=False).tolist()
+    for word in PRESENT_WORDS:
+        answer = ask(clip, word, table)
+        assert answer.present and answer.count > 0 and "is there" in answer.reason
     answers = [ask(clip, word, table) for word in absent]
-    assert sum(one.count == 0 for one in answers) >= 57
-    assert all((one.present is False) == (one.count == 0) for one in answers)
+    assert sum(answer.count == 0 for answer in answers) >= 57
+    assert all((answer.present is False) == (answer.count == 0) for answer in answers)
 
 
-def test_absent_thing_shows_nothing_unless_kept(clip: Scene, table: TableEncoder) -> None:
-    nothing = ask(clip, "sofa", table)
-    assert nothing.threshold.value == np.inf and nothing.threshold.explanation == nothing.reason
-    assert objects(clip, nothing).objects == ()
-    seen = view_mask(clip, nothing, "middle")
-    assert not seen.mask.any() and not seen.attention.any()
+def test_absent_object_is_not_rendered_unless_kept(clip: Scene, table: TableEncoder) -> None:
+    absent = ask(clip, "sofa", table)
+    assert absent.threshold.value == np.inf and absent.threshold.explanation == absent.reason
+    assert objects(clip, absent).objects == ()
+    in_view = view_mask(clip, absent, "middle")
+    assert not in_view.mask.any() and not in_view.attention.any()
     with pytest.raises(InvalidQuery, match="absent=keep"):
-        object_splats(clip, nothing)
+        object_splats(clip, absent)
     assert ask(clip, Query.of(("sofa",), threshold=0.0), table).count == 0
-    kept = ask(clip, Query.of(("sofa",), absent="keep"), table)
-    assert kept.count > 0 and kept.presence == nothing.presence
+    answer = ask(clip, Query.of(("sofa",), absent="keep"), table)
+    assert answer.count > 0 and answer.presence == absent.presence
     with pytest.raises(InvalidQuery, match="drop, keep"):
         Query.of(("sofa",), absent="hide")
 
 
 def test_of_several_words_the_absent_ones_are_left_out(clip: Scene, table: TableEncoder) -> None:
-    def same(one: Answer, other: Answer) -> bool:
-        return np.array_equal(one.scores, other.scores) and np.array_equal(one.selected, other.selected)
+    def are_equal(a: Answer, b: Answer) -> bool:
+        return np.array_equal(a.scores, b.scores) and np.array_equal(a.selected, b.selected)
 
     cat = ask(clip, "cat", table)
-    both = ask(clip, Query.of(("sofa", "cat")), table)
-    assert same(both, cat) and both.present and "'sofa' is not there" in both.reason
-    assert not same(ask(clip, Query.of(("sofa", "cat"), absent="keep"), table), cat)
-    assert ask(clip, Query.of(("cat",), ("sofa",)), table).presence == cat.presence  # negatives are not questioned
+    combined = ask(clip, Query.of(("sofa", "cat")), table)
+    assert are_equal(combined, cat) and combined.present and "'sofa' is not there" in combined.reason
+    assert not are_equal(ask(clip, Query.of(("sofa", "cat"), absent="keep"), table), cat)
+    assert ask(clip, Query.of(("cat",), ("sofa",)), table).presence == cat.presence  # presence ignores negatives
     example = Query.of((SplatTerm(0), "sofa"))
-    assert (
-        same(ask(clip, example, table), ask(clip, Query.of((SplatTerm(0),)))) and ask(clip, example, table).count > 0
-    )
+    assert are_equal(ask(clip, example, table), ask(clip, Query.of((SplatTerm(0),))))
+    assert ask(clip, example, table).count > 0
     assert ask(clip, Query.of((SplatTerm(0),))).present is None
 
 
@@ -104,43 +103,43 @@ def test_references_that_mean_the_same_hide_nothing(clip: Scene, table: TableEnc
     assert ask(clip, "sofa", crowded).present is False
 
 
-def test_small_evidence_does_not_make_a_thing(clip: Scene, table: TableEncoder) -> None:
-    stray = torch.cat([clip.lift.features, torch.from_numpy(table.encode(["sofa"]))])
+def test_small_total_weight_makes_no_object(clip: Scene, table: TableEncoder) -> None:
+    features = torch.cat([clip.lift.features, torch.from_numpy(table.encode(["sofa"]))])
     ones = torch.ones(COUNT + 1)
-    given = {"features": stray, "agreement": ones, "seen": ones > 0}
+    values = {"features": features, "agreement": ones, "seen": ones > 0}
     total_weight = torch.cat([torch.ones(COUNT), torch.tensor([1e-4])])
     for weight, present in ((1e-4, False), (1.0, True)):
         total_weight[-1] = weight
-        lifted = Scene(replace(clip.lift, total_weight=total_weight.clone(), **given))
+        lifted = Scene(replace(clip.lift, total_weight=total_weight.clone(), **values))
         assert ask(lifted, "sofa", table).present is present
 
 
-class Asked:
-    """An encoder of the shipped words in another space; it knows what it was asked."""
+class RecordingEncoder:
+    """Text encoder of the shipped words in another space; ``texts`` are those that it encoded."""
 
     channels = 64
 
     def __init__(self, seed: int) -> None:
-        self.name, self.texts = "asked", list[str]()
-        self._turn = np.random.default_rng(seed).normal(size=(512, 64))
+        self.name, self.texts = "recording", list[str]()
+        self._projection = np.random.default_rng(seed).normal(size=(512, 64))
         self._table = TableEncoder.open(LVIS_TABLE)
 
     def encode(self, texts: Sequence[str]) -> np.ndarray:
         self.texts += texts
-        rows = self._table.encode(texts) @ self._turn
+        rows = self._table.encode(texts) @ self._projection
         return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
 
 
 def test_an_encoder_makes_its_references_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    first, again, other = Asked(0), Asked(0), Asked(1)
-    made = references_of(first, "")
-    assert isinstance(made, References) and 200 <= len(made.words) <= len(first.texts)
-    kept = references_of(CachingEncoder(again), "")
-    assert isinstance(kept, References) and kept.words == made.words and len(again.texts) == 1
-    np.testing.assert_allclose(kept.vectors, made.vectors, atol=1e-3)
-    anew = references_of(other, "")  # of the same name, but it says something else
-    assert isinstance(anew, References) and len(other.texts) > len(anew.words)
+    first, second, other = RecordingEncoder(0), RecordingEncoder(0), RecordingEncoder(1)
+    references = references_of(first, "")
+    assert isinstance(references, References) and 200 <= len(references.words) <= len(first.texts)
+    cached = references_of(CachingEncoder(second), "")
+    assert isinstance(cached, References) and cached.words == references.words and len(second.texts) == 1
+    np.testing.assert_allclose(cached.vectors, references.vectors, atol=1e-3)
+    recomputed = references_of(other, "")  # an encoder of the same name with other vectors
+    assert isinstance(recomputed, References) and len(other.texts) > len(recomputed.words)
 
 
 def test_without_references_presence_is_not_known(clip: Scene, table: TableEncoder) -> None:
@@ -148,7 +147,7 @@ def test_without_references_presence_is_not_known(clip: Scene, table: TableEncod
     unknown = ask(clip, "cat", axes)
     assert (unknown.present, unknown.presence) == (None, None) and unknown.count > 0
     assert "200 words" in unknown.reason
-    few = TableEncoder("few", ("cat", "sofa"), table.encode(["cat", "sofa"]))  # of CLIP's, as its vectors tell
+    few = TableEncoder("few", ("cat", "sofa"), table.encode(["cat", "sofa"]))  # recognised as CLIP by its vectors
     assert ask(clip, "sofa", few).presence == ask(clip, "sofa", table).presence
 
 
@@ -157,11 +156,11 @@ def test_vectors_of_words_are_present_or_absent_too(clip: Scene, table: TableEnc
     assert LiftResult.of(clip.lift).query(cat).present and LiftResult.of(clip.lift).query(sofa).present is False
     assert not LiftResult.of(clip.lift).query(sofa, splats=clip.splats).splats.any()
     assert LiftResult.of(clip.lift).query(sofa, absent="keep").splats.any()
-    turn = np.linalg.qr(np.random.default_rng(3).normal(size=(512, 512)))[0].astype(np.float32)
-    turned = LiftResult.of(replace(clip.lift, features=clip.lift.features @ torch.from_numpy(turn)))
-    assert turned.query(sofa @ turn).present is None
-    told = turned.query(sofa @ turn, references=table.embeddings @ turn)
-    assert told.present is False and told.presence is not None and told.presence < 0.5
+    rotation = np.linalg.qr(np.random.default_rng(3).normal(size=(512, 512)))[0].astype(np.float32)
+    rotated = LiftResult.of(replace(clip.lift, features=clip.lift.features @ torch.from_numpy(rotation)))
+    assert rotated.query(sofa @ rotation).present is None
+    answer = rotated.query(sofa @ rotation, references=table.embeddings @ rotation)
+    assert answer.present is False and answer.presence is not None and answer.presence < 0.5
     for wrong in (table.embeddings[:9], table.embeddings[:, :9], np.zeros((300, 512))):
         with pytest.raises(InvalidQuery, match="references"):
             LiftResult.of(clip.lift).query(sofa, references=wrong)
@@ -172,19 +171,19 @@ def test_texts_are_asked_as_their_vectors_are(
 ) -> None:
     lift = LiftResult.of(clip.lift)
     cat = lift.query(table.encode(["cat"]), table.encode(["pizza"]))
-    opened: list[str] = []
+    spaces: list[str] = []
 
     def encoder_of_space(space: str, hint: str, *, stand_in: bool) -> TableEncoder:
-        opened.append(space)
+        spaces.append(space)
         return table
 
     monkeypatch.setattr("liftcore.text.encoder_of_space", encoder_of_space)
     for encoder in (table, "lvis", LVIS_TABLE, None):
-        told = lift.query("cat", ["pizza"], encoder=encoder)
-        assert torch.equal(told.scores, cat.scores) and torch.equal(told.splats, cat.splats)
-        assert (told.present, told.presence) == (cat.present, cat.presence)
-        assert told.reason.startswith("'cat' is there")
-    assert opened == [lift.metadata.text_space]
+        answer = lift.query("cat", ["pizza"], encoder=encoder)
+        assert torch.equal(answer.scores, cat.scores) and torch.equal(answer.splats, cat.splats)
+        assert (answer.present, answer.presence) == (cat.present, cat.presence)
+        assert answer.reason.startswith("'cat' is there")
+    assert spaces == [lift.metadata.text_space]
     wrong: Any
     for wrong in (7, "no such encoder", TableEncoder):
         with pytest.raises(InvalidQuery, match="encoder: expected"):
@@ -195,7 +194,7 @@ def test_texts_are_asked_as_their_vectors_are(
 
 
 def test_many_words_follow_the_same_rule(clip: Scene, table: TableEncoder) -> None:
-    words = ["cat", "sofa", "lamp"]  # without its nearest words, a sofa would have splats of its own
-    found = segment(clip, words, table.encode(words))
-    assert [one.word for one in found.named_words] == ["cat"]
-    assert set(found.labels.tolist()) <= {-1, 0}
+    words = ["cat", "sofa", "lamp"]  # without the presence test, some splats would be a sofa
+    segmentation = segment(clip, words, table.encode(words))
+    assert [label.word for label in segmentation.named_words] == ["cat"]
+    assert set(segmentation.labels.tolist()) <= {-1, 0}

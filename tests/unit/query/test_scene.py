@@ -1,4 +1,4 @@
-"""A scene opened for questions: of a file, of values, and kept by a result."""
+"""A scene opened for queries: from a file, from values, and cached by a result."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ AXES = TableEncoder("axes", ("x", "y", "z"), np.eye(3, CHANNELS, dtype=np.float3
 def test_file_and_values_give_the_same_answer(tiny_lift: Path, scene: Scene) -> None:
     result = lc.load_lift(tiny_lift)
     expected = scene.ask("x", encoder=AXES)
-    for opened in (lc.Scene(result), lc.Scene(str(tiny_lift), scene.splat_file), lc.Scene(result, scene.splats)):
-        answer = opened.ask(lc.Query(text=["x"]), encoder=AXES)
+    for variant in (lc.Scene(result), lc.Scene(str(tiny_lift), scene.splat_file), lc.Scene(result, scene.splats)):
+        answer = variant.ask(lc.Query(text=["x"]), encoder=AXES)
         assert answer == expected and np.array_equal(answer.selected, expected.selected)
         assert answer.box is not None and len(answer.top) == 10
     assert scene.ask("x", encoder=AXES, places=False).top == ()
@@ -31,9 +31,9 @@ def test_file_and_values_give_the_same_answer(tiny_lift: Path, scene: Scene) -> 
 
 def test_result_keeps_its_scene_while_its_splats_are_the_same(tiny_lift: Path, scene: Scene) -> None:
     result = lc.load_lift(tiny_lift)
-    opened = result.scene(scene.splats)
-    assert result.scene(scene.splats) is opened and result.scene() is not opened
-    assert lc.LiftResult.of(result).settings == result.settings  # which copies values, and no scene
+    first_scene = result.scene(scene.splats)
+    assert result.scene(scene.splats) is first_scene and result.scene() is not first_scene
+    assert lc.LiftResult.of(result).settings == result.settings  # a copy has the values and no scene
 
 
 def test_files_are_those_of_the_answer_and_no_others(scene: Scene, tmp_path: Path) -> None:
@@ -44,9 +44,9 @@ def test_files_are_those_of_the_answer_and_no_others(scene: Scene, tmp_path: Pat
     assert lc.read_splats(tmp_path / "x.ply").count == answer.count - scene.objects(answer).unassigned_splats
     scene.export(tmp_path / "mask.png", lc.Query(text=["x"], view="middle"), "mask", encoder=AXES)
     assert (tmp_path / "mask.png").read_bytes() == b"".join(scene.blocks_of(answer, "mask", view="middle"))
-    for what, told in (("mesh", "what: expected one of object, coloured"), ("mask", "view: expected")):
-        with pytest.raises(lc.InvalidQuery, match=told):
-            scene.export(tmp_path / "none.png", answer, what)
+    for content, message in (("mesh", "what: expected one of object, coloured"), ("mask", "view: expected")):
+        with pytest.raises(lc.InvalidQuery, match=message):
+            scene.export(tmp_path / "none.png", answer, content)
     assert not (tmp_path / "none.png").exists()
 
 

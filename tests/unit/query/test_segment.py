@@ -1,4 +1,4 @@
-"""Many words at once: every splat's word or none, its pictures, and the best words for an example."""
+"""Segmentation by many words: the word of each splat or none, its pictures, and the best words for an example."""
 
 import io
 import json
@@ -34,7 +34,7 @@ CLUSTER = np.arange(COUNT) // SPLATS_A_CLUSTER
 
 @pytest.fixture
 def clear(scene: Scene) -> Scene:
-    """Each cluster is an axis with noise on all others."""
+    """Three clusters, each of one unit axis with noise."""
     rows = EYE[CLUSTER] + np.random.default_rng(0).normal(0, 0.05, (COUNT, CHANNELS)).astype(np.float32)
     ones = torch.ones(COUNT)
     lift = replace(scene.lift, features=torch.from_numpy(rows), total_weight=ones, seen=ones > 0)
@@ -44,32 +44,34 @@ def clear(scene: Scene) -> Scene:
 
 
 def test_every_splat_gets_the_word_that_it_is_most_like(clear: Scene) -> None:
-    found = segment(clear, ["lamp", "apple", "book"], EYE[[2, 0, 1]])
-    assert np.array_equal(found.labels, np.array([1, 2, 0])[CLUSTER])
-    assert (found.margin > 0.5).all()
+    segmentation = segment(clear, ["lamp", "apple", "book"], EYE[[2, 0, 1]])
+    assert np.array_equal(segmentation.labels, np.array([1, 2, 0])[CLUSTER])
+    assert (segmentation.margin > 0.5).all()
     means = clear.splats.means.numpy()
-    for named in found.named_words:
-        mine = means[found.labels == named.row]
-        assert named.splats == SPLATS_A_CLUSTER and named.share == pytest.approx(1 / 3, abs=1e-6)
-        assert np.array(named.box) == pytest.approx(np.stack([mine.min(axis=0), mine.max(axis=0)]), abs=0.3)
-        assert named.score > 0.9 and 0 < named.threshold < 1
-    names = [found.named_words[value - 1].word for value in found.values[::SPLATS_A_CLUSTER]]
+    for label in segmentation.named_words:
+        members = means[segmentation.labels == label.row]
+        assert label.splats == SPLATS_A_CLUSTER and label.share == pytest.approx(1 / 3, abs=1e-6)
+        assert np.array(label.box) == pytest.approx(np.stack([members.min(axis=0), members.max(axis=0)]), abs=0.3)
+        assert label.score > 0.9 and 0 < label.threshold < 1
+    names = [segmentation.named_words[value - 1].word for value in segmentation.values[::SPLATS_A_CLUSTER]]
     assert names == ["apple", "book", "lamp"]
 
 
 def test_words_that_are_not_there_name_nothing(clear: Scene) -> None:
-    between = (EYE[0] + EYE[5]) / np.sqrt(2)  # what the first cluster is most like, but for its own word
-    found = segment(clear, ["apple", "pear", "book", "lamp", "void"], np.stack([EYE[0], between, *EYE[[1, 2, 7]]]))
-    assert {named.word for named in found.named_words} == {"apple", "book", "lamp"}
-    assert np.array_equal(found.labels, np.array([0, 2, 3])[CLUSTER])
+    between = (EYE[0] + EYE[5]) / np.sqrt(2)  # the second best word of the first cluster
+    words, vectors = ["apple", "pear", "book", "lamp", "void"], np.stack([EYE[0], between, *EYE[[1, 2, 7]]])
+    segmentation = segment(clear, words, vectors)
+    assert {label.word for label in segmentation.named_words} == {"apple", "book", "lamp"}
+    assert np.array_equal(segmentation.labels, np.array([0, 2, 3])[CLUSTER])
 
 
 def test_splats_of_no_word_and_unseen_ones_are_named_none(clear: Scene) -> None:
-    found, rest = segment(clear, ["apple", "book"], EYE[:2]), slice(2 * SPLATS_A_CLUSTER, None)
-    assert np.array_equal(found.labels == -1, CLUSTER == 2) and np.array_equal(found.values == 0, CLUSTER == 2)
-    assert not found.margin[rest].any()
-    hidden = Scene(replace(clear.lift, seen=torch.arange(COUNT) != 3), clear.splats)
-    assert segment(hidden, ["apple", "book", "lamp"], EYE[:3]).labels[3] == -1
+    segmentation, rest = segment(clear, ["apple", "book"], EYE[:2]), slice(2 * SPLATS_A_CLUSTER, None)
+    assert np.array_equal(segmentation.labels == -1, CLUSTER == 2)
+    assert np.array_equal(segmentation.values == 0, CLUSTER == 2)
+    assert not segmentation.margin[rest].any()
+    without_feature = Scene(replace(clear.lift, seen=torch.arange(COUNT) != 3), clear.splats)
+    assert segment(without_feature, ["apple", "book", "lamp"], EYE[:3]).labels[3] == -1
     flat = Scene(replace(clear.lift, features=torch.ones(COUNT, CHANNELS)), clear.splats)  # of equal scores
     assert segment(flat, ["apple", "book"], EYE[:2]).named_words == ()
 
@@ -87,24 +89,25 @@ def test_splat_of_no_word_gets_the_one_of_most_of_its_node(clear: Scene) -> None
         "node_views": views,
     }
     tree |= {"node_confidence": torch.ones(3), "node_features": torch.from_numpy(EYE[:3]).half()}
-    alone = replace(clear.lift, features=rows, seen=torch.arange(COUNT) != 1)
-    plain, kept = (Scene(replace(alone, **some), clear.splats) for some in (dict.fromkeys(tree), tree))
+    lift = replace(clear.lift, features=rows, seen=torch.arange(COUNT) != 1)
+    without_tree, with_tree = (Scene(replace(lift, **fields), clear.splats) for fields in (dict.fromkeys(tree), tree))
     words = ["apple", "book", "lamp"]
-    assert segment(plain, words, EYE[:3]).labels[odd].tolist() == [-1, -1, -1]
-    found = segment(kept, words, EYE[:3])
-    assert found.labels[odd].tolist() == [0, -1, -1] and found.score[0] < 0.2 and found.margin[0] <= 0
-    assert np.array_equal(found.labels[3:], CLUSTER[3:])
+    assert segment(without_tree, words, EYE[:3]).labels[odd].tolist() == [-1, -1, -1]
+    segmentation = segment(with_tree, words, EYE[:3])
+    assert segmentation.labels[odd].tolist() == [0, -1, -1]
+    assert segmentation.score[0] < 0.2 and segmentation.margin[0] <= 0
+    assert np.array_equal(segmentation.labels[3:], CLUSTER[3:])
 
 
 def test_order_and_number_of_words_change_no_label(clear: Scene) -> None:
     words, vectors = [f"w{k}" for k in range(40)], np.random.default_rng(1).normal(size=(40, CHANNELS))
     words[:3], vectors[:3] = ["apple", "book", "lamp"], EYE[:3]
-    mixed = np.random.default_rng(2).permutation(40)
-    one = segment(clear, words, vectors)
-    other = segment(clear, [words[k] for k in mixed], vectors[mixed])
-    assert [one.words[row] for row in one.labels] == [other.words[row] for row in other.labels] == [
+    order = np.random.default_rng(2).permutation(40)
+    original = segment(clear, words, vectors)
+    permuted = segment(clear, [words[k] for k in order], vectors[order])
+    assert [original.words[row] for row in original.labels] == [permuted.words[row] for row in permuted.labels] == [
         words[cluster] for cluster in CLUSTER]  # fmt: skip
-    assert np.array_equal(one.margin, other.margin)
+    assert np.array_equal(original.margin, permuted.margin)
 
 
 @pytest.mark.parametrize(
@@ -117,47 +120,47 @@ def test_words_without_directions_of_their_own_are_refused(clear: Scene, words: 
 
 
 def test_a_lift_in_memory_is_segmented_by_one_call(clear: Scene) -> None:
-    found = LiftResult.of(clear.lift).segment(["apple", "book", "lamp"], torch.eye(CHANNELS)[:3], clear.splats)
-    assert np.array_equal(found.labels, CLUSTER)
+    segmentation = LiftResult.of(clear.lift).segment(["apple", "book", "lamp"], torch.eye(CHANNELS)[:3], clear.splats)
+    assert np.array_equal(segmentation.labels, CLUSTER)
 
 
 def test_words_need_no_vectors_where_there_is_an_encoder(clear: Scene, tmp_path: Path) -> None:
-    """A specification, an opened encoder, and at last none of the lift's space."""
+    """A specification, an open encoder, and last an error: no encoder of the lift's text space."""
     words, table = ["apple", "book", "lamp"], tmp_path / "table.safetensors"
     table.write_bytes(text_table())
     for encoder in (f"table:{table}", lc.open_encoder(f"table:{table}")):
-        found = LiftResult.of(clear.lift).segment(words, splats=clear.splats, encoder=encoder)
-        assert np.array_equal(found.labels, CLUSTER)
+        segmentation = LiftResult.of(clear.lift).segment(words, splats=clear.splats, encoder=encoder)
+        assert np.array_equal(segmentation.labels, CLUSTER)
     with pytest.raises(InvalidQuery, match="give encoder="):
         LiftResult.of(clear.lift).segment(words, splats=clear.splats)
     with pytest.raises(InvalidQuery, match="give encoder="):
         LiftResult.of(clear.lift).objects(clear.splats, words)
-    for nothing in ([], ["no such word"]):
+    for wrong_words in ([], ["no such word"]):
         with pytest.raises(InvalidQuery):
-            LiftResult.of(clear.lift).segment(nothing, splats=clear.splats, encoder=f"table:{table}")
+            LiftResult.of(clear.lift).segment(wrong_words, splats=clear.splats, encoder=f"table:{table}")
 
 
 def test_pictures_show_the_words_of_the_pixels(clear: Scene) -> None:
-    found = segment(clear, ["apple", "book"], EYE[:2])
-    values = word_map(clear, found, "middle")
-    with Image.open(io.BytesIO(map_png(values, found))) as picture:
+    segmentation = segment(clear, ["apple", "book"], EYE[:2])
+    values = word_map(clear, segmentation, "middle")
+    with Image.open(io.BytesIO(map_png(values, segmentation))) as picture:
         assert picture.mode == "P" and np.array_equal(np.asarray(picture), values)
         legend = json.loads(picture.info["legend"])
-        shown = np.asarray(picture.convert("RGB"))
+        pixels = np.asarray(picture.convert("RGB"))
     assert set(legend.values()) == {"apple", "book"}
-    left = {word: np.flatnonzero((values == int(value)).any(axis=0)).mean() for value, word in legend.items()}
-    assert left["apple"] < left["book"] < WIDTH / 2 + 3
-    assert not shown[values == 0].any() and (shown[values == 1] == found.colours[1]).all()
-    with Image.open(io.BytesIO(picture_png(render(clear, "middle"), values, found))) as picture:
+    columns = {word: np.flatnonzero((values == int(value)).any(axis=0)).mean() for value, word in legend.items()}
+    assert columns["apple"] < columns["book"] < WIDTH / 2 + 3
+    assert not pixels[values == 0].any() and (pixels[values == 1] == segmentation.colours[1]).all()
+    with Image.open(io.BytesIO(picture_png(render(clear, "middle"), values, segmentation))) as picture:
         assert picture.width > WIDTH and picture.height >= HEIGHT
 
 
 def test_coloured_splats_have_the_colours_of_their_words(clear: Scene, tmp_path: Path) -> None:
-    found = segment(clear, ["apple", "book"], EYE[:2])
-    (tmp_path / "named.ply").write_bytes(b"".join(named_ply(clear, found)))
-    seen = view_colours(read_splats(tmp_path / "named.ply"), clear.cameras["middle"]).numpy()
-    np.testing.assert_allclose(255 * seen, found.colours[found.values], atol=1e-2)
-    assert tuple(found.colours[0]) == NO_CLUSTER_COLOUR
+    segmentation = segment(clear, ["apple", "book"], EYE[:2])
+    (tmp_path / "named.ply").write_bytes(b"".join(named_ply(clear, segmentation)))
+    colours = view_colours(read_splats(tmp_path / "named.ply"), clear.cameras["middle"]).numpy()
+    np.testing.assert_allclose(255 * colours, segmentation.colours[segmentation.values], atol=1e-2)
+    assert tuple(segmentation.colours[0]) == NO_CLUSTER_COLOUR
 
 
 def test_labels_go_out_as_columns_and_a_document(tiny_lift: Path, tmp_path: Path, capsys) -> None:
@@ -197,28 +200,29 @@ def test_command_names_splats_and_examples(tiny_lift: Path, tmp_path: Path, caps
     (tmp_path / "words.txt").write_text("apple\nlamp\n\napple\n")
     ends = {"labels": "png", "picture": "png", "coloured": "ply", "splat_labels": "npy"}
     files = {kind: tmp_path / f"{kind}.{end}" for kind, end in ends.items()}
-    written = [part for kind, path in files.items() for part in (f"--{kind.replace('_', '-')}", str(path))]
+    options = [part for kind, path in files.items() for part in (f"--{kind.replace('_', '-')}", str(path))]
     command = ["segment", str(tiny_lift), "--table", str(tmp_path / "table.safetensors")]
-    assert cli.main([*command, "--view", "middle", *written, "--json"]) == 0
+    assert cli.main([*command, "--view", "middle", *options, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
-    assert {named["word"] for named in document["found"]} == {"apple", "book", "lamp"}
-    told = document["answer"]  # as HTTP has it; the other keys are those of before
+    assert {label["word"] for label in document["found"]} == {"apple", "book", "lamp"}
+    answer = document["answer"]  # as HTTP has it; the other keys are the older ones
     assert {name: document[name] for name in ("words", "splats", "none")} == {
         "words": 3,
         "splats": 60,
-        "none": told["none"],
+        "none": answer["none"],
     }
-    assert [[*one["box"].values()] for one in told["named_words"]] == [one["box"] for one in document["found"]]
+    boxes = [[*entry["box"].values()] for entry in answer["named_words"]]
+    assert boxes == [entry["box"] for entry in document["found"]]
     assert document["files"] == {kind: str(path) for kind, path in files.items()}
     values = np.load(files["splat_labels"])
-    for named in document["found"]:
-        assert (values == named["value"]).sum() == named["splats"]
-    asked = [*command, "--words", str(tmp_path / "words.txt"), "--example", "splat:0", "--top", "1"]
-    assert cli.main([*asked, "--json"]) == 0
+    for label in document["found"]:
+        assert (values == label["value"]).sum() == label["splats"]
+    arguments = [*command, "--words", str(tmp_path / "words.txt"), "--example", "splat:0", "--top", "1"]
+    assert cli.main([*arguments, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     (best,) = document["examples"]
     assert best["example"] == "splat:0" and best["words"] == document["what"]["splat:0"]
-    assert cli.main(asked) == 0
+    assert cli.main(arguments) == 0
     assert capsys.readouterr().out.startswith("splat:0: apple ")
     assert cli.main([*command, "--words", str(tmp_path / "words.txt")]) == 0
     assert "2 of 2 words" in capsys.readouterr().out
@@ -228,23 +232,23 @@ def test_command_names_splats_and_examples(tiny_lift: Path, tmp_path: Path, caps
 
 
 def test_a_camera_of_ones_own_is_seen_from(tiny_lift: Path, tmp_path: Path, capsys) -> None:
-    known = read_cameras(tiny_lift.parent / "c.json")
-    own, two = tmp_path / "own.json", tmp_path / "two.json"
-    write_inria_cameras(Cameras((known["middle"].replace(name="mine"),)), own)
-    write_inria_cameras(Cameras((known["middle"].replace(name="mine"), known["left"])), two)
+    cameras = read_cameras(tiny_lift.parent / "c.json")
+    own_file, file_of_two = tmp_path / "own.json", tmp_path / "two.json"
+    write_inria_cameras(Cameras((cameras["middle"].replace(name="mine"),)), own_file)
+    write_inria_cameras(Cameras((cameras["middle"].replace(name="mine"), cameras["left"])), file_of_two)
     command = ["query", str(tiny_lift), "--like", "splat:0", "--mask"]
     assert cli.main([*command, str(tmp_path / "lift.png"), "--view", "middle"]) == 0
-    assert cli.main([*command, str(tmp_path / "own.png"), "--camera", str(own)]) == 0
+    assert cli.main([*command, str(tmp_path / "own.png"), "--camera", str(own_file)]) == 0
     assert "view mine" in capsys.readouterr().out
-    assert cli.main([*command, str(tmp_path / "of_two.png"), "--camera", str(two), "--view", "mine"]) == 0
+    assert cli.main([*command, str(tmp_path / "of_two.png"), "--camera", str(file_of_two), "--view", "mine"]) == 0
     for name in ("own.png", "of_two.png"):
         assert (tmp_path / name).read_bytes() == (tmp_path / "lift.png").read_bytes()
     capsys.readouterr()
-    assert cli.main([*command, str(tmp_path / "m.png"), "--camera", str(two)]) == 2
+    assert cli.main([*command, str(tmp_path / "m.png"), "--camera", str(file_of_two)]) == 2
     assert "--camera: expected one camera, got 2 of them" in capsys.readouterr().err
 
 
 def test_one_word_names_splats_without_a_margin(clear: Scene) -> None:
     words, vectors = ["a"], np.eye(1, CHANNELS)
-    found = segment(clear, words, vectors)
-    assert not found.margin.any() and set(np.unique(found.labels)) <= {-1, 0}
+    segmentation = segment(clear, words, vectors)
+    assert not segmentation.margin.any() and set(np.unique(segmentation.labels)) <= {-1, 0}

@@ -1,4 +1,4 @@
-"""What is selected answers the question: other words compete, zero scores select nothing, things are taken whole."""
+"""Rules of a selection: other words compete, zero scores select nothing, objects are selected as a whole."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,7 +18,7 @@ from liftcore.text import LVIS_TABLE
 from liftcore.text.table import TableEncoder
 
 CAT, COW, CURTAIN = 21, 2320, 659  # splats: .7 % of the total weight, 77.3 % and 22 %
-THINGS = np.repeat([0, 1, 2], [CAT, COW, CURTAIN])
+OBJECTS = np.repeat([0, 1, 2], [CAT, COW, CURTAIN])
 
 
 @pytest.fixture(scope="module")
@@ -27,20 +27,23 @@ def table() -> TableEncoder:
 
 
 def lifted(scene: Scene, features: np.ndarray, **fields: Any) -> Scene:
-    """A lift of other features [P, F], of total weight one."""
+    """Return the scene with these features [P, F], of total weight one."""
     ones = torch.ones(len(features))
-    given = {"total_weight": ones, "agreement": ones, "seen": ones > 0, "object": None, "object_views": None}
-    return Scene(replace(scene.lift, features=torch.from_numpy(features.astype(np.float32)), **given | fields))
+    defaults = {"total_weight": ones, "agreement": ones, "seen": ones > 0, "object": None, "object_views": None}
+    return Scene(replace(scene.lift, features=torch.from_numpy(features.astype(np.float32)), **defaults | fields))
 
 
 def noisy(vectors: np.ndarray, noise: float, seed: int = 0) -> np.ndarray:
-    """Vectors [n, F] with noise of a length."""
-    more = np.random.default_rng(seed).normal(size=vectors.shape)
-    return vectors + noise * more / np.linalg.norm(more, axis=1, keepdims=True)
+    """Return vectors [n, F] with an added offset of length ``noise`` each."""
+    offsets = np.random.default_rng(seed).normal(size=vectors.shape)
+    return vectors + noise * offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
 
 
 def pictures(table: TableEncoder, words: Sequence[str], noise: float, hub: float = 0.0) -> np.ndarray:
-    """[n, 512]: vectors as a photo's are, .29 like their word, .22 like others; ``hub`` draws them to some words."""
+    """Return [n, 512], vectors like those of photos: cosine .29 to their word, .22 to others; ``hub`` adds hub words.
+
+    Hub words are nearer to all vectors than other words are, by a vector of length ``hub`` towards them.
+    """
     rows, mean = table.encode(words), table.embeddings.mean(axis=0)
     gap = np.random.default_rng(5).normal(size=512)
     gap -= mean * (gap @ mean) / np.square(mean).sum()
@@ -50,37 +53,39 @@ def pictures(table: TableEncoder, words: Sequence[str], noise: float, hub: float
 
 @pytest.fixture
 def thin(scene: Scene, table: TableEncoder) -> Scene:
-    """A thin cat before a large cow and a curtain, whose scores part far below the cat."""
-    words = np.array(["cat", "cow", "curtain"])[THINGS].tolist()
+    """A thin cat in front of a large cow and a curtain: the scores of these two part far below the cat's."""
+    words = np.array(["cat", "cow", "curtain"])[OBJECTS].tolist()
     return lifted(scene, pictures(table, words, 0.2))
 
 
-def test_thin_thing_does_not_take_the_scene(thin: Scene, table: TableEncoder) -> None:
+def test_query_of_a_thin_object_does_not_select_the_scene(thin: Scene, table: TableEncoder) -> None:
     scores = ask(thin, Query.of(("cat",), threshold=0.0), table).scores
-    plain = scores >= find_threshold(scores).value
-    assert plain.mean() > 0.5  # which the histogram alone selects
+    above_threshold = scores >= find_threshold(scores).value
+    assert above_threshold.mean() > 0.5  # which the histogram alone selects
     answer = ask(thin, "cat", table)
     assert answer.present is not False
-    assert answer.selected[THINGS == 0].mean() > 0.4
+    assert answer.selected[OBJECTS == 0].mean() > 0.4
     assert answer.selected.sum() < 3 * CAT
     assert "other words are nearer" in answer.threshold.explanation
-    for method in ("otsu", 0.0):  # what was asked for by name is done as asked
-        found = ask(thin, Query.of(("cat",), threshold=method), table)
-        assert np.array_equal(found.selected, found.scores >= np.float32(found.threshold.value))
+    for method in ("otsu", 0.0):  # an explicit method or threshold is applied as it is
+        by_method = ask(thin, Query.of(("cat",), threshold=method), table)
+        assert np.array_equal(by_method.selected, by_method.scores >= np.float32(by_method.threshold.value))
 
 
 def test_competition_keeps_what_the_histogram_finds_well(thin: Scene, table: TableEncoder) -> None:
     answer = ask(thin, "curtain", table)
     assert answer.threshold.value == find_threshold(answer.scores).value
     assert np.array_equal(answer.selected, answer.scores >= np.float32(answer.threshold.value))
-    assert answer.selected[THINGS == 2].mean() > 0.9 and answer.clear
+    assert answer.selected[OBJECTS == 2].mean() > 0.9 and answer.clear
 
 
 def test_selection_has_the_same_bits_together_and_alone(thin: Scene, table: TableEncoder) -> None:
-    asked = [resolve_query(thin, Query.of((word,), absent="keep"), table) for word in ("cat", "cow", "sofa")]
-    for together, one in zip(answers(thin, asked), asked, strict=True):
-        (alone,) = answers(thin, [one])
-        assert np.array_equal(together.selected, alone.selected) and together.threshold == alone.threshold
+    resolved_queries = [
+        resolve_query(thin, Query.of((word,), absent="keep"), table) for word in ("cat", "cow", "sofa")
+    ]
+    for batched, resolved_query in zip(answers(thin, resolved_queries), resolved_queries, strict=True):
+        (single,) = answers(thin, [resolved_query])
+        assert np.array_equal(batched.selected, single.selected) and batched.threshold == single.threshold
 
 
 @pytest.mark.parametrize("method", [*METHODS, 0.0, -1.0])
@@ -95,51 +100,52 @@ def test_equal_or_zero_scores_select_nothing_and_say_why(scene: Scene, method: s
 
 
 def test_words_of_a_pack_compete_with_each_other(scene: Scene) -> None:
-    """Four words in a table of their own: where another one is nearer, a splat is not selected."""
+    """Four words in one table: a splat with another nearer word is not selected."""
     axes = np.eye(8, dtype=np.float32)
     rows = np.repeat(axes[:3], 20, axis=0)
-    rows[20:40, 0] = 0.9  # nearer to the second word, and like the first
+    rows[20:40, 0] = 0.9  # nearer to the second word, but also like the first
     rows = noisy(rows, 0.02)
     pack = TableEncoder("pack", ("one", "two", "three", "first"), axes[[0, 1, 2, 0]])
-    plain = find_threshold(ask(lifted(scene, rows), Query.of(("one",), threshold=0.0), pack).scores).value
-    assert (ask(lifted(scene, rows), Query.of(("one",), threshold=plain), pack).selected).sum() == 40
+    threshold = find_threshold(ask(lifted(scene, rows), Query.of(("one",), threshold=0.0), pack).scores).value
+    assert (ask(lifted(scene, rows), Query.of(("one",), threshold=threshold), pack).selected).sum() == 40
     answer = ask(lifted(scene, rows), "one", pack)  # "first" is the same word, and takes nothing
     assert np.flatnonzero(answer.selected).tolist() == list(range(20))
-    both = ask(lifted(scene, rows), Query.of(("one", "two")), pack)
-    assert np.flatnonzero(both.selected).tolist() == list(range(40))
+    combined = ask(lifted(scene, rows), Query.of(("one", "two")), pack)
+    assert np.flatnonzero(combined.selected).tolist() == list(range(40))
 
 
-def test_what_hubs_hide_is_not_sure_and_shown(scene: Scene, table: TableEncoder) -> None:
-    """Splats that all lie nearer to some words than to their own, as images may: contrast tells them apart."""
+def test_presence_hidden_by_hubs_is_unsure_and_selected(scene: Scene, table: TableEncoder) -> None:
+    """Splats nearer to some hub words than to their own word, as images may be: contrast still separates them."""
     words = [word for word in ("cat", "boat", "pizza") for _ in range(200)]
-    drawn = lifted(scene, pictures(table, words, 0.2, hub=0.3))
-    found = ask(drawn, "pizza", table)
-    assert found.present is None and "not sure" in found.reason
-    assert found.presence is not None and found.presence < 0.5
-    assert found.selected[400:].mean() > 0.9 and found.count < 300
-    assert ask(drawn, "sofa", table).present is False
+    with_hubs = lifted(scene, pictures(table, words, 0.2, hub=0.3))
+    answer = ask(with_hubs, "pizza", table)
+    assert answer.present is None and "not sure" in answer.reason
+    assert answer.presence is not None and answer.presence < 0.5
+    assert answer.selected[400:].mean() > 0.9 and answer.count < 300
+    assert ask(with_hubs, "sofa", table).present is False
 
 
-def test_thing_that_is_mostly_selected_is_taken_whole_unless_it_holds_two(scene: Scene, table: TableEncoder) -> None:
+def test_mostly_selected_object_is_selected_whole_unless_it_holds_two(scene: Scene, table: TableEncoder) -> None:
     words = ["cat"] * 300 + ["boat"] * 200 + ["pizza"] * 200
     rows = pictures(table, words, 0.1)
     rows[200:300] = pictures(table, ["cat"] * 100, 0.1) * 0.6 + 0.4 * pictures(table, ["zebra"] * 100, 0.1)
     views = torch.zeros((3, 5), dtype=torch.int32)
-    one = torch.from_numpy(np.repeat([0, 1, 2], [300, 200, 200]).astype(np.int32))
-    two = torch.from_numpy(np.repeat([0, 1, 2], [400, 100, 200]).astype(np.int32))  # half of the boat in the cat's
+    separate_labels = torch.from_numpy(np.repeat([0, 1, 2], [300, 200, 200]).astype(np.int32))
+    # Half of the boat is in the cat's object.
+    mixed_labels = torch.from_numpy(np.repeat([0, 1, 2], [400, 100, 200]).astype(np.int32))
     cut = ask(lifted(scene, rows), "cat", table)
-    whole = ask(lifted(scene, rows, object=one, object_views=views), "cat", table)
+    complete = ask(lifted(scene, rows, object=separate_labels, object_views=views), "cat", table)
     assert cut.selected[:200].mean() > 0.9
-    assert np.flatnonzero(whole.selected).tolist() == list(range(300))
-    mixed = ask(lifted(scene, rows, object=two, object_views=views), "cat", table)
-    assert not mixed.selected[300:].any()
+    assert np.flatnonzero(complete.selected).tolist() == list(range(300))
+    of_mixed = ask(lifted(scene, rows, object=mixed_labels, object_views=views), "cat", table)
+    assert not of_mixed.selected[300:].any()
 
 
 def test_word_near_to_all_of_a_scene_keeps_no_rest_from_its_thing(scene: Scene, table: TableEncoder) -> None:
     rows = pictures(table, ["cat"] * 300 + ["boat"] * 200 + ["pizza"] * 200, 0.1)
     rows[130:300] *= 0.8
     boat, cat = table.encode(["boat", "cat"])
-    bias = 0.12 * (boat - cat)  # of all splats alike: the rest of the cat is nearer to the boat's word as it lies
+    bias = 0.12 * (boat - cat)  # the same for all splats: it makes the rest of the cat nearer to the boat's word
     numbers = torch.from_numpy(np.repeat([0, 1, 2], [300, 200, 200]).astype(np.int32))
     views, cats = torch.zeros((3, 5), dtype=torch.int32), np.arange(700) < 130
     rivals = CompetingWords.among(References(tuple(table.words), table.embeddings), cat[None])
@@ -150,53 +156,53 @@ def test_word_near_to_all_of_a_scene_keeps_no_rest_from_its_thing(scene: Scene, 
     assert np.array_equal(answer, np.arange(700) < 300)
 
 
-def test_of_a_thing_with_another_nearer_word_nothing_is_selected(scene: Scene, table: TableEncoder) -> None:
+def test_object_with_another_nearer_word_is_not_selected(scene: Scene, table: TableEncoder) -> None:
     words = ["sheep"] * 300 + ["cow"] * 200 + ["curtain"] * 1200
-    things = torch.from_numpy(np.repeat([0, 1, 2], [300, 200, 1200]).astype(np.int32))
+    labels = torch.from_numpy(np.repeat([0, 1, 2], [300, 200, 1200]).astype(np.int32))
     rows, views = pictures(table, words, 0.1), torch.zeros((3, 5), dtype=torch.int32)
-    rows[:40] = 0.5 * rows[:40] + 0.5 * pictures(table, ["cow"] * 40, 0.1)  # of the sheep, and somewhat like a cow
-    merged = pictures(table, ["cow"] * 40 + words[40:], 0.1)  # of a cow that masks keep with the sheep
-    ways: tuple[dict[str, Any], ...] = {}, {"object": things, "object_views": views}
-    found = [ask(lifted(scene, some, **fields), "cow", table) for some in (rows, merged) for fields in ways]
-    assert found[0].selected[:40].mean() > 0.5 and not found[1].selected[:300].any()
-    assert "another word is nearer" in found[1].threshold.explanation
-    assert found[2].selected[:40].mean() > 0.5 and (found[3].selected >= found[2].selected)[:40].all()
-    assert all(one.selected[300:500].mean() > 0.9 for one in found)
+    rows[:40] = 0.5 * rows[:40] + 0.5 * pictures(table, ["cow"] * 40, 0.1)  # a part of the sheep, a little like a cow
+    merged = pictures(table, ["cow"] * 40 + words[40:], 0.1)  # a cow that masks merge with the sheep
+    ways: tuple[dict[str, Any], ...] = {}, {"object": labels, "object_views": views}
+    cases = [ask(lifted(scene, features, **fields), "cow", table) for features in (rows, merged) for fields in ways]
+    assert cases[0].selected[:40].mean() > 0.5 and not cases[1].selected[:300].any()
+    assert "another word is nearer" in cases[1].threshold.explanation
+    assert cases[2].selected[:40].mean() > 0.5 and (cases[3].selected >= cases[2].selected)[:40].all()
+    assert all(case.selected[300:500].mean() > 0.9 for case in cases)
 
 
-def test_of_a_thing_that_holds_two_what_is_nearest_to_it_is_taken(scene: Scene, table: TableEncoder) -> None:
+def test_of_an_object_that_holds_two_the_nearer_part_is_selected(scene: Scene, table: TableEncoder) -> None:
     words = ["cat"] * 300 + ["boat"] * 200 + ["pizza"] * 200
     rows = pictures(table, words, 0.1)
     rows[250:300] = 0.55 * rows[250:300] + 0.45 * pictures(table, ["zebra"] * 50, 0.1)
-    things = np.repeat([0, 1, 2], [360, 140, 200]).astype(np.int32)  # sixty splats of the boat are in the cat's
+    labels = np.repeat([0, 1, 2], [360, 140, 200]).astype(np.int32)  # sixty splats of the boat are in the cat's
     views = torch.zeros((3, 5), dtype=torch.int32)
     cut = ask(lifted(scene, rows), "cat", table)
-    found = ask(lifted(scene, rows, object=torch.from_numpy(things), object_views=views), "cat", table)
-    assert cut.selected[250:300].mean() < 0.5 < found.selected[250:300].mean()
-    assert not found.selected[300:].any()
+    answer = ask(lifted(scene, rows, object=torch.from_numpy(labels), object_views=views), "cat", table)
+    assert cut.selected[250:300].mean() < 0.5 < answer.selected[250:300].mean()
+    assert not answer.selected[300:].any()
 
 
 @pytest.fixture
 def handles(scene: Scene, table: TableEncoder) -> Scene:
-    """Two mugs with handles, of which one has two, a cat without, and the handle of nothing."""
+    """Two mugs, one with one handle and one with two, a cat without a handle, and a handle of no object."""
     rows = pictures(table, ["mug"] * 600 + ["cat"] * 300 + ["handle"] * 60 + ["curtain"] * 1200, 0.1)
     for first in (140, 300, 500):
         part = slice(first, first + 50)
         rows[part] = 0.4 * rows[part] + 0.6 * pictures(table, ["handle"] * 50, 0.1)
-    things = torch.from_numpy(np.repeat([0, 1, 2, 3, 4], [200, 400, 300, 60, 1200]).astype(np.int32))
-    return lifted(scene, rows, object=things, object_views=torch.zeros((5, 5), dtype=torch.int32))
+    labels = torch.from_numpy(np.repeat([0, 1, 2, 3, 4], [200, 400, 300, 60, 1200]).astype(np.int32))
+    return lifted(scene, rows, object=labels, object_views=torch.zeros((5, 5), dtype=torch.int32))
 
 
 @pytest.mark.parametrize("phrase", ["mug handle", "handle of the mug", "the mug's handles", "a handle of my mug"])
 def test_phrase_finds_the_part_within_the_thing_alone(phrase: str, handles: Scene, table: TableEncoder) -> None:
     answer = ask(handles, phrase, table)
-    wanted = np.concatenate([np.arange(first, first + 50) for first in (140, 300, 500)])
-    assert answer.selected[wanted].mean() > 0.9 and not np.delete(answer.selected, wanted).any()
+    expected = np.concatenate([np.arange(first, first + 50) for first in (140, 300, 500)])
+    assert answer.selected[expected].mean() > 0.9 and not np.delete(answer.selected, expected).any()
     (wording,) = answer.wording
     assert (wording.text, wording.word, wording.match) == (phrase, "handle of the mug", "part")
     assert answer.present is not False and "Within it" in answer.reason and answer.query.text == [phrase]
-    together = answers(handles, [resolve_query(handles, Query.of(some), table) for some in ("cat", phrase)])
-    assert (together[1].scores == answer.scores).all() and (together[1].selected == answer.selected).all()
+    batched = answers(handles, [resolve_query(handles, Query.of(text), table) for text in ("cat", phrase)])
+    assert (batched[1].scores == answer.scores).all() and (batched[1].selected == answer.selected).all()
 
 
 def test_part_is_asked_by_its_own_word(handles: Scene, table: TableEncoder) -> None:
@@ -232,21 +238,21 @@ def test_word_of_a_part_takes_its_node_where_levels_disagree(
 ) -> None:
     rows = pictures(table, ["mug"] * 300 + ["cat"] * 300 + ["curtain"] * 900, 0.1)
     rows[:60] = 0.85 * rows[:60] + 0.15 * pictures(table, ["handle"] * 60, 0.1)  # the sum of both levels
-    own = pictures(table, ["mug", "cat", "curtain", "handle", "mug"], 0.02)
+    node_features = pictures(table, ["mug", "cat", "curtain", "handle", "mug"], 0.02)
     tree = {
         "object": np.repeat([0, 1, 2], [300, 300, 900]), "object_views": np.zeros((3, 5)),
         "node": np.repeat([3, 4, 1, 2], [60, 240, 300, 900]), "node_parents": np.array([-1, -1, -1, 0, 0]),
         "node_views": np.zeros((5, 5)),
     }  # fmt: skip
     fields: dict[str, Any] = {name: torch.from_numpy(values.astype(np.int32)) for name, values in tree.items()}
-    fields |= {"node_confidence": torch.ones(5), "node_features": torch.from_numpy(own).half()}
+    fields |= {"node_confidence": torch.ones(5), "node_features": torch.from_numpy(node_features).half()}
     facts = {"diagnostics": {"objects": {"level_agreement": agreement}}}
-    told = lifted(scene, rows, metadata=scene.lift.metadata.model_copy(update=facts), **fields)
-    found = ask(told, Query.of(("handle",), absent="keep"), table)
-    assert (np.flatnonzero(found.selected).tolist() == list(range(60))) == by_node
-    assert ("the named parts are selected" in found.threshold.explanation) == by_node
-    assert np.flatnonzero(ask(told, "mug", table).selected)[[0, -1]].tolist() == [0, 299]
+    subject = lifted(scene, rows, metadata=scene.lift.metadata.model_copy(update=facts), **fields)
+    answer = ask(subject, Query.of(("handle",), absent="keep"), table)
+    assert (np.flatnonzero(answer.selected).tolist() == list(range(60))) == by_node
+    assert ("the named parts are selected" in answer.threshold.explanation) == by_node
+    assert np.flatnonzero(ask(subject, "mug", table).selected)[[0, -1]].tolist() == [0, 299]
     references = References(tuple(table.words), table.embeddings)
-    every = parts_of_words(told, references, table.embeddings)
-    alone = [part_nodes(told, CompetingWords.among(references, word[None])) for word in table.embeddings]
-    assert every == alone and any(every) == by_node
+    all_parts = parts_of_words(subject, references, table.embeddings)
+    single_parts = [part_nodes(subject, CompetingWords.among(references, word[None])) for word in table.embeddings]
+    assert all_parts == single_parts and any(all_parts) == by_node

@@ -1,4 +1,4 @@
-"""Selections: what each edit takes, against slow definitions; the way back; and what is asked of them."""
+"""Selections: each edit against its slow definition, undo and redo, and queries of a selection."""
 
 from __future__ import annotations
 
@@ -66,17 +66,17 @@ def test_stroke_marks_the_pixels_within_its_radius(radius: float) -> None:
             way = np.array([bx - ax, by - ay], np.float64)
             share = np.clip(((x - ax) * way[0] + (y - ay) * way[1]) / max(way @ way, 1.0), 0, 1)
             far = np.minimum(far, np.hypot(x - ax - share * way[0], y - ay - share * way[1]))
-        marked = area_mask(Stroke("view", tuple(map(tuple, corners))), (width, height), radius)
+        mask = area_mask(Stroke("view", tuple(map(tuple, corners))), (width, height), radius)
         off_the_edge = np.abs(far - radius) > 1e-5
-        assert (marked == (far <= radius))[off_the_edge].all() and marked[far == radius].all()
+        assert (mask == (far <= radius))[off_the_edge].all() and mask[far == radius].all()
 
 
 @pytest.mark.parametrize("area", ["camera:box:12,2,19,20", "camera:stroke:14,4,17,22"])
 def test_area_takes_the_splats_whose_centres_are_seen_there(area: str, scene: Scene) -> None:
-    # By the definition in float64: a dense A tells at which splat a ray has lost its light.
+    # By the definition in float64: a dense A has the splat at which a ray's accumulated weight reaches 0.75.
     from_the_left = [[0, 0, 1, 4], [0, -1, 0, 0], [1, 0, 0, 5], [0, 0, 0, 1]]  # one cluster behind the other
     camera = Camera.pinhole("camera", 32, 24, 60, 60, 16, 12, from_the_left)
-    numbers = [int(one) for one in area.split(":")[2].split(",")]
+    numbers = [int(number) for number in area.split(":")[2].split(",")]
     x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     if "box" in area:
         mask = (x >= numbers[0]) & (x < numbers[2]) & (y >= numbers[1]) & (y < numbers[3])
@@ -106,35 +106,35 @@ def test_area_takes_the_splats_whose_centres_are_seen_there(area: str, scene: Sc
 
 
 def test_selection_grows_and_shrinks_by_splats_that_touch(scene: Scene) -> None:
-    own, near = touching_pairs(scene.splats, ALL)
-    pairs = {(int(a), int(b)) for one, other in zip(own, near, strict=True) for a, b in ((one, other), (other, one))}
+    first, second = touching_pairs(scene.splats, ALL)
+    pairs = {(int(a), int(b)) for p, q in zip(first, second, strict=True) for a, b in ((p, q), (q, p))}
     seed = ALL == 30
     selection = scene.select("mine", seed).edit("grow", steps=2)
-    grown = {30}
+    expected = {30}
     for _ in range(2):
-        grown |= {b for a, b in pairs if a in grown}
-    assert set(rows_of(selection.splats)) == grown and 1 < len(grown) < len(ALL)
+        expected |= {b for a, b in pairs if a in expected}
+    assert set(rows_of(selection.splats)) == expected and 1 < len(expected) < len(ALL)
     selection.edit("shrink")
-    assert set(rows_of(selection.splats)) == {a for a in grown if all(b in grown for x, b in pairs if x == a)}
-    whole = scene.select("mine", cluster(1)).edit("grow", steps=100)
-    assert rows_of(whole.splats) == rows_of(cluster(1))  # the clusters lie apart
+    assert set(rows_of(selection.splats)) == {a for a in expected if all(b in expected for x, b in pairs if x == a)}
+    complete = scene.select("mine", cluster(1)).edit("grow", steps=100)
+    assert rows_of(complete.splats) == rows_of(cluster(1))  # the clusters lie apart
 
 
 def test_selection_is_asked_and_exported_as_it_is(scene: Scene, tmp_path: Path) -> None:
-    strange = cluster(0) | (ALL == 59)  # a splat far away is no stray of a selection
+    strange = cluster(0) | (ALL == 59)  # a distant splat of a selection belongs to its object
     scene.select("mine", strange)
     answer = scene.ask(Query(sets=["selection:mine"]))
     assert rows_of(answer.selected) == rows_of(strange) and answer.present and answer.count == 21
-    found = scene.objects(answer)
-    assert [one.splats for one in found.objects] == [21] and found.unassigned_splats == 0
-    assert found.objects[0].box == scene.select("mine").box
+    grouping = scene.objects(answer)
+    assert [obj.splats for obj in grouping.objects] == [21] and grouping.unassigned_splats == 0
+    assert grouping.objects[0].box == scene.select("mine").box
     scene.export(tmp_path / "object.ply", answer, "object")
     assert Scene(scene.lift).splats.count == 60
     assert b"element vertex 21\n" in (tmp_path / "object.ply").read_bytes()[:200]
     like = scene.ask(Query(like=["selection:mine"]))
     assert rows_of(like.selected) == rows_of(cluster(0))
-    both = scene.select("other", cluster(2)) and scene.objects(Query(sets=["selection:other", "selection:mine"]))
-    assert sorted(one.splats for one in both.objects) == [20, 20]  # a splat of two sets is of the first
+    two_sets = scene.select("other", cluster(2)) and scene.objects(Query(sets=["selection:other", "selection:mine"]))
+    assert sorted(obj.splats for obj in two_sets.objects) == [20, 20]  # a splat of two sets is of the first
 
 
 def test_edits_without_a_source_or_with_two_are_refused(scene: Scene) -> None:

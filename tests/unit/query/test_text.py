@@ -1,4 +1,4 @@
-"""Text encoders: look-ups, meanings, shapes, and what is said when something is missing."""
+"""Text encoders: look-ups, meanings, shapes, and errors of missing words and weights."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""Thresholds without ground truth: where they fall, and that nothing makes them fail."""
+"""Thresholds without ground truth: their values, and that no input makes them fail."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SEARCHED = tuple(METHODS)  # every method that looks at the scores
 
 
 def hills(*parts: tuple[float, float, int], seed: int = 0) -> torch.Tensor:
-    """Normal hills of (mean, deviation, count)."""
+    """Return scores [n] f32 of normal distributions, each of (mean, deviation, count)."""
     rng = np.random.default_rng(seed)
     return torch.from_numpy(np.concatenate([rng.normal(*part) for part in parts]).astype(np.float32))
 

@@ -1,4 +1,4 @@
-"""A lift on other splats of its scene: rows where they are kept, mixtures where not, and a moved scene found."""
+"""Transfer of a lift to other splats of its scene: equal rows, mixtures, and an aligned scene after a motion."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CLUSTER = np.repeat(np.arange(3), SPLATS_A_CLUSTER)
 
 @pytest.fixture
 def lifted(scene: Scene) -> tuple[LiftResult, Splats]:
-    """The tiny scene's lift and splats, which have colours that tell splats apart."""
+    """The tiny scene's lift and splats, with distinct colours."""
     sh = torch.from_numpy(np.random.default_rng(5).uniform(-1.5, 1.5, (scene.splats.count, 1, 3)).astype("f4"))
     splats = Splats(
         **{name: getattr(scene.splats, name) for name in ("means", "quats", "log_scales", "opacity_logits")}, sh=sh

@@ -1,4 +1,4 @@
-"""Words as people type them: what each is asked as, and what is said of those that nothing stands for."""
+"""Words as people type them: the word of the table that stands for each, and errors for those without one."""
 
 from functools import cache
 
@@ -75,7 +75,7 @@ def test_what_is_like_nothing_has_no_words_near_to_it(text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "thing", "part"),
+    ("text", "object_phrase", "part"),
     [
         ("the mug's handle", "mug", "handle"), ("handles of the mug", "mug", "handle"),
         ("mug handle", "mug", "handle"), ("wheel of my old car", "car (automobile)", "wheel"),
@@ -87,9 +87,9 @@ def test_what_is_like_nothing_has_no_words_near_to_it(text: str) -> None:
         ("lamp shade", None, None), ("the red cup", None, None), ("a " * 500, None, None), ("cat", None, None),
     ],
 )  # fmt: skip
-def test_part_and_thing_of_a_phrase_are_found(text: str, thing: str | None, part: str | None) -> None:
-    found = lvis().find_part(text)
-    assert (found.object_phrase, found.part) == (thing, part) if found else thing is None
+def test_part_and_thing_of_a_phrase_are_found(text: str, object_phrase: str | None, part: str | None) -> None:
+    phrase = lvis().find_part(text)
+    assert (phrase.object_phrase, phrase.part) == (object_phrase, part) if phrase else object_phrase is None
 
 
 @pytest.mark.parametrize("text", ["men's shoes", "children\u2019s toys", "babies' bottles"])
@@ -101,7 +101,7 @@ def test_several_owners_without_an_article_may_name_a_kind(text: str) -> None:
     assert wording is not None and wording.word in ("shoe", "toy", "bottle")
 
 
-def test_a_part_that_no_word_stands_for_is_told_from_its_thing() -> None:
+def test_a_part_that_no_word_stands_for_is_separated_from_its_object() -> None:
     assert lvis().unknown_part("the black cat's tail") == ("cat", "tail", True)
     assert lvis().unknown_part("tip of the umbrella") == ("umbrella", "tip", True)
     texts = ("the mug's handle", "cat", "cat tail", "the zebu's tail", "cup of tea", "a photo of the cat")
@@ -109,11 +109,12 @@ def test_a_part_that_no_word_stands_for_is_told_from_its_thing() -> None:
 
 
 def test_words_of_a_short_table_are_found_by_meaning() -> None:
-    own = Vocabulary(OF_SCENE)
-    assert [own.find(text) for text in ("kitten", "teacup", "bull", "wolf")] == [None] * 4
-    assert own.nearest("kitten")[0] == "cat" and own.nearest("teacup")[0] == "teapot"
-    assert own.nearest("bull")[0] == "cow" and own.nearest("guitar") == ("violin",)
-    assert own.find("ship") == ("ship", "boat", "synonym") and own.find("plane") == ("plane", "airplane", "synonym")
+    vocabulary = Vocabulary(OF_SCENE)
+    assert [vocabulary.find(text) for text in ("kitten", "teacup", "bull", "wolf")] == [None] * 4
+    assert vocabulary.nearest("kitten")[0] == "cat" and vocabulary.nearest("teacup")[0] == "teapot"
+    assert vocabulary.nearest("bull")[0] == "cow" and vocabulary.nearest("guitar") == ("violin",)
+    assert vocabulary.find("ship") == ("ship", "boat", "synonym")
+    assert vocabulary.find("plane") == ("plane", "airplane", "synonym")
     assert Vocabulary(["donut", "Car_(Automobile)"]).find("doughnuts") == ("doughnuts", "donut", "synonym")
     assert Vocabulary(["donut", "Car_(Automobile)"]).find("cars") == ("cars", "Car (Automobile)", "number")
 
@@ -124,7 +125,7 @@ def test_words_of_the_scene_come_first_of_their_kind() -> None:
 
 def test_what_is_typed_is_completed_by_words_synonyms_and_letters() -> None:
     typed = ("dou", "don", "the tea", "pingu", "bunn", "")
-    words = {text: [one.word for one in lvis().complete(text)] for text in typed}
+    words = {text: [completion.word for completion in lvis().complete(text)] for text in typed}
     assert words["dou"][0] == "doughnut" and "doughnut" in words["don"] and "teapot" in words["the tea"]
     assert "penguin" in words["pingu"] and "rabbit" in words["bunn"] and words[""] == []
     assert ("doughnut", "donut") in lvis().complete("don") and len(lvis().complete("c", 5)) == 5
@@ -137,11 +138,11 @@ def test_answer_says_what_a_text_was_asked_as(scene: Scene) -> None:
     assert (wording.text, wording.word, wording.match) == ("some red apples", "apple", "head")
     assert (answer.scores == scene.ask("apple", encoder=table, places=False).scores).all()
     assert scene.ask("apple", encoder=table, places=False).wording == ()
-    with pytest.raises(InvalidQuery, match="got 'boook'") as caught:
+    with pytest.raises(InvalidQuery, match="got 'boook'") as info:
         scene.ask("boook", encoder=table)
-    assert caught.value.nearest == ("book",)
-    with pytest.raises(InvalidQuery) as caught:
+    assert info.value.nearest == ("book",)
+    with pytest.raises(InvalidQuery) as info:
         scene.ask("sky", encoder=table)
-    assert set(caught.value.nearest or ()) == {"apple", "book", "lamp"}  # what is in the scene
+    assert set(info.value.nearest or ()) == {"apple", "book", "lamp"}  # what is in the scene
     assert scene.askable("ap", encoder=table).words[0].word == "apple"
     assert set(scene.askable(encoder=table).scene_words) == {"apple", "book", "lamp"}
