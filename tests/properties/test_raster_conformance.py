@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 UNDECIDED = 0.03  # of rays too close to call in a weighting, which no comparison sees
 GAIN = CompositingParams(opacity_logit_scale=1.2)
-WALKS = (
+PARAMS = (
     CompositingParams(),
     GAIN,
     CompositingParams(opacity_logit_scale=0.5),
@@ -67,13 +67,13 @@ pytestmark = pytest.mark.usefixtures("every_kernel")
 every_footprint = pytest.mark.parametrize("footprint", FOOTPRINTS)
 
 
-def drawn(
+def draw_case(
     data: st.DataObject, footprint: str, backend: Backend, *, strided: bool = False
 ) -> tuple[Splats, Camera, ViewFeatures, CompositingParams]:
     """A scene of the kernel, a view, what it observes, and a walk, over some of its pixels if asked."""
     kernel, antialiased = FOOTPRINTS[footprint]
     splats, camera, observation = data.draw(scenes(kernel, backend.splats, backend.size))
-    params = replace(data.draw(st.sampled_from(WALKS)), antialiased=antialiased)
+    params = replace(data.draw(st.sampled_from(PARAMS)), antialiased=antialiased)
     if strided:
         stride = data.draw(st.integers(1, 5))
         left, top = (data.draw(st.integers(0, min(stride, side) - 1)) for side in (camera.width, camera.height))
@@ -92,7 +92,7 @@ def seeded(footprint: str, seed: int, count: int) -> tuple[Splats, CompositingPa
 def test_renders_equal_the_oracle(footprint, backend):
     @backend.holds(st.data())
     def check(data) -> None:
-        splats, camera, _, params = drawn(data, footprint, backend)
+        splats, camera, _, params = draw_case(data, footprint, backend)
         check_render(backend.open(splats), splats, camera, params)
 
 
@@ -101,7 +101,7 @@ def test_renders_equal_the_oracle(footprint, backend):
 def test_splats_that_a_ray_meets_have_a_footprint(footprint, backend):
     @backend.holds(st.data())
     def check(data) -> None:
-        splats, camera, _, params = drawn(data, footprint, backend)
+        splats, camera, _, params = draw_case(data, footprint, backend)
         check_footprints(backend.open(splats), splats, camera, params)
 
 
@@ -122,7 +122,7 @@ def test_footprint_of_a_ball_is_as_large_as_the_pixels_that_it_holds(backend):
 def test_region_weights_and_evidence_equal_the_oracle(footprint, backend):
     @backend.holds(st.data(), st.sampled_from(POWERS))
     def check(data, weighting) -> None:
-        splats, camera, observation, params = drawn(data, footprint, backend, strided=True)
+        splats, camera, observation, params = draw_case(data, footprint, backend, strided=True)
         check_region_weights(backend.open(splats), splats, camera, observation, params, weighting)
 
 
@@ -131,7 +131,7 @@ def test_region_weights_and_evidence_equal_the_oracle(footprint, backend):
 def test_weights_that_count_equal_the_oracle_ray_by_ray(footprint, backend):
     @backend.holds(st.data(), st.sampled_from(SELECTIONS))
     def check(data, weighting) -> None:
-        splats, camera, _, params = drawn(data, footprint, backend, strided=True)
+        splats, camera, _, params = draw_case(data, footprint, backend, strided=True)
         check_selected_weights(backend.open(splats), splats, camera, params, weighting)
 
 
@@ -145,10 +145,10 @@ def test_every_weighting_equals_the_oracle_and_few_rays_are_too_close_to_call(ba
     for weighting in SELECTIONS:
         undecided = []
         for splats, camera, raster, view in views:
-            chosen, close = selected_weights(view.A, splats, camera, CompositingParams(), weighting)
-            found = raster.region_weights(camera, one_region_a_ray(camera), CompositingParams(), weighting)
-            W = dense(found, splats.count, width * height)
-            assert np.abs(W.T - chosen)[~view.cut & ~close].max() < INSIDE, weighting
+            expected, close = selected_weights(view.A, splats, camera, CompositingParams(), weighting)
+            actual = raster.region_weights(camera, one_region_a_ray(camera), CompositingParams(), weighting)
+            W = dense(actual, splats.count, width * height)
+            assert np.abs(W.T - expected)[~view.cut & ~close].max() < INSIDE, weighting
             undecided.append(close & ~view.cut)
         assert np.concatenate(undecided).mean() < UNDECIDED, weighting
 
@@ -159,8 +159,8 @@ def test_of_equal_weights_the_nearest_counts():
     means, scales = torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, 2.0]]), torch.ones(2, 3)  # the second is the nearer
 
     def on_the_axis(splats: Splats, weighting: Weighting) -> list[float]:
-        found = CpuRaster(splats).region_weights(camera, one_region_a_ray(camera), CompositingParams(), weighting)
-        return dense(found, 2, 81)[:, 4 * 9 + 4].tolist()
+        weights = CpuRaster(splats).region_weights(camera, one_region_a_ray(camera), CompositingParams(), weighting)
+        return dense(weights, 2, 81)[:, 4 * 9 + 4].tolist()
 
     ties = 0
     for step in range(-8, 9):
@@ -216,13 +216,13 @@ def test_flips_at_the_cut_offs_are_rare_and_unbiased(footprint, backend):
 def test_ray_rows_are_rows_of_a(footprint, backend):
     @backend.holds(st.data())
     def check(data) -> None:
-        splats, camera, _, params = drawn(data, footprint, backend)
+        splats, camera, _, params = draw_case(data, footprint, backend)
         check_ray_rows(backend.open(splats), splats, camera, params, backend.rays)
 
 
 @every_backend
 def test_adjoints_equal_the_oracle(backend):
-    @backend.holds(scenes(max_splats=backend.splats, largest=backend.size), st.sampled_from(WALKS), CHANNELS)
+    @backend.holds(scenes(max_splats=backend.splats, largest=backend.size), st.sampled_from(PARAMS), CHANNELS)
     def check(scene, params, channels) -> None:
         splats, camera, _ = scene
         check_adjoint(backend.open(splats), splats, camera, params, channels)
@@ -230,7 +230,7 @@ def test_adjoints_equal_the_oracle(backend):
 
 @every_backend
 def test_a_render_and_its_adjoint_agree_on_every_inner_product(backend):
-    @backend.holds(scenes(max_splats=backend.splats, largest=backend.size), st.sampled_from(WALKS))
+    @backend.holds(scenes(max_splats=backend.splats, largest=backend.size), st.sampled_from(PARAMS))
     def check(scene, params) -> None:
         splats, camera, _ = scene
         check_inner_product(backend.open(splats), splats, camera, params)
@@ -271,8 +271,8 @@ def test_views_walked_in_a_row_are_those_walked_alone_to_the_bit(footprint, back
 def test_the_number_of_threads_changes_no_bit(footprint):
     (splats, params), camera = seeded(footprint, 7, 3_000), random_camera(7, 200, 150)
     gain, strided = replace(params, opacity_logit_scale=1.2), replace(params, stride=3, offset=(1, 2))
-    one, many = CpuRaster(splats, threads=1), CpuRaster(splats, threads=5)
-    for own, weighting in (
+    serial, parallel = CpuRaster(splats, threads=1), CpuRaster(splats, threads=5)
+    for case_params, weighting in (
         (params, Weighting()),
         (gain, Weighting(2)),
         (gain, Weighting(2, Selection.TOP_K, count=3)),
@@ -280,16 +280,18 @@ def test_the_number_of_threads_changes_no_bit(footprint):
         (strided, Weighting(0, Selection.CENTRE, floor=0.02)),
     ):
         for observation in (random_regions(7, 4, 30, (75, 100)), random_grid(7, (10, 13))):
-            first, second = (raster.region_weights(camera, observation, own, weighting) for raster in (one, many))
+            first, second = (
+                raster.region_weights(camera, observation, case_params, weighting) for raster in (serial, parallel)
+            )
             assert same_bits(first, second)
     image, labels = random_image(camera, 5), torch.arange(3_000, dtype=torch.int32) % 60 - 1
-    for own in (params, gain):
+    for case_params in (params, gain):
         for product in (
-            lambda raster, own=own: raster.row_sums(camera, own),
-            lambda raster, own=own: raster.adjoint(camera, image, own),
-            lambda raster, own=own: raster.strongest_labels(camera, labels, own),
+            lambda raster, case_params=case_params: raster.row_sums(camera, case_params),
+            lambda raster, case_params=case_params: raster.adjoint(camera, image, case_params),
+            lambda raster, case_params=case_params: raster.strongest_labels(camera, labels, case_params),
         ):
-            first, second = product(one), product(many)
+            first, second = product(serial), product(parallel)
             assert first.any() and torch.equal(first, second)
 
 
@@ -298,8 +300,8 @@ def test_images_and_traced_rays_are_whole_whatever_the_stride():
     raster, params = CpuRaster(splats), CompositingParams(stride=4, offset=(3, 1))
     assert torch.equal(raster.row_sums(camera, params), raster.row_sums(camera, CompositingParams()))
     pixels = torch.tensor([[3, 1], [7, 5], [59, 45]], dtype=torch.int32)
-    for asked in (pixels, torch.cat([pixels, torch.tensor([[0, 0]], dtype=torch.int32)])):
-        got, full = (raster.ray_rows(camera, asked, own) for own in (params, CompositingParams()))
+    for rays in (pixels, torch.cat([pixels, torch.tensor([[0, 0]], dtype=torch.int32)])):
+        got, full = (raster.ray_rows(camera, rays, case_params) for case_params in (params, CompositingParams()))
         assert torch.equal(got.splats, full.splats)
         assert torch.allclose(got.weights, full.weights, atol=1e-6)
 
@@ -307,17 +309,19 @@ def test_images_and_traced_rays_are_whole_whatever_the_stride():
 def test_the_oracle_is_a_backend_that_gives_the_same_products():
     splats, camera = random_splats(1, 30), random_camera(1)
     assert not dense_view(splats, camera, GAIN).cut.any()
-    fast, plain = CpuRaster(splats), ReferenceRaster(splats)
+    fast, reference = CpuRaster(splats), ReferenceRaster(splats)
     observation, params = random_regions(1), replace(GAIN, stride=2, offset=(1, 0))
-    ours, theirs = (raster.region_weights(camera, observation, params, Weighting(2)) for raster in (fast, plain))
-    assert np.abs(dense(ours, 30, 5) - dense(theirs, 30, 5)).max() < INSIDE
-    assert torch.equal(ours.total_weight_splats, theirs.total_weight_splats)
-    assert torch.allclose(ours.total_weight, theirs.total_weight, atol=INSIDE)
-    assert torch.allclose(fast.row_sums(camera, GAIN), plain.row_sums(camera, GAIN), atol=INSIDE)
+    actual, expected = (
+        raster.region_weights(camera, observation, params, Weighting(2)) for raster in (fast, reference)
+    )
+    assert np.abs(dense(actual, 30, 5) - dense(expected, 30, 5)).max() < INSIDE
+    assert torch.equal(actual.total_weight_splats, expected.total_weight_splats)
+    assert torch.allclose(actual.total_weight, expected.total_weight, atol=INSIDE)
+    assert torch.allclose(fast.row_sums(camera, GAIN), reference.row_sums(camera, GAIN), atol=INSIDE)
     image = random_image(camera, 2)
-    assert torch.allclose(fast.adjoint(camera, image, GAIN), plain.adjoint(camera, image, GAIN), atol=1e-4)
-    some = pixels_of(camera)[::50]
-    assert torch.equal(fast.ray_rows(camera, some, GAIN).indptr, plain.ray_rows(camera, some, GAIN).indptr)
+    assert torch.allclose(fast.adjoint(camera, image, GAIN), reference.adjoint(camera, image, GAIN), atol=1e-4)
+    sample = pixels_of(camera)[::50]
+    assert torch.equal(fast.ray_rows(camera, sample, GAIN).indptr, reference.ray_rows(camera, sample, GAIN).indptr)
 
 
 @every_backend
@@ -351,6 +355,6 @@ def test_values_of_another_shape_and_walks_without_meaning_are_refused(backend):
         raster.adjoint(camera, torch.zeros(3, 4, 1), params)
     with pytest.raises(InvalidInput, match="labels"):
         raster.strongest_labels(camera, torch.zeros(3, dtype=torch.int32), params)
-    for made in (raster, ReferenceRaster(splats)):
+    for candidate in (raster, ReferenceRaster(splats)):
         with pytest.raises(InvalidSettings, match="3D Gaussians"):
-            made.row_sums(camera, CompositingParams(antialiased=True))
+            candidate.row_sums(camera, CompositingParams(antialiased=True))

@@ -66,8 +66,8 @@ def encode(tmp_path: Path) -> Encode:
         **settings: Any,
     ) -> tuple[Encoded, dict[str, Tensor]]:
         out = tmp_path / "out" / "pack.safetensors"
-        chosen = EncodeSettings(**{"normalised": False, **settings})
-        done = write_encoded(find_images([folder]), encoder or MeanColour(), out, chosen, sizes=sizes)
+        options = EncodeSettings(**{"normalised": False, **settings})
+        result = write_encoded(find_images([folder]), encoder or MeanColour(), out, options, sizes=sizes)
         assert [path.name for path in out.parent.iterdir()] == [out.name]
         packs = read_features(out)
         grids = {}
@@ -75,7 +75,7 @@ def encode(tmp_path: Path) -> Encode:
             observed = packs[view]
             assert isinstance(observed, FeatureGrid)
             grids[view] = observed.grid
-        return done, grids
+        return result, grids
 
     return run
 
@@ -99,8 +99,8 @@ def test_a_blob_lights_the_cell_that_it_lies_in_as_the_photo_is_stored(photos: P
     exif = Image.Exif()
     exif[ORIENTATION] = 6
     upright.save(photos / "tagged.png", exif=exif)
-    done, grids = encode(photos)
-    assert done.readings == {"a": Reading.UPRIGHT, "tagged": Reading.STORED}
+    result, grids = encode(photos)
+    assert result.readings == {"a": Reading.UPRIGHT, "tagged": Reading.STORED}
     for grid in grids.values():
         assert grid.shape == (2, 3, 3) and grid.dtype == torch.float16
         assert int(grid.sum(dim=-1).argmax()) == 2 and grid[1].max() == 0
@@ -121,24 +121,28 @@ TURNS = {  # what a stored photo is, of the one that EXIF's orientation shows
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".webp"])
 @pytest.mark.parametrize("tag", TURNS)
 def test_a_photo_is_read_in_the_orientation_of_its_camera(tag: int, suffix: str, tmp_path: Path) -> None:
-    shown = np.zeros((48, 64, 3), np.uint8)
-    shown[:16, :16], shown[:16, -16:] = (255, 0, 0), (0, 255, 0)  # two corners tell each of eight ways
-    stored, path, exif = np.ascontiguousarray(TURNS[tag](shown)), tmp_path / f"a{suffix}", Image.Exif()
+    upright = np.zeros((48, 64, 3), np.uint8)
+    upright[:16, :16], upright[:16, -16:] = (255, 0, 0), (0, 255, 0)  # two corners tell each of eight ways
+    stored, path, exif = np.ascontiguousarray(TURNS[tag](upright)), tmp_path / f"a{suffix}", Image.Exif()
     exif[ORIENTATION] = tag
-    how: dict[str, Any] = (
+    options: dict[str, Any] = (
         {"quality": 95, "subsampling": 0} if suffix == ".jpg" else {"lossless": True} if suffix == ".webp" else {}
     )
-    Image.fromarray(stored).save(path, exif=exif, **how)
+    Image.fromarray(stored).save(path, exif=exif, **options)
     across = stored.shape[0] > stored.shape[1]
-    for size, expected in ((None, stored), (stored.shape[1::-1], stored), ((640, 480), shown if across else stored)):
+    for size, expected in (
+        (None, stored),
+        (stored.shape[1::-1], stored),
+        ((640, 480), upright if across else stored),
+    ):
         image, reading = read_image(path, size)
         assert np.abs(np.asarray(image).astype(int) - expected).max() < 20
         assert reading is (
-            Reading.UPRIGHT if tag == 1 else Reading.ORIENTED if expected is shown and across else Reading.STORED
+            Reading.UPRIGHT if tag == 1 else Reading.ORIENTED if expected is upright and across else Reading.STORED
         )
     assert read_header(path).oriented == (64, 48)
     with Image.open(path) as image:
-        assert np.abs(np.asarray(ImageOps.exif_transpose(image)).astype(int) - shown).max() < 20
+        assert np.abs(np.asarray(ImageOps.exif_transpose(image)).astype(int) - upright).max() < 20
 
 
 @pytest.mark.parametrize("tag", TURNS)
@@ -157,8 +161,8 @@ def test_sizes_of_cameras_turn_the_photos_that_are_encoded(photos: Path, encode:
     exif[ORIENTATION] = 6
     upright.transpose(Image.Transpose.ROTATE_90).save(photos / "a.png", exif=exif)
     sizes = {"a": (600, 400)}
-    done, grids = encode(photos, sizes=sizes)
-    assert done.readings == {"a": Reading.ORIENTED}
+    result, grids = encode(photos, sizes=sizes)
+    assert result.readings == {"a": Reading.ORIENTED}
     assert grids["a"].shape == (2, 3, 3) and int(grids["a"].sum(dim=-1).argmax()) == 2
 
 
@@ -181,11 +185,11 @@ def test_every_kind_of_picture_has_its_colours(photos: Path, encode: Encode) -> 
 
 
 def test_images_of_any_size_become_whole_patches_of_the_shorter_side(photos: Path, encode: Encode) -> None:
-    wanted = {(1, 1): (2, 2), (3, 1): (2, 6), (7, 90): (26, 2), (9, 8): (2, 2)}
-    for width, height in wanted:
+    expected_shapes = {(1, 1): (2, 2), (3, 1): (2, 6), (7, 90): (26, 2), (9, 8): (2, 2)}
+    for width, height in expected_shapes:
         Image.new("RGB", (width, height), (255, 0, 0)).save(photos / f"{width}x{height}.png")
     _, grids = encode(photos)
-    for (width, height), shape in wanted.items():
+    for (width, height), shape in expected_shapes.items():
         grid = grids[f"{width}x{height}"]
         assert tuple(grid.shape[:2]) == shape
         assert grid[..., 0].min() == 1 and grid[..., 1:].max() == 0
@@ -202,12 +206,12 @@ def test_batches_hold_one_size_and_change_nothing(photos: Path, encode: Encode) 
     for k in range(5):
         width = 16 if k < 3 else 24
         blob(width, 16, (2 * k, 0, 2 * k + 4, 5)).save(photos / f"{k}.png")
-    one, three = MeanColour(), MeanColour()
-    _, apart = encode(photos, one)
-    _, together = encode(photos, three, batch=2)
-    assert (one.batches, three.batches) == ([1] * 5, [2, 1, 2])
-    assert apart.keys() == together.keys() == set("01234")
-    assert all(torch.equal(apart[view], together[view]) for view in apart)
+    first, second = MeanColour(), MeanColour()
+    _, first_grids = encode(photos, first)
+    _, second_grids = encode(photos, second, batch=2)
+    assert (first.batches, second.batches) == ([1] * 5, [2, 1, 2])
+    assert first_grids.keys() == second_grids.keys() == set("01234")
+    assert all(torch.equal(first_grids[view], second_grids[view]) for view in first_grids)
 
 
 def test_cells_are_unit_vectors_unless_asked_otherwise(photos: Path, encode: Encode) -> None:
@@ -224,8 +228,8 @@ def test_what_float16_cannot_hold_is_float32_and_what_is_no_number_refused(
 ) -> None:
     Image.new("RGB", (8, 8), (255, 255, 255)).save(photos / "bright.png")
     Image.new("RGB", (8, 8), (9, 9, 9)).save(photos / "dark.png")
-    done, grids = encode(photos, MeanColour(scale=1e5))
-    assert done.wide == ("bright",)
+    result, grids = encode(photos, MeanColour(scale=1e5))
+    assert result.wide == ("bright",)
     assert grids["bright"].dtype == torch.float32 and grids["bright"].max() == 1e5
     assert grids["dark"].dtype == torch.float16
     before = (tmp_path / "out" / "pack.safetensors").read_bytes()
@@ -236,50 +240,50 @@ def test_what_float16_cannot_hold_is_float32_and_what_is_no_number_refused(
 
 
 def test_views_are_named_after_their_images_and_sub_folders(photos: Path) -> None:
-    kept = ("a.png", "b.0001.JPG", "camA/000.jpg", "camB/000.jpg", "camB/001.png")
-    for name in (*kept, "._a.png", "notes.txt", ".thumbnails/000.jpg", "notes/notes.txt"):
+    names = ("a.png", "b.0001.JPG", "camA/000.jpg", "camB/000.jpg", "camB/001.png")
+    for name in (*names, "._a.png", "notes.txt", ".thumbnails/000.jpg", "notes/notes.txt"):
         (photos / name).parent.mkdir(exist_ok=True)
         (photos / name).write_bytes(b"")
-    assert find_images([photos]) == {name.rpartition(".")[0]: photos / name for name in kept}
+    assert find_images([photos]) == {name.rpartition(".")[0]: photos / name for name in names}
     assert list(find_images([photos / "b.0001.JPG", photos / "a.png"])) == ["a", "b.0001"]
     assert list(find_images([photos / "camB"])) == ["000", "001"]
     (photos / "a.jpg").write_bytes(b"")
-    for given, message in (
+    for paths, message in (
         ([photos], "one image a view"),
         ([photos / "camA", photos / "camB"], "one image a view"),
         ([photos / "notes"], "1 other files"),
         ([photos / "none"], "nothing at"),
     ):
         with pytest.raises(InvalidInput, match=message):
-            find_images(given)
+            find_images(paths)
 
 
 def test_what_is_no_image_is_refused_by_name(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = photos / "whole.png"
-    blob(64, 64, (3, 3, 40, 50)).save(whole)
+    complete_file = photos / "whole.png"
+    blob(64, 64, (3, 3, 40, 50)).save(complete_file)
     Image.fromarray(np.ones((4, 4), np.float32)).save(photos / "float.tif")
-    bad = {"text.png": b"hello", "empty.png": b"", "cut.png": whole.read_bytes()[:-40]}
+    bad = {"text.png": b"hello", "empty.png": b"", "cut.png": complete_file.read_bytes()[:-40]}
     for name, content in bad.items():
         (photos / name).write_bytes(content)
     for name in (*bad, "float.tif"):
         with pytest.raises(InvalidInput, match=name):
             read_image(photos / name)
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 3_000)
-    assert read_image(whole)[0].size == (64, 64)
+    assert read_image(complete_file)[0].size == (64, 64)
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1_000)  # a decompression bomb is twice as large
     with pytest.raises(InvalidInput, match="at most 2000 pixels"):
-        read_image(whole)
+        read_image(complete_file)
 
 
 PATCH, SIDE, WIDTH, F = 8, 32, 24, 10
 
 
-def small_vit(**more: Any) -> Any:
+def small_vit(**options: Any) -> Any:
     library()
     from open_clip.transformer import VisionTransformer
 
     torch.manual_seed(3)
-    return VisionTransformer(SIDE, PATCH, WIDTH, 3, 2, 2.0, output_dim=F, **more).eval()
+    return VisionTransformer(SIDE, PATCH, WIDTH, 3, 2, 2.0, output_dim=F, **options).eval()
 
 
 def small_resnet() -> Any:
@@ -303,8 +307,8 @@ class Holder(nn.Module):
 
 
 def small_encoder(kind: str, tower: Any) -> ClipImageEncoder:
-    opened = OpenedModel("open_clip:small/tag", "small", Holder(tower))
-    return ClipImageEncoder(kind, opened, opened.name, torch.device("cpu"))
+    model = OpenedModel("open_clip:small/tag", "small", Holder(tower))
+    return ClipImageEncoder(kind, model, model.name, torch.device("cpu"))
 
 
 @cache
@@ -321,10 +325,10 @@ def test_maskclip_is_the_last_attention_when_each_token_sees_itself_alone() -> N
         *blocks, last = tower.transformer.resblocks
         for block in blocks:
             tokens = block(tokens)
-        alone = ~torch.eye(tokens.shape[1], dtype=torch.bool)
+        mask = ~torch.eye(tokens.shape[1], dtype=torch.bool)
         normed = last.ln_1(tokens)
-        seen, _ = last.attn(normed, normed, normed, attn_mask=alone)
-        expected = (tower.ln_post(seen) @ tower.proj)[:, 1:].reshape(2, 4, 4, F)
+        attention, _ = last.attn(normed, normed, normed, attn_mask=mask)
+        expected = (tower.ln_post(attention) @ tower.proj)[:, 1:].reshape(2, 4, 4, F)
         torch.testing.assert_close(vit_values(tower, images), expected)
 
 
@@ -354,8 +358,8 @@ def test_resnet_values_are_what_the_pool_gives_for_equal_cells() -> None:
         cells = tower.layer4(tower.layer3(tower.layer2(tower.layer1(tower.stem(images)))))
         assert grid.shape == (1, 2, 3, F)
         for row, column in np.ndindex(2, 3):
-            alike = cells[:, :, row, column, None, None].expand(-1, -1, 2, 2)
-            torch.testing.assert_close(grid[:, row, column], tower.attnpool(alike))
+            equal_cells = cells[:, :, row, column, None, None].expand(-1, -1, 2, 2)
+            torch.testing.assert_close(grid[:, row, column], tower.attnpool(equal_cells))
 
 
 @pytest.mark.parametrize("kind", ENCODERS)
@@ -370,10 +374,10 @@ def test_a_change_in_a_patch_moves_its_own_cell_most(kind: str) -> None:
     for row, column in ((1, 3), (2, 1)):
         spotted = images.clone()
         spotted[..., row * patch : (row + 1) * patch, column * patch : (column + 1) * patch] *= -1
-        together = encoder.encode(torch.cat([images, spotted]))
-        torch.testing.assert_close(together[:1], before, atol=1e-4, rtol=1e-4)  # an image does not know its batch
-        moved = (together[1] - together[0]).norm(dim=-1)
-        assert divmod(int(moved.argmax()), columns) == (row, column)
+        batch = encoder.encode(torch.cat([images, spotted]))
+        torch.testing.assert_close(batch[:1], before, atol=1e-4, rtol=1e-4)  # an image does not know its batch
+        change = (batch[1] - batch[0]).norm(dim=-1)
+        assert divmod(int(change.argmax()), columns) == (row, column)
 
 
 def test_cells_of_a_resnet_are_brought_back_to_their_patches() -> None:
@@ -381,9 +385,9 @@ def test_cells_of_a_resnet_are_brought_back_to_their_patches() -> None:
     resnet, images = backbone("resnet18"), torch.randn(4, 3, 5 * 32, 5 * 32)
     spotted = images.clone()
     spotted[..., 64:96, 64:96] += torch.randn(4, 3, 32, 32)
-    moved = (resnet.encode(spotted) - resnet.encode(images)).square().sum(dim=(0, 3))
+    change = (resnet.encode(spotted) - resnet.encode(images)).square().sum(dim=(0, 3))
     for axis in (0, 1):
-        middle = (moved.sum(dim=1 - axis) * torch.arange(5.0)).sum() / moved.sum()
+        middle = (change.sum(dim=1 - axis) * torch.arange(5.0)).sum() / change.sum()
         assert abs(float(middle) - 2) < 0.1
 
 
@@ -412,37 +416,37 @@ def test_weights_from_a_file_give_the_same_features(tmp_path: Path) -> None:
     torch.save({"model": state}, tmp_path / "vit.pth")
     images = torch.randn(1, 3, 32, 48)
     for name in ("vit.safetensors", "vit.pth"):
-        opened = open_image_encoder(f"timm:test_vit@{tmp_path / name}")
-        assert torch.equal(opened.encode(images), vit.encode(images))
-        assert (opened.name, opened.text_space) == ("timm:test_vit", "none")
+        encoder = open_image_encoder(f"timm:test_vit@{tmp_path / name}")
+        assert torch.equal(encoder.encode(images), vit.encode(images))
+        assert (encoder.name, encoder.text_space) == ("timm:test_vit", "none")
     save_file({**state, "blocks.99.weight": torch.zeros(1)}, str(tmp_path / "more.safetensors"))
     del state["cls_token"]
     save_file(state, str(tmp_path / "less.safetensors"))
-    for name, what in (("more", "an unexpected blocks.99"), ("less", "cls_token")):
-        with pytest.raises(InvalidInput, match=what):
+    for name, message in (("more", "an unexpected blocks.99"), ("less", "cls_token")):
+        with pytest.raises(InvalidInput, match=message):
             open_image_encoder(f"timm:test_vit@{tmp_path / name}.safetensors")
 
 
 def test_weights_under_other_names_are_taken_in_their_order(tmp_path: Path) -> None:
     resnet = backbone("test_resnet")
-    own = [*resnet._model.state_dict().items()]
-    other = {f"_part{k}.{name.rpartition('.')[2]}": tensor for k, (name, tensor) in enumerate(own)}
+    tensors = [*resnet._model.state_dict().items()]
+    other = {f"_part{k}.{name.rpartition('.')[2]}": tensor for k, (name, tensor) in enumerate(tensors)}
     head = {"_fc.weight": torch.zeros(10, 96), "_fc.bias": torch.zeros(10)}
     torch.save(other | head, tmp_path / "renamed.pth")
     images = torch.randn(1, 3, 64, 96)
-    opened = open_image_encoder(f"timm:test_resnet@{tmp_path / 'renamed.pth'}")
-    assert torch.equal(opened.encode(images), resnet.encode(images))
+    encoder = open_image_encoder(f"timm:test_resnet@{tmp_path / 'renamed.pth'}")
+    assert torch.equal(encoder.encode(images), resnet.encode(images))
     swapped = [*other.items()]
     swapped[1], swapped[2] = swapped[2], swapped[1]  # a weight and a bias of one shape
     torch.save(dict(swapped), tmp_path / "swapped.pth")
     torch.save(other | {"_more.weight": torch.zeros(2)}, tmp_path / "long.pth")
     save_file({name: tensor.clone() for name, tensor in other.items()}, tmp_path / "sorted.safetensors")
-    for name, what in (
+    for name, message in (
         ("swapped.pth", r"tensor 1 is _part2.bias \[16\] where the model has conv1.1.weight \[16\]"),
         ("long.pth", r"_more.weight \[2\] where the model has nothing"),
         ("sorted.safetensors", "sorts by name"),
     ):
-        with pytest.raises(InvalidInput, match=what):
+        with pytest.raises(InvalidInput, match=message):
             open_image_encoder(f"timm:test_resnet@{tmp_path / name}")
 
 

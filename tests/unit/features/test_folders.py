@@ -138,12 +138,12 @@ def npy_of_objects() -> bytes:
 def test_arrays_that_are_broken_or_bombs_are_refused(content: bytes | None, message: str, tmp_path: Path) -> None:
     if content is not None:
         (tmp_path / "a.npy").write_bytes(content)
-    with pytest.raises(InvalidFeatures, match=message) as caught:
+    with pytest.raises(InvalidFeatures, match=message) as error:
         open_npy(tmp_path / "a.npy")
-    assert "\n" not in str(caught.value)
+    assert "\n" not in str(error.value)
 
 
-BESIDE = (
+UNRELATED_FILES = (
     "._frame_1_s.npy",
     ".DS_Store",
     "Thumbs.db",
@@ -155,7 +155,7 @@ BESIDE = (
 
 def test_what_systems_put_beside_files_is_left_out(tmp_path: Path) -> None:
     langsplat(tmp_path)
-    for name in BESIDE:
+    for name in UNRELATED_FILES:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"\x00\x05\x16\x07\x00\x02\x00\x00Mac OS X")
     assert [*langsplat_views(tmp_path)] == ["frame_1"]
@@ -189,9 +189,9 @@ def test_maps_may_have_unit_axes_and_any_floats(
         np.savez_compressed(tmp_path / "a.npz", array)
     else:
         torch.save(tensor, tmp_path / f"a{suffix}")
-    found = array_views(tmp_path, layout)["a"]
-    assert found.grid.tolist() == GRID.tolist()
-    assert found.grid.dtype == (torch.float16 if dtype == "float16" else torch.float32)
+    view = array_views(tmp_path, layout)["a"]
+    assert view.grid.tolist() == GRID.tolist()
+    assert view.grid.dtype == (torch.float16 if dtype == "float16" else torch.float32)
 
 
 def test_maps_of_feature_3dgs_are_of_their_images_and_channels_first(tmp_path: Path) -> None:
@@ -223,7 +223,7 @@ def test_values_in_memory_and_in_packs_may_have_unit_axes(tmp_path: Path) -> Non
         (np.ones((2, 1, 3, 4), np.float32), "save each of the 2"),
     ],
 )
-def test_other_axes_are_told_with_a_way_on(stored: np.ndarray, message: str, tmp_path: Path) -> None:
+def test_other_axes_are_refused_with_a_remedy(stored: np.ndarray, message: str, tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", stored)
     with pytest.raises(InvalidFeatures, match=message):
         array_views(tmp_path, "chw")["a"]

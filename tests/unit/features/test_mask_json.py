@@ -33,14 +33,14 @@ def rle(mask: np.ndarray, *, as_string: bool = True) -> dict[str, Any]:
 
 def coco(*masks: tuple[int, int, Any], images: int = 2, **entries: dict[str, Any]) -> dict[str, Any]:
     """A data set of so many images, with (image, category, segmentation) annotated, and more for images by name."""
-    listed = [{"id": k, "file_name": f"{k}.jpg", "height": HEIGHT, "width": WIDTH} for k in range(images)]
-    for image in listed:
+    image_records = [{"id": k, "file_name": f"{k}.jpg", "height": HEIGHT, "width": WIDTH} for k in range(images)]
+    for image in image_records:
         image.update(entries.get(f"image_{image['id']}", {}))
     annotations = [
         {"image_id": image, "category_id": category, "segmentation": segmentation, "bbox": [1, 1, 3, 3]}
         for image, category, segmentation in masks
     ]
-    return {"images": listed, "annotations": annotations, "categories": CATEGORIES}
+    return {"images": image_records, "annotations": annotations, "categories": CATEGORIES}
 
 
 def write(folder: Path, **documents: Any) -> Path:
@@ -60,11 +60,11 @@ def write(folder: Path, **documents: Any) -> Path:
     return folder
 
 
-def shown(found: Prompts, view: str) -> list[str]:
-    """The rows of a view, a letter a pixel: the first one of its phrase, ``.`` for none, UNDECIDED."""
-    regions = found.views[view]
+def label_rows(prompts: Prompts, view: str) -> list[str]:
+    """Return the rows of a view, a letter a pixel: the first one of its phrase, ``.`` for none, UNDECIDED."""
+    regions = prompts.views[view]
     assert isinstance(regions, Regions)
-    letters = [word[0] for word in found.table.words] + ["."]
+    letters = [word[0] for word in prompts.table.words] + ["."]
     channels = regions.codebook.numpy().argmax(axis=1)
     top = regions.labels.numpy().max(axis=0)
     top = np.broadcast_to(top, (HEIGHT, WIDTH)) if top.size == 1 else top
@@ -76,62 +76,63 @@ def drawing(mug: np.ndarray, bowl: np.ndarray, rest: str = ".") -> list[str]:
     return ["".join(row) for row in letters]
 
 
-BOTH, NOTHING = drawing(MUG, BOWL), drawing(MUG & BOWL, MUG & BOWL)
+BOTH_MASKS, NO_MASKS = drawing(MUG, BOWL), drawing(MUG & BOWL, MUG & BOWL)
 
 
 def test_images_that_nobody_annotated_are_left_out_unless_they_are_negatives(tmp_path: Path) -> None:
     folder = write(tmp_path, a=coco((0, 1, rle(MUG)), (0, 2, rle(BOWL)), images=5))
-    found = prompt_views(folder)
-    assert [*found.views] == ["0"] and shown(found, "0") == BOTH
-    assert any("4 of 5 images of a.json" in warning for warning in found.warnings)
-    found = prompt_views(folder, unannotated="negative")
-    assert [*found.views] == ["0", "1", "2", "3", "4"] and shown(found, "3") == NOTHING and not found.warnings
+    prompts = prompt_views(folder)
+    assert [*prompts.views] == ["0"] and label_rows(prompts, "0") == BOTH_MASKS
+    assert any("4 of 5 images of a.json" in warning for warning in prompts.warnings)
+    prompts = prompt_views(folder, unannotated="negative")
+    assert [*prompts.views] == ["0", "1", "2", "3", "4"] and not prompts.warnings
+    assert label_rows(prompts, "3") == NO_MASKS
 
 
 def test_a_file_that_says_what_is_absent_is_believed(tmp_path: Path) -> None:
     """LVIS: image 1 has neither, image 2 was searched for a bowl alone, image 3 has more mugs than are masked."""
-    told = {
+    image_fields = {
         "image_0": {"neg_category_ids": [], "not_exhaustive_category_ids": []},
         "image_1": {"neg_category_ids": [1, 2], "not_exhaustive_category_ids": []},
         "image_2": {"neg_category_ids": [], "not_exhaustive_category_ids": []},
         "image_3": {"neg_category_ids": [2], "not_exhaustive_category_ids": [1]},
     }
     masks = [(0, 1, rle(MUG)), (0, 2, rle(BOWL)), (2, 2, rle(BOWL)), (3, 1, rle(MUG))]
-    found = prompt_views(write(tmp_path, lvis=coco(*masks, images=5, **told)))
-    assert [*found.views] == ["0", "1", "2", "3"]
-    assert (shown(found, "0"), shown(found, "1")) == (BOTH, NOTHING)
-    assert shown(found, "2") == drawing(MUG & BOWL, BOWL, UNDECIDED)
-    assert shown(found, "3") == drawing(MUG, MUG & BOWL, UNDECIDED)
+    prompts = prompt_views(write(tmp_path, lvis=coco(*masks, images=5, **image_fields)))
+    assert [*prompts.views] == ["0", "1", "2", "3"]
+    assert (label_rows(prompts, "0"), label_rows(prompts, "1")) == (BOTH_MASKS, NO_MASKS)
+    assert label_rows(prompts, "2") == drawing(MUG & BOWL, BOWL, UNDECIDED)
+    assert label_rows(prompts, "3") == drawing(MUG, MUG & BOWL, UNDECIDED)
 
 
 def test_pairs_of_a_photo_and_a_phrase_decide_that_phrase_alone(tmp_path: Path) -> None:
     """SA-Co: photo a was asked for both and has a mug, photo b was asked for a bowl, and has none."""
-    asked = [("a", "red mug"), ("a", "bowl"), ("b", "bowl"), ("b", "red mug"), ("c", "bowl")]
-    images = [{"id": k, "file_name": f"{name}.jpg", "text_input": text} for k, (name, text) in enumerate(asked)]
+    pairs = [("a", "red mug"), ("a", "bowl"), ("b", "bowl"), ("b", "red mug"), ("c", "bowl")]
+    images = [{"id": k, "file_name": f"{name}.jpg", "text_input": text} for k, (name, text) in enumerate(pairs)]
     annotations = [{"image_id": 0, "segmentation": rle(MUG)}, {"image_id": 4, "segmentation": rle(BOWL)}]
-    found = prompt_views(write(tmp_path, gold={"images": images, "annotations": annotations}))
-    assert [*found.views] == ["a", "b", "c"]
-    assert shown(found, "a") == drawing(MUG, MUG & BOWL) and shown(found, "b") == NOTHING
-    assert shown(found, "c") == drawing(MUG & BOWL, BOWL, UNDECIDED)
+    prompts = prompt_views(write(tmp_path, gold={"images": images, "annotations": annotations}))
+    assert [*prompts.views] == ["a", "b", "c"]
+    assert label_rows(prompts, "a") == drawing(MUG, MUG & BOWL) and label_rows(prompts, "b") == NO_MASKS
+    assert label_rows(prompts, "c") == drawing(MUG & BOWL, BOWL, UNDECIDED)
 
 
 def test_a_file_a_phrase_decides_its_own_phrase_alone(tmp_path: Path) -> None:
     mug, bowl = coco((0, 1, rle(MUG))), coco((0, 2, rle(BOWL)), (1, 2, rle(BOWL)))
     mug["categories"], bowl["categories"] = CATEGORIES[:1], CATEGORIES[1:]
-    found = prompt_views(write(tmp_path, mug=mug, bowl=bowl))
-    assert shown(found, "0") == BOTH
-    assert shown(found, "1") == drawing(MUG & BOWL, BOWL, UNDECIDED)
+    prompts = prompt_views(write(tmp_path, mug=mug, bowl=bowl))
+    assert label_rows(prompts, "0") == BOTH_MASKS
+    assert label_rows(prompts, "1") == drawing(MUG & BOWL, BOWL, UNDECIDED)
 
 
 def test_polygons_and_run_lengths_of_one_image_are_masks_alike(tmp_path: Path) -> None:
     parts = [[1, 1, 4, 1, 4, 2, 1, 2], [1, 2, 4, 2, 4, 4, 1, 4], [1, 1, 2, 1, 2, 4, 1, 4], [3, 3, 3, 3]]
-    found = prompt_views(
+    prompts = prompt_views(
         write(
             tmp_path,
             a=coco((0, 1, parts), (0, 2, rle(BOWL)), (1, 1, MUG_POLYGON), (1, 2, [5.0, 2, 8, 2, 8, 5, 5, 5])),
         )
     )
-    assert shown(found, "0") == shown(found, "1") == BOTH
+    assert label_rows(prompts, "0") == label_rows(prompts, "1") == BOTH_MASKS
 
 
 def test_polygons_are_filled_as_coco_fills_them() -> None:
@@ -144,19 +145,19 @@ def test_polygons_are_filled_as_coco_fills_them() -> None:
     ]
     for polygon, counts in cases:
         size = (12, 14)
-        ours = fill_polygons(size, read_polygons(polygon, "a"))
-        theirs = mask_of_runs(*read_runs({"size": [*size], "counts": counts}, "a"))
-        assert_within_a_pixel(ours, theirs)
+        actual = fill_polygons(size, read_polygons(polygon, "a"))
+        expected = mask_of_runs(*read_runs({"size": [*size], "counts": counts}, "a"))
+        assert_within_a_pixel(actual, expected)
 
 
-def assert_within_a_pixel(ours: np.ndarray, theirs: np.ndarray) -> None:
-    padded = np.pad(theirs, 1, mode="edge")
-    around = np.stack([padded[y : y + ours.shape[0], x : x + ours.shape[1]] for y in range(3) for x in range(3)])
-    assert not (ours & ~around.any(axis=0)).any() and not (around.all(axis=0) & ~ours).any()
+def assert_within_a_pixel(actual: np.ndarray, expected: np.ndarray) -> None:
+    padded = np.pad(expected, 1, mode="edge")
+    around = np.stack([padded[y : y + actual.shape[0], x : x + actual.shape[1]] for y in range(3) for x in range(3)])
+    assert not (actual & ~around.any(axis=0)).any() and not (around.all(axis=0) & ~actual).any()
 
 
 @pytest.mark.parametrize(
-    ("polygon", "covered"),
+    ("polygon", "pixel_count"),
     [
         ([[-50, -50, 50, -50, 50, 50, -50, 50]], 48),  # beyond the image on every side
         ([[3, 3, 9, 9]], 0), ([[2, 2]], 0), ([[1, 1, 5, 1, 3, 1]], 0),  # no area
@@ -165,8 +166,8 @@ def assert_within_a_pixel(ours: np.ndarray, theirs: np.ndarray) -> None:
         ([{"x": 0, "y": 0}, {"x": 8, "y": 0}, {"x": 8, "y": 6}], 24),
     ],
 )  # fmt: skip
-def test_polygons_cover_the_pixels_whose_centres_they_hold(polygon: Any, covered: int) -> None:
-    assert fill_polygons((HEIGHT, WIDTH), read_polygons(polygon, "a")).sum() == pytest.approx(covered, abs=4)
+def test_polygons_cover_the_pixels_whose_centres_they_hold(polygon: Any, pixel_count: int) -> None:
+    assert fill_polygons((HEIGHT, WIDTH), read_polygons(polygon, "a")).sum() == pytest.approx(pixel_count, abs=4)
 
 
 @pytest.mark.parametrize(
@@ -177,7 +178,7 @@ def test_what_is_no_polygon_is_refused(polygon: Any) -> None:
         read_polygons(polygon, "a")
 
 
-def test_polygons_beyond_their_image_are_told(tmp_path: Path) -> None:
+def test_polygons_beyond_their_image_are_reported(tmp_path: Path) -> None:
     corner = [[6, 4, 8.1, 4, 8.1, 6.1]]  # as drawn over the edge by hand
     tall = write(tmp_path / "tall", a=coco((0, 1, BOWL_POLYGON), image_0={"width": HEIGHT, "height": WIDTH}))
     with pytest.raises(InvalidFeatures, match=r"within images of 6 x 8 pixels, got 1 of 1.*swapped"):
@@ -185,23 +186,25 @@ def test_polygons_beyond_their_image_are_told(tmp_path: Path) -> None:
     small = write(tmp_path / "small", a=coco((0, 1, BOWL_POLYGON), image_0={"width": 4, "height": 3}))
     with pytest.raises(InvalidFeatures, match=r"1 polygons of a.json extend beyond their images"):
         prompt_views(small)  # which leaves no mask
-    found = prompt_views(write(tmp_path / "whole", a=coco((0, 1, corner), (1, 2, BOWL_POLYGON))))
-    assert not any("beyond" in warning for warning in found.warnings)
+    prompts = prompt_views(write(tmp_path / "whole", a=coco((0, 1, corner), (1, 2, BOWL_POLYGON))))
+    assert not any("beyond" in warning for warning in prompts.warnings)
 
 
-def test_boxes_without_a_mask_are_told_and_decide_nothing(tmp_path: Path) -> None:
+def test_boxes_without_a_mask_are_reported_and_decide_nothing(tmp_path: Path) -> None:
     folder = write(tmp_path, a=coco((0, 1, []), (0, 2, rle(BOWL)), (1, 1, MUG_POLYGON)))
-    found = prompt_views(folder)
+    prompts = prompt_views(folder)
     box = [line[:1] + UNDECIDED * 3 + line[4:] for line in drawing(MUG & BOWL, BOWL)]
-    assert shown(found, "0") == [box[k] if 1 <= k < 4 else line for k, line in enumerate(drawing(MUG & BOWL, BOWL))]
-    assert any("1 annotations of a.json" in warning for warning in found.warnings)
+    assert label_rows(prompts, "0") == [
+        box[k] if 1 <= k < 4 else line for k, line in enumerate(drawing(MUG & BOWL, BOWL))
+    ]
+    assert any("1 annotations of a.json" in warning for warning in prompts.warnings)
     with pytest.raises(InvalidFeatures, match=r"0 of 1 phrases; .*at most a box and no mask"):
         prompt_views(write(tmp_path / "boxes", a=coco((0, 1, []), (1, 1, []))))
 
 
-@pytest.mark.parametrize("given", [".", "json_data"])
+@pytest.mark.parametrize("subfolder", [".", "json_data"])
 @pytest.mark.parametrize("kind", ["npy", "npz", "png"])
-def test_tracked_objects_are_masks_of_their_class_names(given: str, kind: str, tmp_path: Path) -> None:
+def test_tracked_objects_are_masks_of_their_class_names(subfolder: str, kind: str, tmp_path: Path) -> None:
     """Grounded SAM 2: two objects of one class are one phrase, and the view is the image, without ``mask_``."""
     mug_parts = MUG.copy()
     mug_parts[2:] = False
@@ -212,9 +215,9 @@ def test_tracked_objects_are_masks_of_their_class_names(given: str, kind: str, t
     empty = {**document, "mask_name": "mask_8.npy", "labels": {}}
     files = {f"mask_data__mask_7_as_{kind}": ids, f"mask_data__mask_8_as_{kind}": 0 * ids}
     folder = write(tmp_path, json_data__mask_7=document, json_data__mask_8=empty, **files)
-    found = prompt_views(folder / given)
-    assert [*found.views] == ["7", "8"] and found.table.words == ("bowl", "red mug")
-    assert (shown(found, "7"), shown(found, "8")) == (BOTH, NOTHING)
+    prompts = prompt_views(folder / subfolder)
+    assert [*prompts.views] == ["7", "8"] and prompts.table.words == ("bowl", "red mug")
+    assert (label_rows(prompts, "7"), label_rows(prompts, "8")) == (BOTH_MASKS, NO_MASKS)
 
 
 def test_tracked_objects_of_several_cameras_keep_their_folders(tmp_path: Path) -> None:
@@ -226,11 +229,12 @@ def test_tracked_objects_of_several_cameras_keep_their_folders(tmp_path: Path) -
             f"{camera}__mask_data__mask_0_as_npy": mask.astype(np.uint16),
         }
         write(tmp_path, **files)
-    found = prompt_views(tmp_path)
-    assert shown(found, "camA/0") == drawing(MUG, MUG & BOWL) and shown(found, "camB/0") == drawing(BOWL, MUG & BOWL)
+    prompts = prompt_views(tmp_path)
+    assert label_rows(prompts, "camA/0") == drawing(MUG, MUG & BOWL)
+    assert label_rows(prompts, "camB/0") == drawing(BOWL, MUG & BOWL)
 
 
-def test_ids_without_their_file_or_their_name_are_told(tmp_path: Path) -> None:
+def test_ids_without_their_file_or_their_name_are_refused(tmp_path: Path) -> None:
     document = {"mask_name": "mask_0.npy", "labels": {"1": {"class_name": "red mug"}}}
     with pytest.raises(InvalidFeatures, match=r"its ids in mask_0\.npy"):
         prompt_views(write(tmp_path / "a", json_data__mask_0=document))
@@ -247,13 +251,13 @@ def test_segments_of_a_panoptic_picture_are_masks_of_their_categories(tmp_path: 
     segments = [{"id": 513, "category_id": 1}, {"id": 196_608, "category_id": 2}]
     annotations = [{"image_id": 5, "file_name": "a.png", "segments_info": segments}]
     content = {"images": [{"id": 5, "file_name": "a.jpg"}], "categories": CATEGORIES, "annotations": annotations}
-    found = prompt_views(write(tmp_path / "coco", panoptic=content, panoptic__a_as_png=colours))
-    assert shown(found, "a") == drawing(MUG, BOWL, UNDECIDED)
+    prompts = prompt_views(write(tmp_path / "coco", panoptic=content, panoptic__a_as_png=colours))
+    assert label_rows(prompts, "a") == drawing(MUG, BOWL, UNDECIDED)
     content = {"annotations": [{"file_name": "a.jpg", "segments_info": segments}]}
     folder = write(
         tmp_path / "deva", pred=content, Annotations__a_as_png=colours, names={"1": "red mug", "2": "bowl"}
     )
-    assert shown(prompt_views(folder, folder / "names.json"), "a") == BOTH
+    assert label_rows(prompt_views(folder, folder / "names.json"), "a") == BOTH_MASKS
     (folder / "names.json").unlink()
     with pytest.raises(InvalidFeatures, match="--names"):
         prompt_views(folder)
@@ -266,8 +270,10 @@ def test_videos_are_data_sets_of_their_frames(tmp_path: Path) -> None:
         {"video_id": 1, "category_id": 1, "segmentations": [rle(MUG), None]},
         {"video_id": 1, "category_id": 2, "segmentations": [BOWL_POLYGON, None]},
     ]
-    found = prompt_views(write(tmp_path, a={"videos": [video], "annotations": annotations, "categories": CATEGORIES}))
-    assert (shown(found, "v/00"), shown(found, "v/01")) == (BOTH, NOTHING)
+    prompts = prompt_views(
+        write(tmp_path, a={"videos": [video], "annotations": annotations, "categories": CATEGORIES})
+    )
+    assert (label_rows(prompts, "v/00"), label_rows(prompts, "v/01")) == (BOTH_MASKS, NO_MASKS)
 
 
 def of_image(path: str, mask: np.ndarray = MUG) -> dict[str, Any]:
@@ -297,20 +303,20 @@ def test_a_document_of_an_image_is_of_the_view_that_it_names(
 
 def test_a_document_that_is_named_like_its_image_keeps_its_own_folder(tmp_path: Path) -> None:
     documents = {"camA__000": of_image("/tmp/x/000.jpg"), "camB__000": of_image("/tmp/x/000.jpg", BOWL)}
-    found = prompt_views(write(tmp_path, **documents))
-    assert {*found.views} == {"camA/000", "camB/000"} and not found.warnings
+    prompts = prompt_views(write(tmp_path, **documents))
+    assert {*prompts.views} == {"camA/000", "camB/000"} and not prompts.warnings
 
 
-def test_masks_of_several_files_of_one_image_are_put_together_and_told(tmp_path: Path) -> None:
-    found = prompt_views(write(tmp_path, mug__out=of_image("in.jpg"), bowl__out=of_image("in.jpg", BOWL)))
-    assert shown(found, "in") == drawing(MUG | BOWL, MUG & BOWL)
-    assert any("2 files are of one image, 'in'" in warning for warning in found.warnings)
+def test_masks_of_several_files_of_one_image_are_combined_with_a_warning(tmp_path: Path) -> None:
+    prompts = prompt_views(write(tmp_path, mug__out=of_image("in.jpg"), bowl__out=of_image("in.jpg", BOWL)))
+    assert label_rows(prompts, "in") == drawing(MUG | BOWL, MUG & BOWL)
+    assert any("2 files are of one image, 'in'" in warning for warning in prompts.warnings)
 
 
 def test_photos_beside_documents_that_name_them_are_no_masks(tmp_path: Path) -> None:
     """As Roboflow exports them, under names of its own."""
-    named = "0_jpg.rf.0123456789abcdef0123456789abcdef.jpg"
-    content = coco((0, 1, MUG_POLYGON), images=1, image_0={"file_name": named})
+    file_name = "0_jpg.rf.0123456789abcdef0123456789abcdef.jpg"
+    content = coco((0, 1, MUG_POLYGON), images=1, image_0={"file_name": file_name})
     photo = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
     folder = write(tmp_path, train___annotations_coco=content, train__0_as_png=photo)
     assert [*prompt_views(folder).views] == ["0"]
@@ -326,7 +332,7 @@ def test_photos_that_label_studio_renamed_are_known(tmp_path: Path) -> None:
     dates = ["20240101-IMG_0.jpg", "20240102-IMG_1.jpg"]
     for name, files, views in (
         ("a", prefixes, ["images/IMG_0", "images/IMG_1"]),
-        ("b", dates, [one[:-4] for one in dates]),
+        ("b", dates, [date[:-4] for date in dates]),
     ):
         content = coco((0, 1, MUG_POLYGON), (1, 1, MUG_POLYGON))
         for image, file in zip(content["images"], files, strict=True):
@@ -351,9 +357,9 @@ def test_documents_of_annotation_tools_are_read(tmp_path: Path) -> None:
     }
     points = [{"x": x, "y": y} for x, y in square]
     roboflow = {"image": {"width": WIDTH, "height": HEIGHT}, "predictions": [{"class": "red mug", "points": points}]}
-    found = prompt_views(write(tmp_path, a=label_me, b=isat, c=roboflow))
-    assert shown(found, "b") == BOTH and shown(found, "c") == drawing(MUG, MUG & BOWL)
-    assert shown(found, "a") == [line.replace("b", UNDECIDED) for line in BOTH]
+    prompts = prompt_views(write(tmp_path, a=label_me, b=isat, c=roboflow))
+    assert label_rows(prompts, "b") == BOTH_MASKS and label_rows(prompts, "c") == drawing(MUG, MUG & BOWL)
+    assert label_rows(prompts, "a") == [line.replace("b", UNDECIDED) for line in BOTH_MASKS]
 
 
 def test_counts_in_pythons_text_of_bytes_are_counts(tmp_path: Path) -> None:
@@ -374,33 +380,33 @@ def test_pixels_that_nobody_decided_have_no_label(tmp_path: Path) -> None:
     """The 255 of VOC and its kin, in pictures of numbers, palettes and binary pictures."""
     void = np.zeros((HEIGHT, WIDTH), bool)
     void[0] = True
-    drawn = drawing(MUG, BOWL)
-    drawn[0] = UNDECIDED * WIDTH
+    expected = drawing(MUG, BOWL)
+    expected[0] = UNDECIDED * WIDTH
     values = np.where(void, 255, 7 * MUG + 9 * BOWL).astype(np.uint8)
     palette = Image.fromarray(values)
     palette.putpalette([*range(256)] * 3)
     for kind in ("grey", "palette", "wide"):
         folder = tmp_path / kind
         folder.mkdir()
-        marked = np.where(void, 65_535, values.astype(np.int32)).astype(np.uint16)
-        picture = palette if kind == "palette" else Image.fromarray(marked if kind == "wide" else values)
+        wide_values = np.where(void, 65_535, values.astype(np.int32)).astype(np.uint16)
+        picture = palette if kind == "palette" else Image.fromarray(wide_values if kind == "wide" else values)
         picture.save(folder / "a.png")
         (folder / "names.json").write_text('{"7": "red mug", "9": "bowl"}', encoding="utf-8")
         mark = 65_535 if kind == "wide" else 255
         with pytest.raises(InvalidFeatures, match=f"got the value {mark}; .*--unlabelled {mark}"):
             prompt_views(folder, folder / "names.json")
-        assert shown(prompt_views(folder, folder / "names.json", unlabelled=mark), "a") == drawn
+        assert label_rows(prompt_views(folder, folder / "names.json", unlabelled=mark), "a") == expected
     mug = np.where(void, 255, MUG).astype(np.uint8)
     folder = write(tmp_path / "binary", **{"red mug__a_as_png": mug})
-    assert shown(prompt_views(folder, unlabelled=255), "a") == [UNDECIDED * WIDTH, *drawing(MUG, MUG & BOWL)[1:]]
+    assert label_rows(prompt_views(folder, unlabelled=255), "a") == [UNDECIDED * WIDTH, *drawing(MUG, MUG & BOWL)[1:]]
     with pytest.raises(InvalidFeatures, match=r"^unlabelled:"):
         prompt_views(write(tmp_path / "json", a=coco((0, 1, MUG_POLYGON))), unlabelled=255)
 
 
 @pytest.mark.parametrize("kind", ["npy", "npz"])
 def test_binary_masks_may_be_arrays(kind: str, tmp_path: Path) -> None:
-    found = prompt_views(write(tmp_path, **{f"red mug__a_as_{kind}": MUG[None], f"bowl__a_as_{kind}": 255 * BOWL}))
-    assert shown(found, "a") == BOTH
+    prompts = prompt_views(write(tmp_path, **{f"red mug__a_as_{kind}": MUG[None], f"bowl__a_as_{kind}": 255 * BOWL}))
+    assert label_rows(prompts, "a") == BOTH_MASKS
 
 
 def test_masks_with_vectors_may_be_polygons_or_have_a_unit_axis(tmp_path: Path) -> None:
@@ -426,8 +432,8 @@ def test_strange_values_are_refused_or_passed_over(strange: Any, tmp_path: Path)
     document["item"] = {"slots": strange}
     data_set = coco((0, 1, rle(MUG)), image_0={"neg_category_ids": [2, strange], "width": strange})
     data_set["categories"] = [CATEGORIES[0], {"id": 2, "name": strange}]
-    found = prompt_views(write(tmp_path / "shapes", a=document))
-    assert found.table.words == ("red mug",) and found.views["a"].labels.max() <= 1
+    prompts = prompt_views(write(tmp_path / "shapes", a=document))
+    assert prompts.table.words == ("red mug",) and prompts.views["a"].labels.max() <= 1
     assert [*prompt_views(write(tmp_path / "coco", a=data_set)).views] == ["0"]
 
 
@@ -445,7 +451,7 @@ def test_rings_within_an_outline_are_holes(key: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", ["", "!", "AAAA", 3, None])
-def test_pictures_in_a_record_that_do_not_open_are_told(content: Any, tmp_path: Path) -> None:
+def test_pictures_in_a_record_that_do_not_open_are_refused(content: Any, tmp_path: Path) -> None:
     shape = {"label": "mug", "shape_type": "mask", "points": [[0, 0], [1, 1]], "mask": content}
     write(tmp_path, a={"imageHeight": HEIGHT, "imageWidth": WIDTH, "shapes": [shape]})
     with pytest.raises(InvalidFeatures, match="a PNG in base64"):

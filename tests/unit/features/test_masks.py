@@ -124,7 +124,7 @@ def test_one_mask_over_the_whole_photo_is_one(tmp_path: Path) -> None:
         ("a.pt", "pickles"),
     ],
 )
-def test_files_without_their_partners_are_told(files: str, message: str, tmp_path: Path) -> None:
+def test_files_without_their_partners_are_refused(files: str, message: str, tmp_path: Path) -> None:
     save(tmp_path, dict.fromkeys(files.split(), b"not opened yet"))
     with pytest.raises(InvalidFeatures, match=message):
         mask_views(tmp_path)
@@ -136,7 +136,7 @@ def of_vectors(vectors: np.ndarray) -> dict[str, Any]:
 
 OBJECTS = np.array([[None]], dtype=object)
 OTHER_SIZE = sam_records(MASKS[2:, :2])
-REFUSED: list[tuple[dict[str, Any], str]] = [
+INVALID_FILES: list[tuple[dict[str, Any], str]] = [
     (of_vectors(np.zeros(3, np.float32)), r"floats \[M, F\]"),
     (of_vectors(np.zeros((3, 5), np.int32)), r"floats \[M, F\], got int32"),
     (of_vectors(OBJECTS), "Python objects, which may run code"),
@@ -170,24 +170,24 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"a.png": Image.new("RGBA", (4, 3))}, "colours with transparency of 8 bits"),
     ({"a.png": Image.new("LA", (4, 3))}, "grey with transparency of 8 bits"),
     ({"a.png": Image.new("1", (4, 3))}, "grey of 1 bits"),  # Pillow spreads fewer bits of grey over 0 to 255
-    *(({"a.png": png(LARGE)[:kept]}, r"a\.png: expected a PNG of one channel") for kept in (0, 30, 60, 2000)),
+    *(({"a.png": png(LARGE)[:length]}, r"a\.png: expected a PNG of one channel") for length in (0, 30, 60, 2000)),
 ]
 
 
-@pytest.mark.parametrize(("files", "message"), REFUSED)
+@pytest.mark.parametrize(("files", "message"), INVALID_FILES)
 def test_files_that_hold_no_masks_of_their_vectors_are_refused(
     files: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
     save(tmp_path, {"a.npy": VECTORS, **files})
-    with pytest.raises(InvalidFeatures, match=message) as caught:
+    with pytest.raises(InvalidFeatures, match=message) as error:
         write_pack(tmp_path / "pack", mask_views(tmp_path), {})
-    assert "\n" not in str(caught.value) and not (tmp_path / "pack").exists()
+    assert "\n" not in str(error.value) and not (tmp_path / "pack").exists()
 
 
-def test_values_that_begin_at_one_are_told_where_zero_was_expected(tmp_path: Path) -> None:
+def test_values_that_begin_at_one_are_refused_where_zero_was_expected(tmp_path: Path) -> None:
     save(tmp_path, {"a.npy": VECTORS, "a.png": GREY})
-    told = r"values 0\.\.2 for 3 vectors, and 255 for none, got the value 3; .*--unlabelled 0"
-    with pytest.raises(InvalidFeatures, match=told):
+    message = r"values 0\.\.2 for 3 vectors, and 255 for none, got the value 3; .*--unlabelled 0"
+    with pytest.raises(InvalidFeatures, match=message):
         mask_views(tmp_path, 255)["a"]
 
 
@@ -224,8 +224,8 @@ def test_every_mask_comes_back_from_both_forms(columns: list[list[bool]]) -> Non
 @given(st.lists(st.integers(0, 1 << 20), min_size=1, max_size=40))
 def test_long_runs_come_back(lengths: list[int]) -> None:
     lengths = [*lengths, 5461 * 32768 - sum(lengths)]
-    size, found = read_runs({"size": [5461, 32768], "counts": compressed(lengths)}, "a.json mask 0")
-    assert (size, found.tolist()) == ((5461, 32768), lengths)
+    size, runs = read_runs({"size": [5461, 32768], "counts": compressed(lengths)}, "a.json mask 0")
+    assert (size, runs.tolist()) == ((5461, 32768), lengths)
 
 
 @pytest.mark.parametrize(
@@ -270,9 +270,9 @@ def test_strings_that_coco_published_fill_the_boxes_that_it_published(
     ],
 )
 def test_what_is_no_mask_is_refused(segmentation: Any, message: str) -> None:
-    with pytest.raises(InvalidFeatures, match=message) as caught:
+    with pytest.raises(InvalidFeatures, match=message) as error:
         read_runs(segmentation, "a.json mask 0")
-    assert str(caught.value).startswith("a.json mask 0: ")
+    assert str(error.value).startswith("a.json mask 0: ")
 
 
 @st.composite
@@ -291,9 +291,9 @@ def test_every_mask_is_whole_on_one_level(masks: np.ndarray) -> None:
     labels = label_levels(list(masks), "a.json")
     assert labels.dtype == np.int32 and labels.shape[1:] == masks.shape[1:]
     for number, mask in enumerate(masks):
-        here = labels == number
-        assert np.array_equal(here.any(axis=0), mask)
-        assert here.any(axis=(1, 2)).sum() == mask.any()
+        level_mask = labels == number
+        assert np.array_equal(level_mask.any(axis=0), mask)
+        assert level_mask.any(axis=(1, 2)).sum() == mask.any()
     assert all((level >= 0).any() for level in labels[1:])
 
 
@@ -311,7 +311,7 @@ def test_largest_masks_come_first_and_of_equals_the_first() -> None:
     assert label_levels([np.zeros((2, 2), bool)], "a.json").tolist() == [[[-1, -1], [-1, -1]]]
 
 
-def test_too_many_masks_over_a_pixel_are_told_with_their_number() -> None:
+def test_too_many_masks_over_a_pixel_are_refused_with_their_number() -> None:
     masks = [np.ones((2, 2), bool)] * MAX_LEVELS
     assert len(label_levels(masks, "a.json")) == MAX_LEVELS
     with pytest.raises(

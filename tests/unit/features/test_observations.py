@@ -68,23 +68,23 @@ def test_tuples_are_summed_in_pieces_and_refused_where_their_codebook_would_be_h
     generator = torch.Generator().manual_seed(2)
     labels = torch.randint(-1, 9, (3, 20, 20), dtype=torch.int32, generator=generator)
     regions = Regions(labels, torch.nn.functional.normalize(torch.randn(9, 7, generator=generator), dim=1))
-    whole = composite(regions, "v0")
+    expected = composite(regions, "v0")
     monkeypatch.setattr(levels, "BLOCK_FLOATS", 21)
-    assert torch.equal(composite(regions, "v0").codebook, whole.codebook)
-    monkeypatch.setattr(levels, "COMPOSITE_BYTES", whole.codebook.nbytes)
-    assert torch.equal(composite(regions, "v0").labels, whole.labels)
-    monkeypatch.setattr(levels, "COMPOSITE_BYTES", whole.codebook.nbytes - 1)
+    assert torch.equal(composite(regions, "v0").codebook, expected.codebook)
+    monkeypatch.setattr(levels, "COMPOSITE_BYTES", expected.codebook.nbytes)
+    assert torch.equal(composite(regions, "v0").labels, expected.labels)
+    monkeypatch.setattr(levels, "COMPOSITE_BYTES", expected.codebook.nbytes - 1)
     with pytest.raises(
-        InvalidFeatures, match=f"IMG_7.*{whole.codebook.shape[0]} tuples of 7 channels.*levels to rows"
+        InvalidFeatures, match=f"IMG_7.*{expected.codebook.shape[0]} tuples of 7 channels.*levels to rows"
     ):
         composite(regions, "IMG_7")
 
 
 def test_one_level_is_that_level_alone_and_all_else_stays_as_it_is():
     regions, grid = random_regions(1, 3), random_grid(1)
-    taken = at_levels(regions, 2, "v0")
-    assert isinstance(taken, Regions)
-    assert torch.equal(taken.labels, regions.labels[2:]) and taken.codebook is regions.codebook
+    result = at_levels(regions, 2, "v0")
+    assert isinstance(result, Regions)
+    assert torch.equal(result.labels, regions.labels[2:]) and result.codebook is regions.codebook
     assert at_levels(regions, "rows", "v0") is regions
     assert all(at_levels(grid, levels, "v0") is grid for levels in ("rows", "composite", 0))
 
@@ -105,7 +105,7 @@ def camera(distortion: Distortion, name: str = "v") -> Camera:
 
 
 def photo_place(view: Camera, row: float, column: float) -> tuple[float, float]:
-    """Where on the photo, from 0 to 1 in x and in y, the ray of a place on the pinhole lies."""
+    """Return x and y on the photo, in 0..1, of the ray through a row and a column of the pinhole image."""
     assert view.lens is not None
     x, y = np.array([(column - view.cx) / view.fx]), np.array([(row - view.cy) / view.fy])
     u, v = view.lens.on_photo(x, y)
@@ -119,15 +119,15 @@ def test_a_pixel_reads_the_label_that_the_photo_has_where_its_ray_lies(
 ) -> None:
     view, rng = camera(distortion), np.random.default_rng(1)
     labels = torch.tensor(rng.integers(-1, 9, (3, *size)), dtype=torch.int32)
-    seen = as_pinhole_sees(Regions(labels, torch.ones(9, 2)), view)
-    assert isinstance(seen, Regions)
-    assert seen.labels.dtype == torch.int32
-    assert seen.labels.shape == (3, view.height, view.width)
+    observation = as_pinhole_sees(Regions(labels, torch.ones(9, 2)), view)
+    assert isinstance(observation, Regions)
+    assert observation.labels.dtype == torch.int32
+    assert observation.labels.shape == (3, view.height, view.width)
     for row in range(0, view.height, 3):
         for column in range(0, view.width, 3):
             x, y = photo_place(view, row + 0.5, column + 0.5)
-            wanted = labels[:, int(y * size[0]), int(x * size[1])]
-            assert torch.equal(seen.labels[:, row, column], wanted)
+            expected = labels[:, int(y * size[0]), int(x * size[1])]
+            assert torch.equal(observation.labels[:, row, column], expected)
 
 
 @pytest.mark.parametrize("distortion", [BARREL, PINCUSHION, WIDE])
@@ -136,17 +136,17 @@ def test_a_cell_reads_the_grid_where_its_ray_lies(distortion: Distortion, dtype:
     view = camera(distortion)
     y, x = torch.meshgrid((torch.arange(11) + 0.5) / 11, (torch.arange(15) + 0.5) / 15, indexing="ij")
     grid = torch.stack([x, y, torch.ones_like(x)], dim=2).to(dtype)  # which is linear between its centres
-    seen = as_pinhole_sees(FeatureGrid(grid), view)
-    assert isinstance(seen, FeatureGrid)
-    assert seen.grid.dtype == dtype
-    rows, columns = seen.grid.shape[:2]
+    observation = as_pinhole_sees(FeatureGrid(grid), view)
+    assert isinstance(observation, FeatureGrid)
+    assert observation.grid.dtype == dtype
+    rows, columns = observation.grid.shape[:2]
     assert (rows, columns) == (round(11 * view.height / 44), round(15 * view.width / 60))
     for r in range(rows):
         for c in range(columns):
             place = photo_place(view, (r + 0.5) * view.height / rows, (c + 0.5) * view.width / columns)
-            wanted = [np.clip(place[0], 0.5 / 15, 14.5 / 15), np.clip(place[1], 0.5 / 11, 10.5 / 11), 1.0]
+            expected = [np.clip(place[0], 0.5 / 15, 14.5 / 15), np.clip(place[1], 0.5 / 11, 10.5 / 11), 1.0]
             tolerance = 1e-3 if dtype == torch.float16 else 1e-6
-            assert np.abs(seen.grid[r, c].double().numpy() - wanted).max() < tolerance
+            assert np.abs(observation.grid[r, c].double().numpy() - expected).max() < tolerance
 
 
 def test_packs_tell_before_a_map_is_read_what_size_it_will_have(tmp_path: Path) -> None:
@@ -156,8 +156,8 @@ def test_packs_tell_before_a_map_is_read_what_size_it_will_have(tmp_path: Path) 
         "plain": Regions(torch.zeros(1, 22, 30, dtype=torch.int32), torch.ones(1, 3)),
     }
     write_pack(tmp_path / "f.safetensors", maps, {})
-    plain = Camera.pinhole("plain", 60, 44, 48.0, 47.0, 29.0, 23.0, np.eye(4))
-    cameras = Cameras((camera(BARREL, "bent"), camera(PINCUSHION, "cells"), plain))
+    pinhole = Camera.pinhole("plain", 60, 44, 48.0, 47.0, 29.0, 23.0, np.eye(4))
+    cameras = Cameras((camera(BARREL, "bent"), camera(PINCUSHION, "cells"), pinhole))
     packs, unpaired = pair(read_features(tmp_path / "f.safetensors"), cameras)
     assert unpaired == []
     for name in maps:

@@ -34,10 +34,10 @@ def values() -> dict[str, ViewFeatures]:
 
 @pytest.mark.parametrize(("kind", "floats"), [("int64", "float64"), ("int8", "float16"), (">i4", ">f4")])
 def test_arrays_of_numpy_become_tensors(kind: str, floats: str) -> None:
-    found = Regions(LABELS.astype(kind), np.eye(2, 3).astype(floats))
-    assert found.labels.dtype == torch.int32 and found.labels.tolist() == [LABELS.tolist()]
-    assert found.codebook.dtype == (torch.float16 if floats == "float16" else torch.float32)
-    assert found.codebook.tolist() == np.eye(2, 3).tolist()
+    observation = Regions(LABELS.astype(kind), np.eye(2, 3).astype(floats))
+    assert observation.labels.dtype == torch.int32 and observation.labels.tolist() == [LABELS.tolist()]
+    assert observation.codebook.dtype == (torch.float16 if floats == "float16" else torch.float32)
+    assert observation.codebook.tolist() == np.eye(2, 3).tolist()
 
 
 @pytest.mark.parametrize("kind", [np.uint16, np.uint32])
@@ -48,7 +48,7 @@ def test_labels_may_be_without_a_sign_as_pictures_have_them(kind: type[np.unsign
         ANY_REGIONS(labels + kind(65_534), np.eye(2))
 
 
-def test_iterator_that_the_disk_has_no_room_for_is_told() -> None:
+def test_iterator_that_the_disk_has_no_room_for_is_refused() -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
     try:
@@ -60,9 +60,9 @@ def test_iterator_that_the_disk_has_no_room_for_is_told() -> None:
 
 def test_arrays_that_fit_are_not_copied() -> None:
     codebook, labels = torch.eye(2, 3, requires_grad=True), torch.zeros(1, 2, 2, dtype=torch.int32)
-    found = Regions(labels, codebook)
-    assert found.codebook.data_ptr() == codebook.data_ptr() and not found.codebook.requires_grad
-    assert found.labels.data_ptr() == labels.data_ptr()
+    observation = Regions(labels, codebook)
+    assert observation.codebook.data_ptr() == codebook.data_ptr() and not observation.codebook.requires_grad
+    assert observation.labels.data_ptr() == labels.data_ptr()
     grid = np.ones((2, 3, 4), np.float16)
     grid.flags.writeable = False  # as mapped files are
     assert FeatureGrid(grid).grid.data_ptr() == grid.ctypes.data
@@ -92,30 +92,30 @@ def test_values_that_cannot_be_right_are_refused(make, message: str) -> None:
 
 
 def test_tensors_of_any_order_are_stored_in_row_order(tmp_path) -> None:
-    turned = torch.from_numpy(MAP).permute(1, 2, 0)
+    transposed = torch.from_numpy(MAP).permute(1, 2, 0)
     single = torch.arange(6).as_strided((1,), (2,))  # as a slice of one number may be
-    write_tensors(tmp_path / "t", {"turned": turned, "every other": turned[:, ::2], "single": single}, {})
-    found = load_file(tmp_path / "t")
-    assert torch.equal(found["turned"], turned) and torch.equal(found["every other"], turned[:, ::2])
-    assert torch.equal(found["single"], single)
+    write_tensors(tmp_path / "t", {"turned": transposed, "every other": transposed[:, ::2], "single": single}, {})
+    tensors = load_file(tmp_path / "t")
+    assert torch.equal(tensors["turned"], transposed) and torch.equal(tensors["every other"], transposed[:, ::2])
+    assert torch.equal(tensors["single"], single)
 
 
 def sources(tmp_path) -> dict[str, Views]:
     write_pack(tmp_path / "p", values(), {})
-    taken: list[str] = []
+    names: list[str] = []
 
     def pairs() -> Iterator[tuple[str, ViewFeatures]]:
         for name, value in values().items():
-            taken.append(name)
+            names.append(name)
             yield name, value
 
-    found = {
+    views = {
         "pack": read_features(tmp_path / "p"),
         "dict": as_views(values()),
         "iterator": as_views(pairs(), tmp_path),
     }
-    assert taken == ["b", "a"] and [path.name for path in tmp_path.iterdir()] == ["p"]
-    return found
+    assert names == ["b", "a"] and [path.name for path in tmp_path.iterdir()] == ["p"]
+    return views
 
 
 @pytest.mark.parametrize("kind", ["pack", "dict", "iterator"])
@@ -129,8 +129,8 @@ def test_views_are_the_same_from_every_source(kind: str, tmp_path) -> None:
     assert {part: spec.dtype for part, spec in views.specs("a").items()} == {"labels": "I16", "codebook": "F16"}
     for name, value in expected.items():
         assert torch.equal(views[name].codebook, value.codebook)
-    read, given = views["a"], expected["a"]
-    assert isinstance(read, Regions) and isinstance(given, Regions) and torch.equal(read.labels, given.labels)
+    actual, source = views["a"], expected["a"]
+    assert isinstance(actual, Regions) and isinstance(source, Regions) and torch.equal(actual.labels, source.labels)
 
 
 CODEBOOK = torch.arange(12.0).reshape(4, 3)
@@ -145,10 +145,10 @@ CODEBOOK = torch.arange(12.0).reshape(4, 3)
     ],
 )
 def test_views_that_cannot_be_right_are_refused_and_not_written(views: Any, message: str, tmp_path: Path) -> None:
-    for given in (views, iter(views.items())):
+    for source in (views, iter(views.items())):
         with pytest.raises(InvalidFeatures, match=message):
-            as_views(given)
-    if "FeatureGrid" not in message:  # which is told by its type
+            as_views(source)
+    if "FeatureGrid" not in message:  # which its type excludes
         with pytest.raises(InvalidFeatures, match=message):
             write_pack(tmp_path / "pack", views, {})
     with pytest.raises(InvalidFeatures, match="'a' twice"):
@@ -219,9 +219,9 @@ def test_names_of_levels_are_texts_that_print_or_none(text: str, names: tuple[st
 
 
 def test_several_packs_make_one_set_of_views(tmp_path: Path) -> None:
-    one = saved(tmp_path / "one", regions(0), encoder="clip")
+    clip = saved(tmp_path / "one", regions(0), encoder="clip")
     other = saved(tmp_path / "other", {"B/grid": torch.ones(1, 1, 3)})
-    packs = read_features(one, other)
+    packs = read_features(clip, other)
     assert packs.views == ("B", "a")
     with pytest.raises(InvalidFeatures, match="'ghost'"):
         packs["ghost"]
@@ -233,13 +233,13 @@ GRID = torch.ones(2, 2, 3)
 
 
 def zip_of_pickles() -> bytes:
-    """What torch.save writes, in short."""
+    """Return a short file of the kind that torch.save writes."""
     with zipfile.ZipFile(content := io.BytesIO(), "w") as archive:
         archive.writestr("archive/data.pkl", b"\x80\x02.")
     return content.getvalue()
 
 
-REFUSED: list[tuple[bytes | dict[str, torch.Tensor], str]] = [
+INVALID_PACKS: list[tuple[bytes | dict[str, torch.Tensor], str]] = [
     (b"", "an empty file"),
     (b"short", "begins with"),
     (zip_of_pickles(), "may run code"),
@@ -264,24 +264,24 @@ REFUSED: list[tuple[bytes | dict[str, torch.Tensor], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("content", "message"), REFUSED)
+@pytest.mark.parametrize(("content", "message"), INVALID_PACKS)
 def test_what_is_no_pack_is_refused_when_it_is_opened(content: Any, message: str, tmp_path: Path) -> None:
     (tmp_path / "pack").write_bytes(content if isinstance(content, bytes) else save(content))
-    with pytest.raises(InvalidFeatures, match=message) as caught:
+    with pytest.raises(InvalidFeatures, match=message) as error:
         read_features(tmp_path / "pack")
-    assert "\n" not in str(caught.value)
+    assert "\n" not in str(error.value)
 
 
 def test_packs_that_do_not_fit_together_are_refused(tmp_path: Path) -> None:
-    one = saved(tmp_path / "one", regions(0), encoder="clip")
+    clip = saved(tmp_path / "one", regions(0), encoder="clip")
     wide = saved(tmp_path / "wide", {"b/grid": torch.ones(1, 1, 4)})
     dino = saved(tmp_path / "dino", {"b/grid": torch.ones(1, 1, 3)}, encoder="dino")
     with pytest.raises(InvalidFeatures, match=r"each view in one pack, got 'a' in"):
-        read_features(one, one)
+        read_features(clip, clip)
     with pytest.raises(InvalidFeatures, match="the same channels"):
-        read_features(one, wide)
+        read_features(clip, wide)
     with pytest.raises(InvalidFeatures, match="one encoder in all packs"):
-        read_features(one, dino)
+        read_features(clip, dino)
     with pytest.raises(InvalidFeatures, match="at least one view"):
         read_features()
     with pytest.raises(InvalidFeatures, match="No such file"):
@@ -329,11 +329,11 @@ def test_written_pack_is_read_back(tmp_path: Path) -> None:
     assert packs.specs("many")["labels"].dtype == "I32"
     assert packs.specs("few")["labels"].dtype == "I16"
     for name, expected in views.items():
-        found = packs[name]
-        assert torch.equal(found.codebook, expected.codebook)
+        observation = packs[name]
+        assert torch.equal(observation.codebook, expected.codebook)
         if isinstance(expected, Regions):
-            assert isinstance(found, Regions)
-            assert torch.equal(found.labels, expected.labels)
+            assert isinstance(observation, Regions)
+            assert torch.equal(observation.labels, expected.labels)
     assert [path.name for path in tmp_path.iterdir()] == ["pack"]
 
 
@@ -342,30 +342,32 @@ def test_real_packs_pair_with_their_cameras(shared_data: Path) -> None:
     packs = read_features(plush / "grids.safetensors", plush / "grids_test.safetensors")
     paired, without = pair(packs, read_cameras(plush))
     assert (len(paired.views), without, packs.channels, packs.text_space) == (97, [], 320, "none")
-    found = read_features(plush / "regions.safetensors")
-    view = found[found.views[0]]
+    region_packs = read_features(plush / "regions.safetensors")
+    view = region_packs[region_packs.views[0]]
     assert isinstance(view, Regions)
     assert view.labels.shape == (4, 371, 495)
     assert len(read_features(shared_data / "tabletop" / "features_hard.safetensors").views) == 52
 
 
-MAC, OTHERS = "Ku\u0308che_0", "K\u00fcche_0"  # one name, decomposed and composed
+DECOMPOSED, COMPOSED = "Ku\u0308che_0", "K\u00fcche_0"  # one name, decomposed and composed
 
 
-@pytest.mark.parametrize(("stored", "photographed"), [(MAC, OTHERS), (OTHERS, MAC), (MAC, MAC)])
+@pytest.mark.parametrize(
+    ("stored", "photographed"), [(DECOMPOSED, COMPOSED), (COMPOSED, DECOMPOSED), (DECOMPOSED, DECOMPOSED)]
+)
 def test_a_name_of_a_mac_is_the_name_of_other_systems(stored: str, photographed: str, tmp_path: Path) -> None:
     save_file({f"{stored}/grid": torch.ones(2, 2, 3)}, tmp_path / "a.pack")
     cameras = Cameras([Camera.pinhole(photographed, 4, 3, 4.0, 4.0, 2.0, 1.5, np.eye(4))])
     for views in (read_features(tmp_path / "a.pack"), as_views({stored: FeatureGrid(np.ones((2, 2, 3)))})):
         paired, left_over = pair(views, cameras)
-        assert (paired.views, left_over) == ((OTHERS,), [])
+        assert (paired.views, left_over) == ((COMPOSED,), [])
         assert torch.equal(paired[photographed].codebook, torch.ones(4, 3))
-        assert torch.equal(views[MAC].codebook, views[OTHERS].codebook)
-    assert cameras[MAC] is cameras[OTHERS] and MAC in cameras and OTHERS in cameras
+        assert torch.equal(views[DECOMPOSED].codebook, views[COMPOSED].codebook)
+    assert cameras[DECOMPOSED] is cameras[COMPOSED] and DECOMPOSED in cameras and COMPOSED in cameras
 
 
 def test_a_pack_with_both_forms_of_a_name_is_refused(tmp_path: Path) -> None:
-    save_file({f"{name}/grid": torch.ones(2, 2, 3) for name in (MAC, OTHERS)}, tmp_path / "a.pack")
+    save_file({f"{name}/grid": torch.ones(2, 2, 3) for name in (DECOMPOSED, COMPOSED)}, tmp_path / "a.pack")
     with pytest.raises(InvalidFeatures, match=r"each view once.*forms of Unicode"):
         read_features(tmp_path / "a.pack")
 

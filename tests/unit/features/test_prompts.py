@@ -26,13 +26,14 @@ from tests.unit.command_line import assert_one_line, run
 
 PHRASES = {0: "red_apple", 2: "Lamp"}  # the cluster between them has no phrase
 MASKS = {
-    view: {phrase: found[0] == cluster for cluster, phrase in PHRASES.items()} for view, found in labels().items()
+    view: {phrase: label_map[0] == cluster for cluster, phrase in PHRASES.items()}
+    for view, label_map in labels().items()
 }
 
 
 def records(view: str, key: str = "class_name", *, as_string: bool = False) -> list[dict[str, Any]]:
-    found = sam_records(np.stack(list(MASKS[view].values())), as_string=as_string)
-    return [{**record, key: phrase} for record, phrase in zip(found, MASKS[view], strict=True)]
+    entries = sam_records(np.stack(list(MASKS[view].values())), as_string=as_string)
+    return [{**record, key: phrase} for record, phrase in zip(entries, MASKS[view], strict=True)]
 
 
 def save(folder: Path, files: dict[str, Any]) -> Path:
@@ -75,10 +76,10 @@ def data_set() -> dict[str, Any]:
 
 def pairs() -> dict[str, Any]:
     """As SA-Co does it: an image for each photo and phrase."""
-    asked = [(view, phrase) for view in MASKS for phrase in PHRASES.values()]
+    view_phrases = [(view, phrase) for view in MASKS for phrase in PHRASES.values()]
     images = [
         {"id": number, "file_name": f"{view}.jpg", "text_input": phrase}
-        for number, (view, phrase) in enumerate(asked)
+        for number, (view, phrase) in enumerate(view_phrases)
     ]
     masks = [
         {"image_id": number, "category_id": 1, "segmentation": record["segmentation"]}
@@ -88,14 +89,14 @@ def pairs() -> dict[str, Any]:
     return {"pairs.json": {"images": images, "categories": categories, "annotations": masks}}
 
 
-def numbered(view: str) -> np.ndarray:
+def numbered_masks(view: str) -> np.ndarray:
     return sum((7 * number * mask for number, mask in enumerate(MASKS[view].values(), 1)), np.zeros(())).astype("u1")
 
 
 def with_legend(view: str) -> bytes:
     content, text = io.BytesIO(), PngInfo()
     text.add_text("legend", json.dumps({7: "red apple", 14: "Lamp", 21: "elsewhere"}))
-    Image.fromarray(numbered(view)).save(content, format="PNG", pnginfo=text)
+    Image.fromarray(numbered_masks(view)).save(content, format="PNG", pnginfo=text)
     return content.getvalue()
 
 
@@ -116,7 +117,7 @@ def frame(mask: np.ndarray) -> list[list[float]]:
 
 def programs() -> dict[str, dict[str, Any]]:
     """Files of annotation programs, an image each."""
-    found: dict[str, dict[str, Any]] = {"LabelMe": {}, "Supervisely": {}, "Darwin": {}, "Cityscapes": {}}
+    files: dict[str, dict[str, Any]] = {"LabelMe": {}, "Supervisely": {}, "Darwin": {}, "Cityscapes": {}}
     for view, masks in MASKS.items():
         height, width = next(iter(masks.values())).shape
         shapes, objects, annotations, polygons = [], [], [], []
@@ -132,11 +133,11 @@ def programs() -> dict[str, dict[str, Any]]:
             polygons.append({"label": phrase, "polygon": frame(mask)})
         size = {"height": height, "width": width}
         item = {"name": f"{view}.jpg", "slots": [size]}
-        found["LabelMe"][f"{view}.json"] = {"shapes": shapes, "imageHeight": height, "imageWidth": width}
-        found["Supervisely"][f"{view}.jpg.json"] = {"size": size, "objects": objects}
-        found["Darwin"][f"{view}.json"] = {"item": item, "annotations": annotations}
-        found["Cityscapes"][f"{view}.json"] = {"imgHeight": height, "imgWidth": width, "objects": polygons}
-    return found
+        files["LabelMe"][f"{view}.json"] = {"shapes": shapes, "imageHeight": height, "imageWidth": width}
+        files["Supervisely"][f"{view}.jpg.json"] = {"size": size, "objects": objects}
+        files["Darwin"][f"{view}.json"] = {"item": item, "annotations": annotations}
+        files["Cityscapes"][f"{view}.json"] = {"imgHeight": height, "imgWidth": width, "objects": polygons}
+    return files
 
 
 NAMES = {  # the same names for values 1 and 2
@@ -158,7 +159,7 @@ NAMES = {  # the same names for values 1 and 2
     "config.json": {"id2label": {"0": "background", "1": "red_apple", "2": "Lamp"}},
     "categories.json": [{"id": 2, "name": "Lamp"}, {"id": 1, "name": "red_apple"}],
 }
-LABELS = {**{f"{view}.png": numbered(view) for view in MASKS}, "names.json": {7: "red_apple", 14: "Lamp"}}
+LABELS = {**{f"{view}.png": numbered_masks(view) for view in MASKS}, "names.json": {7: "red_apple", 14: "Lamp"}}
 COLOURS = {name: np.repeat(mask[..., None] // 255, 3, axis=2) for name, mask in binary("{view}/{phrase}").items()}
 KINDS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "binary PNGs": (binary("{phrase}/{view}"), {}),
@@ -170,7 +171,7 @@ KINDS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "label PNGs": (LABELS, {"names": "names.json"}),
     "label PNGs with a legend": ({f"{view}.png": with_legend(view) for view in MASKS}, {}),
     **{name: (files, {}) for name, files in programs().items()},
-    **{name: ({**{f"{view}.png": numbered(view) // 7 for view in MASKS}, name: names}, {"names": name})
+    **{name: ({**{f"{view}.png": numbered_masks(view) // 7 for view in MASKS}, name: names}, {"names": name})
        for name, names in NAMES.items()},
 }  # fmt: skip
 
@@ -179,8 +180,8 @@ KINDS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
 def test_every_kind_makes_the_same_pack(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files, options = KINDS[kind]
     save(tmp_path / "masks", files)
-    options = {name: str(tmp_path / "masks" / told) if name == "names" else told for name, told in options.items()}
-    flags = [part for name, told in options.items() for part in (f"--{name}", told)]
+    options = {name: str(tmp_path / "masks" / value) if name == "names" else value for name, value in options.items()}
+    flags = [part for name, value in options.items() for part in (f"--{name}", value)]
     pack = tmp_path / "pack.safetensors"
     status, out, err = run(capsys, "pack", "prompts", tmp_path / "masks", "-o", pack, "--json", *flags)
     assert (status, err) == (0, "")
@@ -191,10 +192,10 @@ def test_every_kind_makes_the_same_pack(kind: str, tmp_path: Path, capsys: pytes
     for name, masks in MASKS.items():
         view = views[name]
         assert isinstance(view, Regions)
-        shown = view.codebook.numpy()[view.labels[0].numpy()]  # [h, w, 3]: a channel a phrase, and the rest
-        assert np.array_equal(shown[..., 0] == 1, masks["Lamp"])
-        assert np.array_equal(shown[..., 1] == 1, masks["red_apple"])
-        assert np.array_equal(shown.sum(axis=2), np.ones_like(shown[..., 0]))
+        channels = view.codebook.numpy()[view.labels[0].numpy()]  # [h, w, 3]: a channel a phrase, and the rest
+        assert np.array_equal(channels[..., 0] == 1, masks["Lamp"])
+        assert np.array_equal(channels[..., 1] == 1, masks["red_apple"])
+        assert np.array_equal(channels.sum(axis=2), np.ones_like(channels[..., 0]))
 
 
 def test_a_lift_of_prompts_is_asked_in_its_words_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -211,7 +212,7 @@ def test_a_lift_of_prompts_is_asked_in_its_words_alone(tmp_path: Path, capsys: p
         json.loads(out)["present"] is None and "not known" in json.loads(out)["answer"]["reason"]
     )  # as no other words compete
     status, out, _ = run(capsys, "segment", lifted, "--json")
-    assert (status, {named["word"] for named in json.loads(out)["found"]}) == (0, {"Lamp", "red apple"})
+    assert (status, {entry["word"] for entry in json.loads(out)["found"]}) == (0, {"Lamp", "red apple"})
     status, _, err = run(capsys, "query", lifted, "red ample")
     assert status == 2 and "nearest: red apple" in err
     assert_one_line(err)
@@ -223,26 +224,26 @@ def test_a_lift_of_prompts_is_asked_in_its_words_alone(tmp_path: Path, capsys: p
 
 
 def test_phrases_of_a_mac_are_asked_as_they_are_typed(tmp_path: Path) -> None:
-    found = prompt_views(save(tmp_path, {"ku\u0308che/a.png": MASKS["middle"]["Lamp"]}))
-    assert found.table.encode(["K\u00fcche"]).tolist() == [[1, 0]]
+    prompts = prompt_views(save(tmp_path, {"ku\u0308che/a.png": MASKS["middle"]["Lamp"]}))
+    assert prompts.table.encode(["K\u00fcche"]).tolist() == [[1, 0]]
 
 
-@pytest.mark.parametrize(("folders", "warned"), [("phrases", True), ("views", False)])
-def test_phrases_that_are_numbered_as_photos_are_told(folders: Any, warned: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("folders", "has_warning"), [("phrases", True), ("views", False)])
+def test_phrases_that_are_numbered_as_photos_give_a_warning(folders: Any, has_warning: bool, tmp_path: Path) -> None:
     mask = MASKS["middle"]["Lamp"]
     save(tmp_path, {f"IMG_{view}/{phrase}.png": mask for view in (7, 12) for phrase in ("lamp", "mug")})
-    assert ("--folders views" in " ".join(prompt_views(tmp_path, folders=folders).warnings)) is warned
+    assert ("--folders views" in " ".join(prompt_views(tmp_path, folders=folders).warnings)) is has_warning
 
 
-def test_masks_in_black_on_white_are_told(tmp_path: Path) -> None:
+def test_masks_in_black_on_white_give_a_warning(tmp_path: Path) -> None:
     save(tmp_path / "black", {name: 255 - mask for name, mask in binary("{phrase}/{view}").items()})
     assert "black on white" in " ".join(prompt_views(tmp_path / "black").warnings)
-    found = prompt_views(save(tmp_path / "white", binary("{phrase}/{view}")))
-    assert found.warnings == ()
+    prompts = prompt_views(save(tmp_path / "white", binary("{phrase}/{view}")))
+    assert prompts.warnings == ()
 
 
 @pytest.mark.parametrize("name", [b"mug/caf\xe9.png", b"caf\xe9/a.png"])
-def test_names_that_are_no_utf8_are_told_before_a_pack_is_written(
+def test_names_that_are_no_utf8_are_refused_before_a_pack_is_written(
     name: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     save(tmp_path, {"mug/a.png": MASKS["middle"]["Lamp"]})
@@ -259,21 +260,23 @@ def test_names_that_are_no_utf8_are_told_before_a_pack_is_written(
 
 def test_masks_that_overlap_count_for_both_phrases(tmp_path: Path) -> None:
     mask = MASKS["middle"]["Lamp"]
-    nothing, everything = np.zeros_like(mask), np.ones_like(mask)
-    files = {"lamp/a.png": mask, "lamp/b.png": nothing, "thing/a.png": everything, "ghost/a.png": nothing}
-    found = prompt_views(save(tmp_path, files))
-    assert found.table.words == ("lamp", "thing")
-    assert found.counts == {"ghost": 0, "lamp": 1, "thing": 1}
-    view = found.views["a"]
-    seen = [{tuple(view.codebook[row].tolist()) for row in pixel if row >= 0} for pixel in view.labels.flatten(1).T]
-    assert seen == [{(1, 0, 0), (0, 1, 0)} if inside else {(0, 1, 0)} for inside in mask.ravel()]
-    assert found.views["b"].codebook[found.views["b"].labels.flatten()].tolist() == [[0, 0, 1]]
+    empty, full = np.zeros_like(mask), np.ones_like(mask)
+    files = {"lamp/a.png": mask, "lamp/b.png": empty, "thing/a.png": full, "ghost/a.png": empty}
+    prompts = prompt_views(save(tmp_path, files))
+    assert prompts.table.words == ("lamp", "thing")
+    assert prompts.counts == {"ghost": 0, "lamp": 1, "thing": 1}
+    view = prompts.views["a"]
+    pixel_codes = [
+        {tuple(view.codebook[row].tolist()) for row in pixel if row >= 0} for pixel in view.labels.flatten(1).T
+    ]
+    assert pixel_codes == [{(1, 0, 0), (0, 1, 0)} if inside else {(0, 1, 0)} for inside in mask.ravel()]
+    assert prompts.views["b"].codebook[prompts.views["b"].labels.flatten()].tolist() == [[0, 0, 1]]
 
 
 def test_packs_of_other_words_make_no_lift(tmp_path: Path) -> None:
     for name, phrase in (("one", "lamp"), ("other", "mug")):
-        found = prompt_views(save(tmp_path / name, {f"{phrase}/{name}.png": MASKS["middle"]["Lamp"]}))
-        write_pack(tmp_path / f"{name}.pack", found.views, {}, table=found.table)
+        prompts = prompt_views(save(tmp_path / name, {f"{phrase}/{name}.png": MASKS["middle"]["Lamp"]}))
+        write_pack(tmp_path / f"{name}.pack", prompts.views, {}, table=prompts.table)
     with pytest.raises(InvalidFeatures, match="one table in all packs"):
         read_features(tmp_path / "one.pack", tmp_path / "other.pack")
 
@@ -281,7 +284,7 @@ def test_packs_of_other_words_make_no_lift(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("names", "message"), [("{}", "JSON of values"), ('{"7": 3}', "JSON of values"), ('["a"]', "the value 7")]
 )
-def test_names_that_do_not_fit_their_pictures_are_told(names: str, message: str, tmp_path: Path) -> None:
+def test_names_that_do_not_fit_their_pictures_are_refused(names: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(InvalidFeatures, match=message):
         prompt_views(save(tmp_path, {**LABELS, "names.json": names}), tmp_path / "names.json")
 
@@ -297,7 +300,7 @@ def test_names_that_do_not_fit_their_pictures_are_told(names: str, message: str,
 )
 def test_tables_without_values_are_no_names(name: str, content: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(InvalidFeatures, match=message):
-        prompt_views(save(tmp_path, {"a.png": numbered("left"), name: content}), tmp_path / name)
+        prompt_views(save(tmp_path, {"a.png": numbered_masks("left"), name: content}), tmp_path / name)
 
 
 @pytest.mark.parametrize(
@@ -306,7 +309,7 @@ def test_tables_without_values_are_no_names(name: str, content: str, message: st
         ({}, "no such folder"),
         ({"a.txt": "x"}, "got 1 other files"),
         ({"a.png": MASKS["left"]["Lamp"]}, "outside of folders of phrases"),
-        ({"mug/a.png": numbered("left")}, r"one value besides 0, a mask, got values from 7 to 14"),
+        ({"mug/a.png": numbered_masks("left")}, r"one value besides 0, a mask, got values from 7 to 14"),
         ({"mug/a.png": np.full((2, 2, 4), 9, np.uint8)}, "colours with transparency"),
         ({"mug/a.png": "x"}, "not a PNG"),
         ({"mug/a.png": np.zeros((2, 2), np.uint8)}, "1 to 4096 phrases with masks, got 0 of 1"),
@@ -333,7 +336,7 @@ def test_tables_without_values_are_no_names(name: str, content: str, message: st
         ),
     ],
 )
-def test_what_is_no_such_folder_is_told(files: dict[str, Any], message: str, tmp_path: Path) -> None:
+def test_what_is_no_such_folder_is_refused(files: dict[str, Any], message: str, tmp_path: Path) -> None:
     save(tmp_path / "masks", files)
     with pytest.raises(InvalidFeatures, match=message):
         prompt_views(tmp_path / "masks").views["a"]

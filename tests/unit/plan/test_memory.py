@@ -1,4 +1,4 @@
-"""What the plan says of memory, beside what a lift makes."""
+"""Memory in the plan, compared with the arrays that a lift allocates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which photos to encode first: an order that the dense definition gives, and what it says."""
+"""The order in which to encode photos, as the dense definition gives it, and the report on it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How many views a pilot asks for, and whether it is right."""
+"""The number of views that a view noise estimate recommends, and its accuracy."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_cosines_are_those_of_the_variance_and_of_the_splats_that_views_show():
     assert pilot_of([[1.0]] * 100, [1.0], [1.0]).views_for(0.9, range(100)) == (81, pytest.approx(0.9))  # all error
 
 
-def test_the_fewest_views_that_come_to_the_cosine_are_taken_but_never_fewer_than_told():
+def test_the_fewest_views_that_reach_the_cosine_are_chosen_but_never_fewer_than_least():
     estimate = pilot_of([[1.0]] * 40, [0.05], [1.0])
     cosines = list(estimate.cosines(range(40)))
     count, expected = estimate.views_for(0.99, range(40))

@@ -1,4 +1,4 @@
-"""What the plan says of views and splats."""
+"""Views and splats in the plan."""
 
 from __future__ import annotations
 

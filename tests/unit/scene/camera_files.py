@@ -59,9 +59,9 @@ def with_json(tmp_path: Path, document: Any) -> Path:
     return path
 
 
-def assert_same(one: Cameras, other: Cameras) -> None:
-    assert list(one) == list(other)
-    for a, b in zip(one.values(), other.values(), strict=True):
+def assert_same(actual: Cameras, expected: Cameras) -> None:
+    assert list(actual) == list(expected)
+    for a, b in zip(actual.values(), expected.values(), strict=True):
         assert (a.width, a.height) == (b.width, b.height)
         assert np.allclose([a.fx, a.fy, a.cx, a.cy], [b.fx, b.fy, b.cx, b.cy], atol=1e-9)
         assert np.allclose(a.viewmat, b.viewmat, atol=1e-12)

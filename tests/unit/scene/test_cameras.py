@@ -28,7 +28,7 @@ from liftcore.values.lift import LiftMetadata
 from liftcore.values.lift_file import camera_input, has_poses, poses_of
 from liftcore.values.settings import LiftSettings
 
-ONE = IMAGES[:1]
+FIRST_IMAGE = IMAGES[:1]
 OPENCV = Brown(k1=0.01, k2=-0.02, p1=0.001, p2=0.002)
 DISTORTED = {**CAMERAS, 1: (2, "SIMPLE_RADIAL", (500.0, 320.0, 240.0, 0.1))}
 TRANSFORMS = {
@@ -72,7 +72,7 @@ def test_zipped_model_is_read_at_any_depth_and_with_any_separators(root: str, mo
 
 
 @pytest.mark.parametrize("packed", [False, True])
-def test_models_that_are_not_read_are_told(packed: bool, tmp_path: Path) -> None:
+def test_models_that_are_not_read_are_in_the_warnings(packed: bool, tmp_path: Path) -> None:
     scene = tmp_path / "scene"
     for place in ("dense/0/sparse", "old/sparse/1", ".cache/sparse/0"):
         write_files(scene / place, binary_files())
@@ -81,8 +81,8 @@ def test_models_that_are_not_read_are_told(packed: bool, tmp_path: Path) -> None
     write_files(scene / "old/sparse/2", {"cameras.bin": b"of no whole model"})
     path = Path(shutil.make_archive(str(scene), "zip", scene)) if packed else scene
     assert read_cameras(path).distorted == ()
-    told = "2 more COLMAP models were not read: old/sparse/1, distorted/sparse/0"
-    assert describe_camera_file(path)["warnings"] == [told]
+    warning = "2 more COLMAP models were not read: old/sparse/1, distorted/sparse/0"
+    assert describe_camera_file(path)["warnings"] == [warning]
     write_files(scene / "a/b/c/d/e", binary_files())  # too deep to be looked for
     assert other_models(scene) == ["old/sparse/1", "distorted/sparse/0"]
     assert other_models(scene / "old/sparse/1") == []
@@ -117,7 +117,9 @@ def test_distorted_photos_and_all_of_a_fisheye_have_a_lens(
 ) -> None:
     fy = 510.0 if 510.0 in parameters else 500.0
     for files in (binary_files, text_files):
-        cameras = read_cameras(write_files(tmp_path / files.__name__, files({1: (number, name, parameters)}, ONE)))
+        cameras = read_cameras(
+            write_files(tmp_path / files.__name__, files({1: (number, name, parameters)}, FIRST_IMAGE))
+        )
         view = cameras["frame 1"]
         assert view.lens == (None if lens is None else Lens(640, 480, 500.0, fy, 320.0, 240.0, lens))
         assert cameras.distorted == (("frame 1",) if lens else ())
@@ -128,7 +130,7 @@ def test_models_of_colmap_that_are_not_read_are_refused(number: int, name: str, 
     sensor = {1: (number, name, (500.0, 500.0, 320.0, 240.0, *[0.0] * (count - 4)))}
     for files in (binary_files, text_files):
         with pytest.raises(InvalidCameras, match=rf"SIMPLE_PINHOLE, .*, got {name}; .*image_undistorter"):
-            read_cameras(write_files(tmp_path / files.__name__, files(sensor, ONE)))
+            read_cameras(write_files(tmp_path / files.__name__, files(sensor, FIRST_IMAGE)))
 
 
 def test_inria_cameras_survive_a_round_trip(model: Path, tmp_path: Path) -> None:
@@ -168,7 +170,7 @@ DAMAGED: list[tuple[dict[str, bytes], str]] = [
     (binary_files(images=[(1, (0.0,) * 4, *IMAGES[0][2:])]), "quaternion that is not zero"),
     (binary_files(images=[(1, (math.nan,) * 4, *IMAGES[0][2:])]), "finite quaternion"),
     (binary_files(images=[(*IMAGES[0][:2], (math.nan, 0.0, 0.0), "a.jpg")]), "finite 4x4"),
-    (binary_files({1: (1, "", (math.nan, 1.0, 1.0, 1.0))}, ONE), "focal"),
+    (binary_files({1: (1, "", (math.nan, 1.0, 1.0, 1.0))}, FIRST_IMAGE), "focal"),
     (binary_files(images=[]), "at least one view"),
     (binary_files(images=[IMAGES[0], IMAGES[0]]), "cameras: expected one view a name, got 'frame 1' twice"),
     (text_files() | {"cameras.txt": b"1 PINHOLE wide 480 1 1 1 1\n"}, "CAMERA_ID MODEL"),
@@ -204,9 +206,9 @@ DAMAGED: list[tuple[dict[str, bytes], str]] = [
 def test_damaged_files_are_refused(files: dict[str, bytes], message: str, tmp_path: Path) -> None:
     folder = write_files(tmp_path / "model", files)
     for path in [folder / next(iter(files)), *([folder] if "cameras.json" not in files else [])]:
-        with pytest.raises(InvalidCameras, match=message) as caught:
+        with pytest.raises(InvalidCameras, match=message) as error:
             read_cameras(path)
-        assert "\n" not in str(caught.value) and len(str(caught.value)) < 600
+        assert "\n" not in str(error.value) and len(str(error.value)) < 600
 
 
 def test_large_json_is_refused(tmp_path: Path) -> None:
@@ -219,11 +221,11 @@ def test_large_json_is_refused(tmp_path: Path) -> None:
 
 
 def test_real_cameras_agree_in_both_formats(shared_data: Path) -> None:
-    one = read_cameras(shared_data / "plush" / "cameras.json")
-    other = read_cameras(shared_data / "plush" / "sparse" / "0")
-    assert len(one) == 97
-    names = sorted(one)
-    assert_same(Cameras([one[name] for name in names]), Cameras([other[name] for name in names]))
+    inria = read_cameras(shared_data / "plush" / "cameras.json")
+    colmap = read_cameras(shared_data / "plush" / "sparse" / "0")
+    assert len(inria) == 97
+    names = sorted(inria)
+    assert_same(Cameras([inria[name] for name in names]), Cameras([colmap[name] for name in names]))
     assert len(read_cameras(shared_data / "tabletop")) == 60
 
 
@@ -266,33 +268,33 @@ def test_folder_and_zip_read_the_same_model(places: tuple[str, ...], tmp_path: P
 def test_distorted_cameras_beside_undistorted_ones_are_refused(packed: bool, tmp_path: Path) -> None:
     scene = tmp_path / "scene"
 
-    def given() -> Path:
+    def scene_path() -> Path:
         return tmp_path / shutil.make_archive(str(scene), "zip", scene) if packed else scene
 
     write_files(scene / "sparse/0", binary_files(DISTORTED))
-    assert len(read_cameras(given()).distorted) == 2
+    assert len(read_cameras(scene_path()).distorted) == 2
     write_files(scene / "sparse/1", binary_files(DISTORTED))  # COLMAP's second component, of the same lens
     write_files(scene / "sparse/2", {**binary_files(), "images.bin": b"cut"})
-    assert len(read_cameras(given()).distorted) == 2
+    assert len(read_cameras(scene_path()).distorted) == 2
     write_files(scene / "dense/0/sparse", binary_files())
-    how = "zip the one alone" if packed else "name the one"
-    both = rf"distorted ones in (.*/)?sparse/0 and undistorted ones in (.*/)?dense/0/sparse; {how} whose photos"
-    with pytest.raises(InvalidCameras, match=both):
-        read_cameras(given())
+    remedy = "zip the one alone" if packed else "name the one"
+    message = rf"distorted ones in (.*/)?sparse/0 and undistorted ones in (.*/)?dense/0/sparse; {remedy} whose photos"
+    with pytest.raises(InvalidCameras, match=message):
+        read_cameras(scene_path())
     if not packed:
         assert len(read_cameras(scene / "sparse/0").distorted) == 2
         assert read_cameras(scene / "dense/0/sparse").distorted == ()
 
 
-def test_distorted_photos_are_told(tmp_path: Path) -> None:
-    found = inspect_file(write_files(tmp_path / "model", binary_files(DISTORTED)))
-    assert found["distorted"] == 2
-    assert found["sizes"] == ["640x480"]  # of the photos
+def test_warnings_count_distorted_photos(tmp_path: Path) -> None:
+    report = inspect_file(write_files(tmp_path / "model", binary_files(DISTORTED)))
+    assert report["distorted"] == 2
+    assert report["sizes"] == ["640x480"]  # of the photos
     assert any(
         re.search(
             "2 of 3 views are of distorted photos, of each of which 9[0-9]% or more is lifted: features must be", text
         )
-        for text in found["warnings"]
+        for text in report["warnings"]
     )
     assert inspect_file(write_files(tmp_path / "plain", binary_files()))["distorted"] == 0
 
@@ -322,8 +324,8 @@ def test_camera_that_no_image_uses_may_be_of_any_model(tmp_path: Path) -> None:
         assert len(names(write_files(tmp_path / files.__name__, files({**CAMERAS, 2: DISTORTED[1]})))) == 3
     unknown = text_files({**CAMERAS, 3: (99, "CROOKED", (1.0, 2.0))})  # of a binary one nobody knows the length
     assert len(names(write_files(tmp_path / "unknown", unknown))) == 3
-    marked = {name: b"\xef\xbb\xbf" + content for name, content in text_files().items()}
-    assert len(names(write_files(tmp_path / "marked", marked))) == 3  # and a byte order mark is none
+    files_with_bom = {name: b"\xef\xbb\xbf" + content for name, content in text_files().items()}
+    assert len(names(write_files(tmp_path / "marked", files_with_bom))) == 3  # and a byte order mark is none
 
 
 @pytest.mark.parametrize(
@@ -347,9 +349,9 @@ def test_error_in_a_zip_names_the_zip(tmp_path: Path) -> None:
     with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as archive:
         archive.writestr("cameras.bin", binary_files()["cameras.bin"] * 50)
         archive.writestr("images.bin", b"")
-    with pytest.raises(InvalidCameras) as caught:
+    with pytest.raises(InvalidCameras) as error:
         read_cameras(path)
-    assert str(caught.value).startswith(f"{path}/images.bin")
+    assert str(error.value).startswith(f"{path}/images.bin")
     content = bytearray(path.read_bytes())
     content[60:100] = bytes(40)
     path.write_bytes(content)
@@ -361,21 +363,21 @@ def test_lifts_that_remember_names_as_a_mac_wrote_them_know_their_cameras(tmp_pa
     """As lifts of before were: names decomposed (NFD), and the digest of their poses too."""
     frames = [{"file_path": f"Ku\u0308che_{k}.png", "transform_matrix": np.eye(4).tolist()} for k in range(2)]
     path = with_json(tmp_path, {"w": 4, "h": 3, "fl_x": 4.0, "fl_y": 4.0, "frames": frames})
-    found = read_cameras(path)
-    assert [*found] == ["K\u00fcche_0", "K\u00fcche_1"]
+    cameras = read_cameras(path)
+    assert [*cameras] == ["K\u00fcche_0", "K\u00fcche_1"]
     views = tuple(f"Ku\u0308che_{k}" for k in range(2))
-    known = [found[view] for view in views]
+    view_cameras = [cameras[view] for view in views]
     old = LiftMetadata(
         version="0.4.0",
         settings=LiftSettings.of(),
         views=views,
-        poses=poses_of(known, "NFD"),
+        poses=poses_of(view_cameras, "NFD"),
         diagnostics={},
         timings={},
     )
-    assert old.views == tuple(found) and has_poses(path, old)
-    assert has_poses(path, old.model_copy(update={"poses": poses_of(known)}))
-    assert not has_poses(path, old.model_copy(update={"poses": poses_of(known[:1])}))
+    assert old.views == tuple(cameras) and has_poses(path, old)
+    assert has_poses(path, old.model_copy(update={"poses": poses_of(view_cameras)}))
+    assert not has_poses(path, old.model_copy(update={"poses": poses_of(view_cameras[:1])}))
 
 
 def named_model(*names: str, shift: float = 0.0) -> dict[str, bytes]:
@@ -407,15 +409,15 @@ def test_of_several_models_the_one_of_the_views_is_read_and_else_the_largest(
     ):
         cameras = read_cameras(path, views=views)
         assert {camera.viewmat[0, 3] for camera in cameras.values()} == {float(number)}
-        [told] = cameras.warnings
-        assert told.startswith(f"{place.format(number)} ({len(cameras)} images")
-        assert re.search(rf"and {place.format(0)} \(2 images", told)
-        assert told in inspect_file(path)["warnings"] or views
+        [warning] = cameras.warnings
+        assert warning.startswith(f"{place.format(number)} ({len(cameras)} images")
+        assert re.search(rf"and {place.format(0)} \(2 images", warning)
+        assert warning in inspect_file(path)["warnings"] or views
     assert other_models(path) == []
     assert len(read_cameras(scene / place.format(0))) == 2  # what is named is read
     if place != "{}":
-        [told] = read_cameras(scene / place.format(0), views=["IMG_0", "IMG_5"]).warnings
-        assert re.search(rf"cameras of 1 of the 2 views; .*{place.format(1)} \(6 images\) has cameras of 2", told)
+        [warning] = read_cameras(scene / place.format(0), views=["IMG_0", "IMG_5"]).warnings
+        assert re.search(rf"cameras of 1 of the 2 views; .*{place.format(1)} \(6 images\) has cameras of 2", warning)
     assert read_cameras(scene / place.format(0)).warnings == ()
 
 
@@ -432,12 +434,12 @@ def test_scenes_in_numbered_folders_are_no_models_of_one(tmp_path: Path) -> None
         read_cameras(tmp_path / "scans")
 
 
-def test_image_names_that_are_no_utf8_are_told(tmp_path: Path) -> None:
+def test_image_names_that_are_no_utf8_give_a_warning(tmp_path: Path) -> None:
     files = {name: content.replace(b"K?c", b"K\xfcc") for name, content in named_model("K?che_0", "K?che_1").items()}
-    found = read_cameras(write_files(tmp_path, files))
-    assert len(found) == 2 and "2 images are not UTF-8" in " ".join(found.warnings)
+    cameras = read_cameras(write_files(tmp_path, files))
+    assert len(cameras) == 2 and "2 images are not UTF-8" in " ".join(cameras.warnings)
     with pytest.raises(InvalidFeatures, match="names of cameras are not UTF-8"):
-        require_pairs(["K\u00fcche_0", "K\u00fcche_1"], found)
+        require_pairs(["K\u00fcche_0", "K\u00fcche_1"], cameras)
 
 
 def test_a_zip_of_json_alone_is_warned_of_no_model(tmp_path: Path) -> None:
@@ -464,12 +466,12 @@ BROKEN_POSES = {
 }
 
 
-@pytest.mark.parametrize("what", BROKEN_POSES)
-def test_a_broken_pose_of_a_model_is_named_and_the_others_are_read(what: str, tmp_path: Path) -> None:
-    whole = read_cameras(write_files(tmp_path / "whole", binary_files()))
-    path = write_files(tmp_path / "model", BROKEN_POSES[what])
+@pytest.mark.parametrize("case", BROKEN_POSES)
+def test_a_broken_pose_of_a_model_is_named_and_the_others_are_read(case: str, tmp_path: Path) -> None:
+    expected = read_cameras(write_files(tmp_path / "whole", binary_files()))
+    path = write_files(tmp_path / "model", BROKEN_POSES[case])
     cameras = read_cameras(path)
-    assert_same(cameras, whole)
+    assert_same(cameras, expected)
     assert any("1 cameras were skipped" in text and "'broken'" in text for text in inspect_file(path)["warnings"])
 
 
@@ -485,10 +487,10 @@ def test_broken_poses_of_json_are_named_and_the_others_are_read(tmp_path: Path) 
     poses = {"a": [[2.0, 0, 0, 0], *frame["transform_matrix"][1:]], "b": None, "c": [[math.nan] * 4] * 3, "d": still}
     frames = [{**frame, "file_path": "good.png"}]
     frames += [{"file_path": name, "transform_matrix": pose} for name, pose in poses.items()]
-    for document, skipped in ((records, 2), ({**TRANSFORMS, "frames": frames}, 4)):
+    for document, skipped_count in ((records, 2), ({**TRANSFORMS, "frames": frames}, 4)):
         path = with_json(tmp_path, document)
         assert names(path) == ["good"]
-        [told] = read_cameras(path).warnings
-        assert f"{skipped} cameras were skipped" in told and "'a', 'b'" in told
+        [warning] = read_cameras(path).warnings
+        assert f"{skipped_count} cameras were skipped" in warning and "'a', 'b'" in warning
     with pytest.raises(InvalidCameras, match="'fx'"):  # what is wrong elsewhere is refused
         read_cameras(with_json(tmp_path, [good, {key: value for key, value in good.items() if key != "fx"}]))

@@ -18,7 +18,7 @@ from liftcore.scene.distortion import FARTHEST, Brown, Distortion, Fisheye, Lens
 POINTS = np.array([[0.1, 0.2], [-0.6, 0.45], [0.7, -0.5], [0.0, 0.55]])
 RATIONAL = Brown(k1=-0.28, k2=0.09, k3=-0.015, k4=0.02, k5=-0.01, k6=0.004, p1=0.0012, p2=-0.0007)
 # cv2.projectPoints of OpenCV 5.0.0; pycolmap 4.2.1 gives the same to 1e-16.
-BENT = [
+DISTORTED_POINTS = [
     [0.098525200191713, 0.19718040038342596],
     [-0.517986313441364, 0.388869422581023],
     [0.5768242947166292, -0.4114993533690209],
@@ -26,7 +26,7 @@ BENT = [
 ]
 FISHEYE_POINTS = np.array([[0.1, 0.2], [-1.6, 0.45], [2.7, -3.5], [0.0, 0.55]])
 FISHEYE = Fisheye(k1=0.03, k2=-0.012, k3=0.004, k4=-0.0006)
-FISHEYE_BENT = [  # cv2.fisheye.projectPoints
+FISHEYE_DISTORTED_POINTS = [  # cv2.fisheye.projectPoints
     [0.09852172813528043, 0.19704345627056086],
     [-1.0128250612582874, 0.2848570484788933],
     [0.8502062347439255, -1.1021191931865701],
@@ -58,19 +58,20 @@ def straight(lens: Distortion, points: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("lens", "points", "seen"), [(RATIONAL, POINTS, BENT), (FISHEYE, FISHEYE_POINTS, FISHEYE_BENT)]
+    ("lens", "points", "distorted"),
+    [(RATIONAL, POINTS, DISTORTED_POINTS), (FISHEYE, FISHEYE_POINTS, FISHEYE_DISTORTED_POINTS)],
 )
-def test_lenses_bend_as_those_of_opencv(lens: Distortion, points: np.ndarray, seen: list[list[float]]) -> None:
-    assert np.abs(distorted_points(lens, points) - seen).max() < 1e-15
-    assert np.abs(straight(lens, np.array(seen)) - points).max() < 1e-8
+def test_lenses_bend_as_those_of_opencv(lens: Distortion, points: np.ndarray, distorted: list[list[float]]) -> None:
+    assert np.abs(distorted_points(lens, points) - distorted).max() < 1e-15
+    assert np.abs(straight(lens, np.array(distorted)) - points).max() < 1e-8
 
 
 @pytest.mark.parametrize("name", OF_COLMAP)
 def test_models_of_colmap_show_a_ray_where_colmap_does(name: str) -> None:
-    parameters, seen = OF_COLMAP[name]
+    parameters, expected = OF_COLMAP[name]
     intrinsics, lens = calibration(MODELS_BY_NAME[name], parameters, "a camera")
     u, v = (0.5, -0.4) if lens is None else distorted_points(lens, np.array([[0.5, -0.4]]))[0]
-    assert np.allclose((intrinsics.fx * u + intrinsics.cx, intrinsics.fy * v + intrinsics.cy), seen, atol=1e-9)
+    assert np.allclose((intrinsics.fx * u + intrinsics.cx, intrinsics.fy * v + intrinsics.cy), expected, atol=1e-9)
 
 
 @given(st.tuples(*[st.floats(-1, 1)] * 5), st.floats(0, 6.3), st.floats(0, 1))
@@ -102,8 +103,8 @@ LENSES = {"barrel": BARREL, "pincushion": PINCUSHION, "fisheye": WIDE}
 
 
 def camera(distortion: Distortion, width: int = 64, height: int = 48, focal: float = 50.0) -> Camera:
-    plain = Camera.pinhole("v", width, height, focal, 1.02 * focal, 0.49 * width, 0.52 * height, np.eye(4))
-    return behind_lens(plain, distortion)
+    pinhole = Camera.pinhole("v", width, height, focal, 1.02 * focal, 0.49 * width, 0.52 * height, np.eye(4))
+    return behind_lens(pinhole, distortion)
 
 
 def corners(view: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -142,11 +143,11 @@ def test_the_pinhole_of_a_photo_is_the_largest_that_it_shows_whole(name: str) ->
 @pytest.mark.parametrize("name", ["barrel", "pincushion"])
 def test_every_pixel_of_a_perspective_photo_is_drawn(name: str) -> None:
     view = camera(LENSES[name])
-    lens, drawn = lens_of(view), drawn_by(view)
+    lens, pinhole = lens_of(view), drawn_by(view)
     u, v = photo_places(lens)
     assert u.shape == v.shape == (48, 64)
-    assert u.min() >= 0 and u.max() < drawn.width and v.min() >= 0 and v.max() < drawn.height
-    back = lens.on_photo((u - drawn.cx) / drawn.fx, (v - drawn.cy) / drawn.fy)
+    assert u.min() >= 0 and u.max() < pinhole.width and v.min() >= 0 and v.max() < pinhole.height
+    back = lens.on_photo((u - pinhole.cx) / pinhole.fx, (v - pinhole.cy) / pinhole.fy)
     assert np.abs(back[0] - (np.arange(64) + 0.5)).max() < 1e-4
     assert np.abs(back[1] - (np.arange(48)[:, None] + 0.5)).max() < 1e-4
     for x, y in ((0, 0), (10, 20), (63, 47)):
@@ -155,8 +156,8 @@ def test_every_pixel_of_a_perspective_photo_is_drawn(name: str) -> None:
 
 def test_the_pinhole_of_a_whole_hemisphere_ends_at_sixty_degrees() -> None:
     view = camera(Fisheye(), width=160, height=160, focal=50.0)  # 92 degrees to each side
-    drawn = drawn_by(view)
-    for pinhole in (view, drawn):
+    outer = drawn_by(view)
+    for pinhole in (view, outer):
         x, y = corners(pinhole)
         assert max(x.max(), -x.min(), y.max(), -y.min()) < math.tan(math.radians(60)) + 2 / 50
         assert pinhole.width > 2 * 50 * math.tan(math.radians(60)) - 4
@@ -198,17 +199,17 @@ def test_a_photo_whose_corners_show_no_ray_is_lifted_as_far_as_it_shows_some(
     u, v = np.meshgrid(np.linspace(0, view.width, 65), np.linspace(0, view.height, 65))
     x, y = (u - view.cx) / view.fx, (v - view.cy) / view.fy
     on_photo = lens.on_photo(x, y)
-    for at, length in zip(on_photo, (width, height), strict=True):
-        assert at.min() > -1e-3 and at.max() < length + 1e-3
+    for coordinate, length in zip(on_photo, (width, height), strict=True):
+        assert coordinate.min() > -1e-3 and coordinate.max() < length + 1e-3
     back = lens.on_plane(*on_photo)  # no other ray is at the same place
     inside = np.hypot(x, y) < 0.999 * np.hypot(x, y).max()
     assert np.abs(back[0] - x)[inside].max() < 1e-6 and np.abs(back[1] - y)[inside].max() < 1e-6
-    drawn = drawn_by(view)
-    assert drawn.width >= view.width and drawn.height >= view.height
+    pinhole = drawn_by(view)
+    assert pinhole.width >= view.width and pinhole.height >= view.height
 
 
 def turns_back(lens: Lens) -> bool:
-    """Whether two places of the photo show one ray, by the lens's slopes at dense places from its axis."""
+    """Return True if two positions on the photo show one ray, by the lens's slopes at dense samples."""
     angles = np.linspace(0, 2 * np.pi, 180, endpoint=False)[:, None]
     radii = np.tan(np.linspace(0, np.arctan(2 * math.tan(math.radians(60))), 1500))
     x, y, h = radii * np.cos(angles), radii * np.sin(angles), 1e-6
@@ -216,12 +217,12 @@ def turns_back(lens: Lens) -> bool:
         lens.distortion.distorted(x + a, y + b) for a, b in ((h, 0), (-h, 0), (0, h), (0, -h))
     )
     slopes = [
-        (p - q) / (2 * h) for one, other in ((right, left), (below, above)) for p, q in zip(one, other, strict=True)
+        (p - q) / (2 * h) for plus, minus in ((right, left), (below, above)) for p, q in zip(plus, minus, strict=True)
     ]
     back = ~((slopes[0] * slopes[3] - slopes[1] * slopes[2] > 0) & (slopes[0] + slopes[3] > 0))
     u, v = lens.on_photo(x, y)
-    beside = (u < 0) | (u > lens.width) | (v < 0) | (v > lens.height)
-    ends = [np.where(found.any(axis=1), found.argmax(axis=1), radii.size) for found in (back, beside)]
+    outside = (u < 0) | (u > lens.width) | (v < 0) | (v > lens.height)
+    ends = [np.where(mask.any(axis=1), mask.argmax(axis=1), radii.size) for mask in (back, outside)]
     return bool((ends[0] < ends[1]).any())
 
 
@@ -254,7 +255,7 @@ def test_no_lens_is_refused_for_a_principal_point_off_the_centre() -> None:
 
 
 def test_warning_tells_the_least_share_and_knows_no_hundred_percent_or_more() -> None:
-    barrel, slight, plain = (
+    barrel, slight, undistorted = (
         camera(Brown(k1=-0.25)),
         camera(Brown(k1=1e-12)),
         replace(camera(Brown(k1=0.0)), lens=None),
@@ -263,13 +264,13 @@ def test_warning_tells_the_least_share_and_knows_no_hundred_percent_or_more() ->
     v, u = np.meshgrid(np.arange(lens.height) + 0.5, np.arange(lens.width) + 0.5, indexing="ij")
     x, y = lens.on_plane(u, v)
     x, y = x * barrel.fx + barrel.cx, y * barrel.fy + barrel.cy
-    seen = (x >= 0) & (x <= barrel.width) & (y >= 0) & (y <= barrel.height)  # of the photo by its pinhole
-    assert lens.share == pytest.approx(seen.mean(), abs=0.01)
-    (told,) = distortion_warning([slight, barrel, plain])
+    visible = (x >= 0) & (x <= barrel.width) & (y >= 0) & (y <= barrel.height)  # of the photo by its pinhole
+    assert lens.share == pytest.approx(visible.mean(), abs=0.01)
+    (warning,) = distortion_warning([slight, barrel, undistorted])
     assert (
         f"2 of 3 views are of distorted photos, of each of which {lens_of(barrel).share:.0%} or more is lifted"
-        in told
+        in warning
     )
-    (told,) = distortion_warning([slight])
-    assert "of each of which nearly all is lifted: features" in told
-    assert distortion_warning([plain]) == []
+    (warning,) = distortion_warning([slight])
+    assert "of each of which nearly all is lifted: features" in warning
+    assert distortion_warning([undistorted]) == []

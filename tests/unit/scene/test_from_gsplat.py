@@ -15,39 +15,48 @@ P = 120
 
 def parameters(seed: int = 0) -> dict[str, Any]:
     rng = np.random.default_rng(seed)
-    named = {"means": (P, 3), "quats": (P, 4), "scales": (P, 3), "opacities": (P,)}
-    return {name: torch.tensor(rng.normal(-1, 2, shape), dtype=torch.float32) for name, shape in named.items()}
+    shapes = {"means": (P, 3), "quats": (P, 4), "scales": (P, 3), "opacities": (P,)}
+    return {name: torch.tensor(rng.normal(-1, 2, shape), dtype=torch.float32) for name, shape in shapes.items()}
 
 
 def test_parameters_of_a_training_are_taken_as_they_are() -> None:
-    given = parameters()
+    tensors = parameters()
     sh0, shN = torch.randn(P, 1, 3), torch.randn(P, 15, 3)
-    ours = lc.Splats.from_gsplat(**given, sh0=sh0, shN=shN, activated=False)
-    theirs = {**given, "opacities": given["opacities"][:, None], "features_dc": sh0[:, 0], "features_rest": shN}
-    nerfstudio = lc.Splats.from_gsplat(**torch.nn.ParameterDict(theirs), activated=False)
-    assert torch.equal(ours.log_scales, given["scales"]) and torch.equal(ours.opacity_logits, given["opacities"])
-    assert ours.sh is not None and nerfstudio.sh is not None
-    assert torch.equal(ours.sh, torch.cat([sh0, shN], dim=1)) and torch.equal(nerfstudio.sh, ours.sh)
-    assert torch.equal(nerfstudio.opacity_logits, ours.opacity_logits) and not nerfstudio.means.requires_grad
-    none = lc.Splats.from_gsplat(**given, features_dc=sh0[:, 0], features_rest=torch.zeros(P, 0, 3), activated=False)
-    assert none.sh_degree == 0 and lc.Splats.from_gsplat(**given, activated=False).sh is None
+    splats = lc.Splats.from_gsplat(**tensors, sh0=sh0, shN=shN, activated=False)
+    nerfstudio_tensors = {
+        **tensors,
+        "opacities": tensors["opacities"][:, None],
+        "features_dc": sh0[:, 0],
+        "features_rest": shN,
+    }
+    nerfstudio = lc.Splats.from_gsplat(**torch.nn.ParameterDict(nerfstudio_tensors), activated=False)
+    assert torch.equal(splats.log_scales, tensors["scales"]) and torch.equal(
+        splats.opacity_logits, tensors["opacities"]
+    )
+    assert splats.sh is not None and nerfstudio.sh is not None
+    assert torch.equal(splats.sh, torch.cat([sh0, shN], dim=1)) and torch.equal(nerfstudio.sh, splats.sh)
+    assert torch.equal(nerfstudio.opacity_logits, splats.opacity_logits) and not nerfstudio.means.requires_grad
+    none = lc.Splats.from_gsplat(
+        **tensors, features_dc=sh0[:, 0], features_rest=torch.zeros(P, 0, 3), activated=False
+    )
+    assert none.sh_degree == 0 and lc.Splats.from_gsplat(**tensors, activated=False).sh is None
 
 
 def test_what_the_rasterizer_takes_is_activated_already() -> None:
-    given = parameters()
-    plain = lc.Splats.from_gsplat(**given, activated=False)
-    active = {**given, "scales": given["scales"].exp(), "opacities": given["opacities"].sigmoid()}
+    tensors = parameters()
+    expected = lc.Splats.from_gsplat(**tensors, activated=False)
+    active = {**tensors, "scales": tensors["scales"].exp(), "opacities": tensors["opacities"].sigmoid()}
     colours = torch.rand(P, 3)
-    found = lc.Splats.from_gsplat(**active, colors=colours, activated=True)
-    assert torch.allclose(found.log_scales, plain.log_scales, atol=1e-5)
-    assert torch.allclose(found.opacity_logits, plain.opacity_logits, atol=1e-3)
-    assert found.sh is not None and torch.allclose(found.sh[:, 0] * SH_C0 + 0.5, colours, atol=1e-6)
+    splats = lc.Splats.from_gsplat(**active, colors=colours, activated=True)
+    assert torch.allclose(splats.log_scales, expected.log_scales, atol=1e-5)
+    assert torch.allclose(splats.opacity_logits, expected.opacity_logits, atol=1e-3)
+    assert splats.sh is not None and torch.allclose(splats.sh[:, 0] * SH_C0 + 0.5, colours, atol=1e-6)
     flat = lc.Splats.from_gsplat(**{**active, "opacities": np.ones(P)}, activated=True, kernel="2dgs")
     assert flat.log_scales.shape == (P, 2) and bool(flat.opacity_logits.isposinf().all()) and not flat.warnings
 
 
 @pytest.mark.parametrize(
-    ("changed", "message"),
+    ("overrides", "message"),
     [
         ({"activated": True}, r"scales: expected lengths of zero or more, .*activated=False"),
         (
@@ -62,17 +71,17 @@ def test_what_the_rasterizer_takes_is_activated_already() -> None:
         ({"sh0": torch.ones(P, 1, 3), "shN": torch.ones(P, 4, 3)}, "sh: expected .* rows"),
     ],
 )
-def test_tensors_that_cannot_be_are_refused_by_their_name(changed: dict[str, Any], message: str) -> None:
+def test_tensors_that_cannot_be_are_refused_by_their_name(overrides: dict[str, Any], message: str) -> None:
     with pytest.raises(lc.InvalidSplats, match=message):
-        lc.Splats.from_gsplat(**{**parameters(), "activated": False, **changed})
+        lc.Splats.from_gsplat(**{**parameters(), "activated": False, **overrides})
 
 
-def test_numbers_that_look_activated_are_told_where_splats_are_made() -> None:
-    given = parameters()
-    active = {**given, "scales": given["scales"].exp(), "opacities": given["opacities"].sigmoid()}
-    told = lc.Splats.from_gsplat(**active, activated=False).warnings
-    assert any("no logits" in text for text in told) and any("no logarithms" in text for text in told)
-    assert not lc.Splats.from_gsplat(**given, activated=False).warnings
+def test_numbers_that_look_activated_give_warnings_where_splats_are_made() -> None:
+    tensors = parameters()
+    active = {**tensors, "scales": tensors["scales"].exp(), "opacities": tensors["opacities"].sigmoid()}
+    warnings = lc.Splats.from_gsplat(**active, activated=False).warnings
+    assert any("no logits" in text for text in warnings) and any("no logarithms" in text for text in warnings)
+    assert not lc.Splats.from_gsplat(**tensors, activated=False).warnings
     assert not lc.Splats.from_gsplat(**active, activated=True).warnings
 
 
@@ -81,12 +90,12 @@ def test_camera_to_world_poses_of_either_convention_give_the_camera(rows: int) -
     for seed in range(3):
         camera = random_camera(seed)
         pose = np.linalg.inv(camera.viewmat)
-        own = (camera.K, camera.width, camera.height)
-        turned = pose * [1, -1, -1, 1]  # y up and z back
-        for convention, given in (("opencv", pose), ("opengl", turned), ("blender", torch.tensor(turned))):
-            found = lc.Camera.from_camera_to_world(given[:rows], *own, convention=convention, name="v0")  # pyright: ignore
-            np.testing.assert_allclose(found.viewmat, camera.viewmat, atol=1e-12)
-            np.testing.assert_allclose(found.centre, pose[:3, 3], atol=1e-12)
+        intrinsics = (camera.K, camera.width, camera.height)
+        opengl_pose = pose * [1, -1, -1, 1]  # y up and z back
+        for convention, matrix in (("opencv", pose), ("opengl", opengl_pose), ("blender", torch.tensor(opengl_pose))):
+            actual = lc.Camera.from_camera_to_world(matrix[:rows], *intrinsics, convention=convention, name="v0")  # pyright: ignore
+            np.testing.assert_allclose(actual.viewmat, camera.viewmat, atol=1e-12)
+            np.testing.assert_allclose(actual.centre, pose[:3, 3], atol=1e-12)
 
 
 @pytest.mark.parametrize(

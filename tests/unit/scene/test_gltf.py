@@ -47,10 +47,12 @@ def activated(splats: Splats) -> dict[str, np.ndarray]:
     return fields | {"sh": splats.sh.numpy()}
 
 
-def assert_same(found: Splats, expected: Splats) -> None:
-    one, other = activated(found), activated(expected)
-    for name, values in other.items():
-        np.testing.assert_allclose(one[name], values, atol=1e-6 * max(1.0, np.abs(values).max()), err_msg=name)
+def assert_same(actual: Splats, expected: Splats) -> None:
+    actual_values, expected_values = activated(actual), activated(expected)
+    for name, values in expected_values.items():
+        np.testing.assert_allclose(
+            actual_values[name], values, atol=1e-6 * max(1.0, np.abs(values).max()), err_msg=name
+        )
 
 
 def write(path: Path, splats: Splats) -> Path:
@@ -89,9 +91,9 @@ def test_every_kernel_comes_back_as_the_gaussians_that_were_written(
     kernel: Kernel, degree: int, tmp_path: Path
 ) -> None:
     splats = some_splats(kernel, degree)
-    found = read_splats(write(tmp_path / "s.glb", splats))
-    assert found.kernel is Kernel.GAUSSIAN_3D and not found.warnings
-    assert_same(found, splats)
+    copy = read_splats(write(tmp_path / "s.glb", splats))
+    assert copy.kernel is Kernel.GAUSSIAN_3D and not copy.warnings
+    assert_same(copy, splats)
     note = parts_of(tmp_path / "s.glb")[0]["asset"].get("extras", {}).get("note", "")
     assert (kernel in note) is (kernel is not Kernel.GAUSSIAN_3D)
 
@@ -113,19 +115,23 @@ def test_nodes_move_what_they_hold(tmp_path: Path) -> None:
         {"mesh": 0, "scale": [2, 2, 2]},
         {"mesh": 0, "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 5, 0, 0, 1]},
     ]
-    found = read_splats(join(tmp_path / "moved.glb", document, binary))
-    assert found.count == 2 * P
+    scene = read_splats(join(tmp_path / "moved.glb", document, binary))
+    assert scene.count == 2 * P
     in_our_frame = TO_FILE @ turn @ TO_FILE
-    assert_same(found[:P], splats.transformed(scale=2.0, rotation=in_our_frame, translation=TO_FILE @ [1, 2, 3]))
+    assert_same(scene[:P], splats.transformed(scale=2.0, rotation=in_our_frame, translation=TO_FILE @ [1, 2, 3]))
     shift = TO_FILE @ (turn @ [5, 0, 0] + [1, 2, 3])
-    assert_same(found[P:], splats.transformed(rotation=in_our_frame, translation=shift))
+    assert_same(scene[P:], splats.transformed(rotation=in_our_frame, translation=shift))
 
 
 def labels() -> Labels:
     box = {"low": [-1.0, -2.0, -3.0], "high": [1.0, 2.0, 4.0]}
-    turned = {"centre": [0.1, 0.2, 0.3], "axes": [[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]], "half_sizes": [3.0, 2.0, 1.0]}
+    oriented_box = {
+        "centre": [0.1, 0.2, 0.3],
+        "axes": [[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]],
+        "half_sizes": [3.0, 2.0, 1.0],
+    }
     mug = {"instance_id": 1, "class_id": 2, "name": "mug ☕", "score": 0.25, "confidence": 0.5, "colour": [1, 2, 255]}
-    mug |= {"splats": 9, "box": box, "oriented_box": turned, "question": "a mug", "provenance": "18 views"}
+    mug |= {"splats": 9, "box": box, "oriented_box": oriented_box, "question": "a mug", "provenance": "18 views"}
     document = {
         "instances": [mug, mug | {"instance_id": 2, "class_id": 1, "name": "plate"}],
         "classes": [{"class_id": 1, "name": "plate"}, {"class_id": 2, "name": "mug ☕"}],
@@ -140,14 +146,14 @@ def test_labels_come_back_with_names_boxes_and_all_that_is_said_of_them(suffix: 
     expected = labels()
     write_splats(tmp_path / "s.ply", some_splats())
     (tmp_path / f"s{suffix}").write_bytes(b"".join(labelled(tmp_path / "s.ply", expected, suffix)))
-    found = read_labels(tmp_path / f"s{suffix}")
-    assert {kind: found.document[kind] for kind in ("instances", "classes")} == expected.document
+    copy = read_labels(tmp_path / f"s{suffix}")
+    assert {kind: copy.document[kind] for kind in ("instances", "classes")} == expected.document
     for name, values in expected.columns.items():
-        np.testing.assert_array_equal(found.columns[name], values)
-    kept = np.arange(P) % 3 == 1
-    (tmp_path / "t").write_bytes(b"".join(labelled(tmp_path / "s.ply", expected, suffix, kept)))
-    one = read_labels(tmp_path / "t")
-    assert [row["name"] for row in one.document["classes"]] == ["plate"] and set(one.columns["class_id"]) == {1}
+        np.testing.assert_array_equal(copy.columns[name], values)
+    mask = np.arange(P) % 3 == 1
+    (tmp_path / "t").write_bytes(b"".join(labelled(tmp_path / "s.ply", expected, suffix, mask)))
+    subset = read_labels(tmp_path / "t")
+    assert [row["name"] for row in subset.document["classes"]] == ["plate"] and set(subset.columns["class_id"]) == {1}
 
 
 def test_feature_ids_of_others_count_from_one_with_zero_for_none(tmp_path: Path) -> None:
@@ -166,7 +172,7 @@ def test_feature_ids_of_others_count_from_one_with_zero_for_none(tmp_path: Path)
 PRIMITIVE = "meshes.0.primitives.0"
 KIND = f"{PRIMITIVE}.extensions.KHR_gaussian_splatting"
 SPZ_INSIDE = "KHR_gaussian_splatting_compression_spz_2"
-MANY = [{"children": list(range(1, 50_000))}, *({"mesh": 0} for _ in range(49_999))]
+MANY_NODES = [{"children": list(range(1, 50_000))}, *({"mesh": 0} for _ in range(49_999))]
 WRONG: dict[str, tuple[str, Any, str]] = {  # where, what, and what is said of it; the first accessor is POSITION
     "another file": ("buffers.0.uri", "../../etc/passwd", "buffers within the file"),
     "an address": ("buffers.0.uri", "http://127.0.0.1/s.bin", "buffers within the file"),
@@ -180,8 +186,12 @@ WRONG: dict[str, tuple[str, Any, str]] = {  # where, what, and what is said of i
     "other extensions": ("extensionsRequired", ["EXT_meshopt_compression"], "EXT_meshopt_compression"),
     "a count": ("accessors.0.count", 1 << 30, "as many splats"),
     "other counts": ("accessors.4.count", P - 1, "rows of 1 plain numbers"),
-    "a bomb of nodes": ("nodes", MANY, "as many splats"),
-    "a bomb of children": ("nodes", [{"children": [1] * 50_000}, *({"children": [1]} for _ in MANY)], "a node twice"),
+    "a bomb of nodes": ("nodes", MANY_NODES, "as many splats"),
+    "a bomb of children": (
+        "nodes",
+        [{"children": [1] * 50_000}, *({"children": [1]} for _ in MANY_NODES)],
+        "a node twice",
+    ),
     "a circle of nodes": ("nodes", [{"mesh": 0, "children": [0]}], "meets a node twice"),
     "a mesh": (f"{PRIMITIVE}.extensions", {}, "without any"),
     "a scale for each axis": ("nodes.0.scale", [1, 2, 1], "a proper rotation"),
@@ -195,10 +205,10 @@ WRONG: dict[str, tuple[str, Any, str]] = {  # where, what, and what is said of i
 
 @pytest.mark.parametrize("name", WRONG)
 def test_what_cannot_be_or_leads_elsewhere_is_refused(name: str, tmp_path: Path) -> None:
-    where, value, message = WRONG[name]
+    location, value, message = WRONG[name]
     document, binary = parts_of(write(tmp_path / "s.glb", some_splats()))
     place: Any = document
-    *way, last = where.split(".")
+    *way, last = location.split(".")
     for step in way:
         place = place[int(step) if step.isdecimal() else step]
     place[last] = value
@@ -210,11 +220,11 @@ def test_what_cannot_be_or_leads_elsewhere_is_refused(name: str, tmp_path: Path)
 def test_damaged_bytes_are_refused_or_read_and_nothing_else(suffix: str, tmp_path: Path) -> None:
     write_splats(tmp_path / "s.ply", some_splats(degree=0))
     content = b"".join(labelled(tmp_path / "s.ply", labels(), suffix))
-    generator, told = np.random.default_rng(3), len(content) if suffix == ".spz" else parts_begin(content)
+    generator, limit = np.random.default_rng(3), len(content) if suffix == ".spz" else parts_begin(content)
     for _ in range(200):
-        whole = generator.random() < 0.8
-        damaged = bytearray(content if whole else content[: int(generator.integers(20, len(content)))])
-        for place in generator.integers(4, min(told, len(damaged)), 3):
+        is_complete = generator.random() < 0.8
+        damaged = bytearray(content if is_complete else content[: int(generator.integers(20, len(content)))])
+        for place in generator.integers(4, min(limit, len(damaged)), 3):
             damaged[place] = generator.integers(32, 127)
         (tmp_path / "t").write_bytes(damaged)
         try:
@@ -229,7 +239,9 @@ def test_columns_come_back_or_are_refused(suffix: str, tmp_path: Path) -> None:
     columns = {f"c{number}": np.full(P, number / 4, np.float32) for number in range(256)}
     write_splats(path, splats, columns)
     extras = read_splats(path).extras
-    assert {name: extras[name].tolist() for name in columns} == {name: own.tolist() for name, own in columns.items()}
+    assert {name: extras[name].tolist() for name in columns} == {
+        name: values.tolist() for name, values in columns.items()
+    }
     ids = np.tile([3.0, np.nan, -1.0, 4e9], P // 4)  # as editors may leave them
     write_splats(path, splats, {"instance_id": ids})
     assert read_labels(path).columns["instance_id"].tolist() == [3, 0, 0, 0] * (P // 4)
@@ -253,8 +265,8 @@ def test_tables_and_numbers_of_others_may_be_anything(tmp_path: Path) -> None:
     member = {"type": "SCALAR", "componentType": "FLOAT32"}
     metadata["schema"]["classes"]["instance"]["properties"] = {"box_low": member, "box_high": member}
     metadata["propertyTables"][0]["properties"] = {name: {"values": 0} for name in ("box_low", "box_high")}
-    found = read_labels(join(tmp_path / "t.glb", document, binary))
-    assert [set(one) for one in found.document["instances"]] == [{"instance_id"}] * 2
+    result = read_labels(join(tmp_path / "t.glb", document, binary))
+    assert [set(row) for row in result.document["instances"]] == [{"instance_id"}] * 2
 
 
 def parts_begin(content: bytes) -> int:
@@ -265,6 +277,6 @@ def test_labels_change_nothing_else_of_an_spz(tmp_path: Path) -> None:
     write_splats(tmp_path / "s.ply", some_splats())
     write_splats(tmp_path / "plain.spz", some_splats())
     (tmp_path / "labelled.spz").write_bytes(b"".join(labelled(tmp_path / "s.ply", labels(), ".spz")))
-    plain, with_labels = read_splats(tmp_path / "plain.spz"), read_splats(tmp_path / "labelled.spz")
+    without_labels, with_labels = read_splats(tmp_path / "plain.spz"), read_splats(tmp_path / "labelled.spz")
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
-        assert torch.equal(getattr(plain, name), getattr(with_labels, name)), name
+        assert torch.equal(getattr(without_labels, name), getattr(with_labels, name)), name

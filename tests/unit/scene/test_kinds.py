@@ -33,7 +33,7 @@ SOG = Path(__file__).parents[2] / "data" / "splats" / "degree3.sog"
 CLOUD = b"ply\nformat binary_little_endian 1.0\nelement vertex 0\n" + b"".join(
     b"property float %c\n" % axis for axis in b"xyz"
 )
-OTHERS = {  # content, a word of its name and of what to do
+FOREIGN_FILES = {  # content, a word of its name and of what to do
     "page.html": (b"<!DOCTYPE html><title>SuperSplat Viewer</title>", "web page", "SuperSplat"),
     "failed.ply": (b"<!DOCTYPE html><h1>404</h1>", "web page", "download"),
     "denied.spz": (b"<?xml version='1.0'?><Error><Code>AccessDenied</Code></Error>", "AccessDenied", "download"),
@@ -85,18 +85,18 @@ def write(path: Path, content: bytes) -> Path:
     return path
 
 
-@pytest.mark.parametrize("name", OTHERS)
+@pytest.mark.parametrize("name", FOREIGN_FILES)
 def test_what_is_no_input_is_named_with_what_to_do(name: str, tmp_path: Path) -> None:
-    content, what, hint = OTHERS[name]
+    content, word, hint = FOREIGN_FILES[name]
     path = write(tmp_path / name, content)
-    found = identify(path)
-    assert found.kind is None and found.recognised
-    for wanted in ("splats", "cameras", "features", "lift", "table"):
-        error = wrong_kind(path, wanted, InvalidInput)
-        assert error is not None and re.search(what, error.got) and wanted in error.expected
-    for read, fault in ((read_splats, InvalidSplats), (read_cameras, InvalidCameras), (inspect_file, InvalidInput)):
-        with pytest.raises(fault, match=f"(?s){what}.*({hint})"):
-            read(path)
+    identity = identify(path)
+    assert identity.kind is None and identity.recognised
+    for expected_kind in ("splats", "cameras", "features", "lift", "table"):
+        error = wrong_kind(path, expected_kind, InvalidInput)
+        assert error is not None and re.search(word, error.got) and expected_kind in error.expected
+    for reader, fault in ((read_splats, InvalidSplats), (read_cameras, InvalidCameras), (inspect_file, InvalidInput)):
+        with pytest.raises(fault, match=f"(?s){word}.*({hint})"):
+            reader(path)
 
 
 def zipped(path: Path, files: dict[str, bytes]) -> Path:
@@ -113,11 +113,11 @@ def splat_bytes(folder: Path) -> bytes:
 
 def test_a_zip_is_what_is_in_it_and_names_the_file_to_give(tmp_path: Path) -> None:
     splats = splat_bytes(tmp_path)
-    one = zipped(tmp_path / "one.zip", {"__MACOSX/._gs.ply": b"x", "3dgs/gs.ply": splats, "cloud.ply": CLOUD})
+    single = zipped(tmp_path / "one.zip", {"__MACOSX/._gs.ply": b"x", "3dgs/gs.ply": splats, "cloud.ply": CLOUD})
     with pytest.raises(InvalidSplats, match=r"a zip with 3dgs/gs\.ply in it; unzip it and give 3dgs/gs\.ply"):
-        read_splats(one)
+        read_splats(single)
     with pytest.raises(InvalidCameras, match=r"a zip with 3dgs/gs\.ply in it"):
-        read_cameras(one)
+        read_cameras(single)
     several = zipped(
         tmp_path / "two.zip", {"a.spz": b"", "iteration_7000/p.ply": splats, "iteration_30000/p.ply": splats}
     )
@@ -140,7 +140,7 @@ def test_a_zip_is_what_is_in_it_and_names_the_file_to_give(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("files", "last", "whose"),
+    ("files", "last", "trainer"),
     [
         (["point_cloud/iteration_7000/point_cloud.ply", "point_cloud/iteration_30000/point_cloud.ply", "input.ply"],
          "point_cloud/iteration_30000/point_cloud.ply", "3DGS"),
@@ -153,19 +153,19 @@ def test_a_zip_is_what_is_in_it_and_names_the_file_to_give(tmp_path: Path) -> No
         (["export_5000.ply", "export_30000.ply"], "export_30000.ply", "Brush"),
     ],
 )  # fmt: skip
-def test_a_trainers_folder_names_its_last_splats(files: list[str], last: str, whose: str, tmp_path: Path) -> None:
+def test_a_trainers_folder_names_its_last_splats(files: list[str], last: str, trainer: str, tmp_path: Path) -> None:
     splats, folder = splat_bytes(tmp_path), tmp_path / "output"
     for name in files:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(CLOUD if name == "input.ply" else splats)
-    with pytest.raises(InvalidSplats, match=whose) as caught:
+    with pytest.raises(InvalidSplats, match=trainer) as error:
         read_splats(folder)
-    assert str(folder / last) in caught.value.hint
+    assert str(folder / last) in error.value.hint
     (folder / "cameras.json").write_text("[]")  # which the original trainer puts there: its folder is cameras, too
     assert kind_of(folder) == "cameras"
-    with pytest.raises(InvalidSplats) as caught:
+    with pytest.raises(InvalidSplats) as error:
         read_splats(folder)
-    assert str(folder / last) in caught.value.hint
+    assert str(folder / last) in error.value.hint
 
 
 def test_folders_of_features_and_photos_name_the_command(tmp_path: Path) -> None:
@@ -184,11 +184,11 @@ def test_folders_of_features_and_photos_name_the_command(tmp_path: Path) -> None
 def test_a_sog_is_its_folder_its_meta_json_and_a_zip_of_its_folder(tmp_path: Path) -> None:
     with zipfile.ZipFile(SOG) as archive:
         archive.extractall(tmp_path / "scene")
-        again = zipped(tmp_path / "z.zip", {f"scene/{name}": archive.read(name) for name in archive.namelist()})
-    whole, meta = read_splats(SOG), tmp_path / "scene" / "meta.json"
-    for path in (tmp_path / "scene", meta, again):
+        folder_zip = zipped(tmp_path / "z.zip", {f"scene/{name}": archive.read(name) for name in archive.namelist()})
+    expected, meta = read_splats(SOG), tmp_path / "scene" / "meta.json"
+    for path in (tmp_path / "scene", meta, folder_zip):
         assert identify(path).format is SplatFormat.SOG
-        assert (read_splats(path).means == whole.means).all()
+        assert (read_splats(path).means == expected.means).all()
     size = sum(file.stat().st_size for file in (tmp_path / "scene").iterdir())
     assert inspect_file(meta)["bytes"] == inspect_file(tmp_path / "scene")["bytes"] == size
     assert input_file(meta).sha256 == input_file(tmp_path / "scene").sha256
@@ -206,14 +206,14 @@ def test_a_sog_is_its_folder_its_meta_json_and_a_zip_of_its_folder(tmp_path: Pat
 def test_pipes_and_devices_are_refused_and_never_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.ply")
     for path in (tmp_path / "pipe.ply", Path("/dev/zero")):
-        for read in (read_splats, read_cameras, inspect_file):
+        for reader in (read_splats, read_cameras, inspect_file):
             with pytest.raises(InvalidInput, match="no regular file"):
-                read(path)
+                reader(path)
         with pytest.raises(OSError, match="no regular file"):
             input_file(path)
 
 
-def test_a_placeholder_of_a_cloud_is_told_from_a_file_that_is_not_there(tmp_path: Path) -> None:
+def test_a_placeholder_of_a_cloud_is_distinguished_from_a_missing_file(tmp_path: Path) -> None:
     (tmp_path / ".scene.ply.icloud").write_bytes(b"bplist00")
     with pytest.raises(InvalidSplats, match="placeholder"):
         read_splats(tmp_path / "scene.ply")
@@ -236,19 +236,19 @@ def test_the_order_is_blamed_only_where_it_is_wrong(tmp_path: Path, capsys: pyte
     cameras = tmp_path / "cameras.json"
     cameras.write_text(json.dumps([{"img_name": "a"}]))
 
-    def said(*files: Path) -> str:
+    def plan_errors(*files: Path) -> str:
         assert main(["plan", *map(str, files)]) == 2
         return capsys.readouterr().err
 
     for files in ((archive, cameras, cameras), (ply, ply, ply), (cameras, cameras, cameras)):
-        assert "the order is" not in said(*files)
-    assert "point_cloud.ply" in said(archive, cameras, cameras)
-    assert "the order is SPLATS CAMERAS FEATURES" in said(cameras, ply, cameras)
+        assert "the order is" not in plan_errors(*files)
+    assert "point_cloud.ply" in plan_errors(archive, cameras, cameras)
+    assert "the order is SPLATS CAMERAS FEATURES" in plan_errors(cameras, ply, cameras)
 
 
 def test_the_page_has_the_table_of_this_version() -> None:
-    built = Path(__file__).parents[3] / "service" / "web" / "src" / "kinds.json"
-    assert json.loads(built.read_text()) == page_table(), "make web"
+    page_file = Path(__file__).parents[3] / "service" / "web" / "src" / "kinds.json"
+    assert json.loads(page_file.read_text()) == page_table(), "make web"
 
 
 def test_a_file_in_the_place_of_another_kind_is_named_for_what_it_is_everywhere(tmp_path: Path) -> None:
@@ -272,17 +272,17 @@ def test_a_file_in_the_place_of_another_kind_is_named_for_what_it_is_everywhere(
     settings = ServiceSettings.model_construct(encoder="", text_spaces={})
     for name in ("splats", *contents):
         path = tmp_path / name
-        known = identify(path)
-        for wanted, read in readers.items():
-            if wanted != name:
-                with pytest.raises(InvalidInput) as caught:
-                    read(path)
-                assert caught.value.got == known.name, (name, wanted)
+        identity = identify(path)
+        for expected_kind, reader in readers.items():
+            if expected_kind != name:
+                with pytest.raises(InvalidInput) as error:
+                    reader(path)
+                assert error.value.got == identity.name, (name, expected_kind)
         if name != "table":
-            with pytest.raises(Misconfigured, match=re.escape(known.name)):
+            with pytest.raises(Misconfigured, match=re.escape(identity.name)):
                 require_encoder_files(settings.model_copy(update={"encoder": f"table:{path}"}))
         for kind in (*AssetKind, "lift"):
             if kind != name:
                 reply = tasks.check(kind, str(path))
-                assert reply["event"] == "invalid" and known.name in reply["fault"]["got"], (name, kind)
-                assert known.kind is None or f"/{known.kind}" in reply["fault"]["hint"], (name, kind)
+                assert reply["event"] == "invalid" and identity.name in reply["fault"]["got"], (name, kind)
+                assert identity.kind is None or f"/{identity.kind}" in reply["fault"]["hint"], (name, kind)

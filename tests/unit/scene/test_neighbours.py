@@ -33,8 +33,8 @@ def by_formula(splats: Splats) -> np.ndarray:
         matrix[j, near] = np.exp(-((row[near] / np.median(row[near])) ** 2) / 2)
     if splats.sh is not None:
         colours = (0.5 + splats.sh[:, 0].double().numpy() / np.sqrt(4 * np.pi)).clip(0, 1)
-        apart = ((colours[:, None] - colours[None]) ** 2).sum(axis=2)
-        matrix *= np.exp(-apart / COLOUR_WIDTH**2 / 2)
+        colour_distances = ((colours[:, None] - colours[None]) ** 2).sum(axis=2)
+        matrix *= np.exp(-colour_distances / COLOUR_WIDTH**2 / 2)
     matrix[matrix < LEAST_AFFINITY] = 0
     return (matrix + matrix.T) / 2
 
@@ -58,20 +58,20 @@ def test_affinities_know_no_unit_of_length(power: int) -> None:
     np.testing.assert_allclose(dense(SplatGraph.of(scaled)), dense(SplatGraph.of(splats)), rtol=1e-5)
 
 
-@pytest.mark.parametrize("together", [5, 12, 60])
-def test_splats_at_one_place_are_neighbours(together: int) -> None:
+@pytest.mark.parametrize("count", [5, 12, 60])
+def test_splats_at_one_place_are_neighbours(count: int) -> None:
     splats = replace(random_splats(0, 60), sh=None)
-    splats.means[:together] = splats.means[0]
+    splats.means[:count] = splats.means[0]
     matrix = dense(SplatGraph.of(splats))
     assert np.array_equal(matrix, matrix.T)
     assert not matrix.diagonal().any()
-    inside = matrix[:together, :together]
-    assert (inside.sum(axis=1) >= min(together - 1, NEIGHBOURS) / 2).all()
+    inside = matrix[:count, :count]
+    assert (inside.sum(axis=1) >= min(count - 1, NEIGHBOURS) / 2).all()
     assert (inside[inside > 0] >= 0.5).all()
 
 
 def test_graph_is_the_same_for_any_number_of_threads() -> None:
     splats = random_splats(0, 9_000)
-    one, three = (SplatGraph.of(splats, threads) for threads in (1, 3))
+    one_thread, three_threads = (SplatGraph.of(splats, threads) for threads in (1, 3))
     for name in ("order", "starts", "neighbours", "affinities"):
-        assert np.array_equal(getattr(one, name), getattr(three, name))
+        assert np.array_equal(getattr(one_thread, name), getattr(three_threads, name))

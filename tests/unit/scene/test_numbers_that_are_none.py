@@ -27,7 +27,7 @@ from tests.unit.command_line import lift_arguments, run, write_toy_scene
 
 FILES = Path(__file__).parents[2] / "data" / "splats"
 COUNT, BROKEN = 40, {"means": 5, "log_scales": 9, "quats": 17, "opacity_logits": 20}
-KEPT = torch.tensor([row not in BROKEN.values() for row in range(COUNT)])
+VALID_ROWS = torch.tensor([row not in BROKEN.values() for row in range(COUNT)])
 ODD = {"means": np.nan, "log_scales": np.inf, "quats": -np.inf, "opacity_logits": np.nan}
 
 
@@ -46,23 +46,26 @@ def broken(splats: Splats) -> dict[str, Any]:
 
 @pytest.mark.parametrize("kernel", list(Kernel))
 def test_no_ray_meets_a_splat_that_is_no_number(kernel: Kernel) -> None:
-    whole = random_splats(3, COUNT, kernel=kernel)
-    splats = Splats(**broken(whole), kernel=kernel)
-    fewer = Splats(**{name: value[KEPT] for name, value in geometry_of(whole).items()}, kernel=kernel)
+    original = random_splats(3, COUNT, kernel=kernel)
+    splats = Splats(**broken(original), kernel=kernel)
+    valid_splats = Splats(**{name: value[VALID_ROWS] for name, value in geometry_of(original).items()}, kernel=kernel)
     assert splats.count == COUNT and "4 of 40 splats" in splats.warnings[0] and "splat 5" in splats.warnings[0]
     camera = random_camera(0)
-    for own, other in zip(
-        (dense_view(one, camera, CompositingParams()).A for one in (splats, fewer)),
-        (torch.stack([lc.render(one, camera, row) for row in torch.eye(one.count)]) for one in (splats, fewer)),
+    for dense_weights, images in zip(
+        (dense_view(scene, camera, CompositingParams()).A for scene in (splats, valid_splats)),
+        (
+            torch.stack([lc.render(scene, camera, row) for row in torch.eye(scene.count)])
+            for scene in (splats, valid_splats)
+        ),
         strict=True,
     ):
-        np.testing.assert_allclose(other.numpy().reshape(len(other), -1).T, own, atol=1e-5)
+        np.testing.assert_allclose(images.numpy().reshape(len(images), -1).T, dense_weights, atol=1e-5)
     cameras = {f"v{number}": random_camera(number, name=f"v{number}") for number in range(3)}
     views = {name: observed(number, 0) for number, name in enumerate(cameras)}
     for preset in ("default", "mean"):
-        result, expected = (lc.lift(one, cameras, views, preset, device="cpu") for one in (splats, fewer))
-        assert not result.seen[~KEPT].any() and not result.features[~KEPT].any()
-        assert torch.equal(result.features[KEPT], expected.features)
+        result, expected = (lc.lift(scene, cameras, views, preset, device="cpu") for scene in (splats, valid_splats))
+        assert not result.seen[~VALID_ROWS].any() and not result.features[~VALID_ROWS].any()
+        assert torch.equal(result.features[VALID_ROWS], expected.features)
         assert any("4 of 40 splats" in text for text in result.diagnostics["warnings"])
     assert any("4 of 40 splats" in text for text in plan_photos(splats, cameras).warnings)
 
@@ -75,23 +78,26 @@ def test_a_colour_that_is_no_number_is_grey_from_everywhere(kernel: Kernel) -> N
     lobes = torch.rand(COUNT, 2, 6) if kernel is Kernel.BETA else None
     if lobes is not None:
         lobes[9, 1, 3] = np.nan
-    shown = replace(splats, sh=sh, sb_params=lobes)
+    with_colours = replace(splats, sh=sh, sb_params=lobes)
     grey = [7, 8] + [9] * (lobes is not None)
-    assert f"{len(grey)} of 40 splats have a colour that is no number" in shown.warnings[0]
+    assert f"{len(grey)} of 40 splats have a colour that is no number" in with_colours.warnings[0]
     for centre in ([3.0, 1.0, -4.0], [0.0, -5.0, 0.3]):
-        colours = view_colours(shown, look_at("v", np.array(centre), 8, 8, 8.0))
+        colours = view_colours(with_colours, look_at("v", np.array(centre), 8, 8, 8.0))
         torch.testing.assert_close(colours[grey], torch.full((len(grey), 3), 0.5), atol=1e-6, rtol=0)
         assert bool(torch.isfinite(colours).all())
-    assert torch.equal(shown.opacity_logits, splats.opacity_logits)
+    assert torch.equal(with_colours.opacity_logits, splats.opacity_logits)
 
 
 def files(folder: Path) -> Iterator[tuple[Path, int, int]]:
-    """A file of each format that can hold such numbers, with how many splats of it are unseen and how many grey."""
+    """Yield a file of each format that can hold such numbers, its number of invisible splats and of grey ones."""
     splats = random_splats(3, COUNT)
-    own = replace(splats, sh=torch.rand(COUNT, 4, 3))
-    write_splats(folder / "s.ply", own)
+    with_colours = replace(splats, sh=torch.rand(COUNT, 4, 3))
+    write_splats(folder / "s.ply", with_colours)
     content = (folder / "s.ply").read_bytes()
-    start, stride = content.index(b"end_header\n") + 11, 4 * len(own.layout or read_splats(folder / "s.ply").layout)
+    start, stride = (
+        content.index(b"end_header\n") + 11,
+        4 * len(with_colours.layout or read_splats(folder / "s.ply").layout),
+    )
     names = read_splats(folder / "s.ply").layout
     rows = np.frombuffer(content[start:], np.dtype([(name, "<f4") for name in names])).copy()
     assert rows.itemsize == stride
@@ -121,8 +127,8 @@ def test_files_of_every_format_keep_their_rows_and_count_what_is_none(tmp_path: 
         assert (f"{unseen} of {splats.count} splats have a place" in text) == (unseen > 0), path
         assert (f"{grey} of {splats.count} splats have a colour" in text) == (grey > 0), path
         assert int(torch.isneginf(splats.opacity_logits).sum()) == unseen
-        found = json.loads(json.dumps(inspect_file(path), allow_nan=False))
-        assert set(splats.warnings) <= set(found["warnings"])
+        report = json.loads(json.dumps(inspect_file(path), allow_nan=False))
+        assert set(splats.warnings) <= set(report["warnings"])
         assert np.isfinite(read_places(path)).all()
         np.testing.assert_array_equal(read_places(path), splats.means.numpy())
         for suffix in (".ply", ".splat", ".spz"):
@@ -136,8 +142,8 @@ def test_questions_take_what_the_lift_took(tmp_path: Path, capsys: pytest.Captur
     splats = read_splats(scene / "splats.ply")
     places, sh = torch.cat([splats.means, torch.full((1, 3), np.nan)]), torch.zeros(3, 1, 3)
     sh[1, 0, 2] = np.nan
-    own = {name: getattr(splats, name)[[0, 1, 1]] for name in ("quats", "log_scales", "opacity_logits")}
-    write_splats(scene / "splats.ply", Splats(places.nan_to_num(7.5), **own, sh=sh.nan_to_num(7.5)))
+    columns = {name: getattr(splats, name)[[0, 1, 1]] for name in ("quats", "log_scales", "opacity_logits")}
+    write_splats(scene / "splats.ply", Splats(places.nan_to_num(7.5), **columns, sh=sh.nan_to_num(7.5)))
     content = (scene / "splats.ply").read_bytes()
     content = content.replace(struct.pack("<f", 7.5), struct.pack("<f", np.nan))
     (scene / "splats.ply").write_bytes(content)
@@ -152,10 +158,10 @@ def test_questions_take_what_the_lift_took(tmp_path: Path, capsys: pytest.Captur
     ask = ["query", scene / "lift.safetensors", "--like", scene / "like.npy"]
     status, out, err = run(capsys, *ask, "--objects", "--json")
     assert status == 0, err
-    found = json.loads(out)
-    assert all(np.isfinite(box).all() for box in (one["box"] for one in found["objects"]))
-    for more in (["--mask", scene / "m.png"], ["--overlay", scene / "r.png"], ["--attention", scene / "a.png"]):
-        assert run(capsys, *ask, "--view", "front", *more)[0] == 0
+    answer = json.loads(out)
+    assert all(np.isfinite(box).all() for box in (entry["box"] for entry in answer["objects"]))
+    for options in (["--mask", scene / "m.png"], ["--overlay", scene / "r.png"], ["--attention", scene / "a.png"]):
+        assert run(capsys, *ask, "--view", "front", *options)[0] == 0
     assert run(capsys, *ask, "--coloured", scene / "c.ply")[0] == 0
     assert read_splats(scene / "c.ply").count == 3
     for name in ("o.ply", "o.splat", "o.spz"):

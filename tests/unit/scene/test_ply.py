@@ -90,10 +90,12 @@ def test_foreign_columns_and_comments_survive_in_their_own_type(line_end: bytes,
 
 
 def test_comments_of_any_bytes_are_kept_and_not_understood(tmp_path: Path) -> None:
-    said = "comment café \x85 property float z\nobj_info 点\n\ncomment end_header\n".encode() + b"comment \xff\xfe\n"
+    comment_lines = (
+        "comment café \x85 property float z\nobj_info 点\n\ncomment end_header\n".encode() + b"comment \xff\xfe\n"
+    )
     for line_end, end in ((b"\n", b"end_header\n"), (b"\r\n", b"end_header\n"), (b"\n", b"end_header \n")):
         head, _, rows = ply_bytes([*INRIA, "mask"]).partition(b"end_header\n")
-        head = head.replace(b"element vertex", said + b"element vertex")
+        head = head.replace(b"element vertex", comment_lines + b"element vertex")
         content = (head + end).replace(b"\n", line_end) + rows
         path = with_ply(tmp_path, content)
         splats = read_splats(path)
@@ -104,15 +106,15 @@ def test_comments_of_any_bytes_are_kept_and_not_understood(tmp_path: Path) -> No
         assert all(b"".join(copy).startswith((head + end).replace(b"\n", line_end)) for copy in copies)
 
 
-@pytest.mark.parametrize(("tail", "warned"), [(b"\n", 0), (bytes(20), 0), (b"abc", 1), (b"1" * 33, 1)])
-def test_bytes_behind_the_rows_are_passed_over_and_said(tail: bytes, warned: int, tmp_path: Path) -> None:
-    plain = ply_bytes(INRIA)
-    path = with_ply(tmp_path, plain + tail)
+@pytest.mark.parametrize(("tail", "warning_count"), [(b"\n", 0), (bytes(20), 0), (b"abc", 1), (b"1" * 33, 1)])
+def test_bytes_behind_the_rows_are_passed_over_and_said(tail: bytes, warning_count: int, tmp_path: Path) -> None:
+    content = ply_bytes(INRIA)
+    path = with_ply(tmp_path, content + tail)
     splats = read_splats(path)
-    assert len(splats.warnings) == warned and all(f"{len(tail)} bytes" in text for text in splats.warnings)
-    assert torch.equal(splats.means, read_splats(with_ply(tmp_path, plain)).means)
-    path.write_bytes(plain + tail)
-    assert b"".join(some_rows(path, np.ones(5, bool))) == plain
+    assert len(splats.warnings) == warning_count and all(f"{len(tail)} bytes" in text for text in splats.warnings)
+    assert torch.equal(splats.means, read_splats(with_ply(tmp_path, content)).means)
+    path.write_bytes(content + tail)
+    assert b"".join(some_rows(path, np.ones(5, bool))) == content
 
 
 def test_columns_reach_their_places_in_the_model(tmp_path: Path) -> None:
@@ -122,11 +124,11 @@ def test_columns_reach_their_places_in_the_model(tmp_path: Path) -> None:
     places = {"y": splats.means[:, 1], "rot_0": splats.quats[:, 0], "f_dc_2": splats.sh[:, 0, 2]}
     places |= {"f_rest_0": splats.sh[:, 1, 0], "f_rest_15": splats.sh[:, 1, 1], "f_rest_44": splats.sh[:, 15, 2]}
     content = ply_bytes(DIALECTS["dbs"])
-    lobes, own = read_splats(with_ply(tmp_path, content)).sb_params, rows_of(content)
+    lobes, lobe_columns = read_splats(with_ply(tmp_path, content)).sb_params, rows_of(content)
     assert lobes is not None and lobes.shape == (5, 2, 6)
-    assert all(np.array_equal(found.numpy(), column[name]) for name, found in places.items())
+    assert all(np.array_equal(values.numpy(), column[name]) for name, values in places.items())
     for i in range(12):  # channel-major, as harmonics are
-        assert np.array_equal(lobes[:, i % 2, i // 2].numpy(), own[f"sb_params_{i}"])
+        assert np.array_equal(lobes[:, i % 2, i // 2].numpy(), lobe_columns[f"sb_params_{i}"])
 
 
 def test_forced_kernel_overrules_the_properties(tmp_path: Path) -> None:
@@ -216,12 +218,12 @@ MALFORMED = {
 @pytest.mark.parametrize("case", MALFORMED)
 def test_malformed_file_is_refused_in_one_clear_line(case: str, tmp_path: Path) -> None:
     content, message = MALFORMED[case]
-    with pytest.raises(InvalidSplats, match=message) as caught:
+    with pytest.raises(InvalidSplats, match=message) as error:
         read_splats(with_ply(tmp_path, content))
-    assert "\n" not in str(caught.value)
-    assert len(str(caught.value)) < 600
-    for path, what in ((tmp_path / "nowhere.ply", "no such file"), (tmp_path, "folder")):
-        with pytest.raises(InvalidSplats, match=what):
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 600
+    for path, reason in ((tmp_path / "nowhere.ply", "no such file"), (tmp_path, "folder")):
+        with pytest.raises(InvalidSplats, match=reason):
             read_splats(path)
 
 
@@ -241,20 +243,22 @@ def test_a_lift_reads_no_colours_and_no_extras(tmp_path, kernel):
     splats = random_splats(4, 9, kernel=kernel)
     extras = {"mask": torch.ones(9)}
     write_splats(tmp_path / "s.ply", replace(splats, sh=torch.ones(9, 16, 3), extras=extras))
-    whole, bare = read_splats(tmp_path / "s.ply"), read_splats(tmp_path / "s.ply", colour=False)
-    assert whole.sh is not None
-    assert "mask" in whole.extras
+    full, bare = read_splats(tmp_path / "s.ply"), read_splats(tmp_path / "s.ply", colour=False)
+    assert full.sh is not None
+    assert "mask" in full.extras
     assert (bare.sh, bare.sb_params, dict(bare.extras), bare.kernel) == (None, None, {}, kernel)
     for name in ("means", "quats", "log_scales", "opacity_logits"):
-        assert torch.equal(getattr(bare, name), getattr(whole, name))
+        assert torch.equal(getattr(bare, name), getattr(full, name))
 
 
 def test_elements_behind_the_vertices_are_passed_over(tmp_path: Path) -> None:
-    plain = ply_bytes(INRIA, head="comment kept\n")
-    others = b"element camera 2\nproperty float focal\nproperty uchar id\nelement version 3\nproperty uchar number\n"
-    content = plain.replace(b"end_header", others + b"end_header") + bytes(2 * 5 + 3)
+    vertices_alone = ply_bytes(INRIA, head="comment kept\n")
+    other_elements = (
+        b"element camera 2\nproperty float focal\nproperty uchar id\nelement version 3\nproperty uchar number\n"
+    )
+    content = vertices_alone.replace(b"end_header", other_elements + b"end_header") + bytes(2 * 5 + 3)
     write_splats(tmp_path / "again.ply", read_splats(with_ply(tmp_path, content)))
-    assert (tmp_path / "again.ply").read_bytes() == plain
+    assert (tmp_path / "again.ply").read_bytes() == vertices_alone
     with pytest.raises(InvalidSplats, match=r"and 13 bytes of other elements = 353 bytes.*got 352 bytes.*truncated"):
         read_splats(with_ply(tmp_path, content[:-1]))
     assert "1 bytes at the file's end" in read_splats(with_ply(tmp_path, content + b"x")).warnings[0]
@@ -285,42 +289,42 @@ def test_filter_of_mip_splatting_is_applied(colour: bool, tmp_path: Path) -> Non
     np.testing.assert_allclose(torch.sigmoid(splats.opacity_logits.double()), opacity, rtol=1e-6)
     if colour:  # what is written has the filter in it, and is not filtered again
         write_splats(tmp_path / "plain.ply", splats)
-        again = read_splats(tmp_path / "plain.ply")
-        assert "filter_3D" not in again.layout
-        assert torch.equal(again.opacity_logits, splats.opacity_logits)
+        copy = read_splats(tmp_path / "plain.ply")
+        assert "filter_3D" not in copy.layout
+        assert torch.equal(copy.opacity_logits, splats.opacity_logits)
 
 
 def test_rows_are_kept_to_the_byte_over_blocks_and_in_their_own_types(tmp_path: Path) -> None:
     names, count = [*INRIA, "mask", "time"], 2 * BLOCK_ROWS + 5
     types = {"f_dc_1": "double", "mask": "uchar", "time": "double"}
     path = with_ply(tmp_path, ply_bytes(names, count, types, head="comment of somebody\n"))
-    kept = np.random.default_rng(1).random(count) < 0.3
-    copy, whole = b"".join(some_rows(path, kept)), rows_of(path.read_bytes())
-    assert rows_of(copy).dtype == whole.dtype and rows_of(copy).tobytes() == whole[kept].tobytes()
-    first = f"ply\nformat binary_little_endian 1.0\ncomment of somebody\nelement vertex {kept.sum()}\n"
+    mask = np.random.default_rng(1).random(count) < 0.3
+    copy, rows = b"".join(some_rows(path, mask)), rows_of(path.read_bytes())
+    assert rows_of(copy).dtype == rows.dtype and rows_of(copy).tobytes() == rows[mask].tobytes()
+    first = f"ply\nformat binary_little_endian 1.0\ncomment of somebody\nelement vertex {mask.sum()}\n"
     assert copy.startswith(first.encode())
     assert b"".join(some_rows(path, np.ones(count, bool))) == path.read_bytes()
 
 
 def test_elements_behind_the_vertices_are_no_rows_of_a_copy(tmp_path: Path) -> None:
-    plain = ply_bytes(INRIA)
-    others = b"element version 200\nproperty uchar number\n"  # as many bytes as two splats and more
-    path = with_ply(tmp_path, plain.replace(b"end_header", others + b"end_header") + bytes(200))
-    assert b"".join(some_rows(path, np.ones(5, bool))) == plain
+    vertices_alone = ply_bytes(INRIA)
+    other_elements = b"element version 200\nproperty uchar number\n"  # as many bytes as two splats and more
+    path = with_ply(tmp_path, vertices_alone.replace(b"end_header", other_elements + b"end_header") + bytes(200))
+    assert b"".join(some_rows(path, np.ones(5, bool))) == vertices_alone
     copy = b"".join(recoloured(path, np.zeros((5, 3), np.uint8)))
-    assert len(copy) == len(plain) and len(rows_of(copy)) == 5
+    assert len(copy) == len(vertices_alone) and len(rows_of(copy)) == 5
 
 
 @pytest.mark.parametrize("dialect", [name for name in DIALECTS if name != "no colour"])
 def test_colours_of_every_dialect_are_the_same_from_everywhere(dialect: str, tmp_path: Path) -> None:
     names = DIALECTS[dialect]
     path = with_ply(tmp_path, ply_bytes(names))
-    wanted = np.random.default_rng(2).integers(0, 256, (5, 3)).astype(np.uint8)
-    (tmp_path / "coloured.ply").write_bytes(b"".join(recoloured(path, wanted)))
+    expected = np.random.default_rng(2).integers(0, 256, (5, 3)).astype(np.uint8)
+    (tmp_path / "coloured.ply").write_bytes(b"".join(recoloured(path, expected)))
     splats = read_splats(tmp_path / "coloured.ply")
     for centre in ([3.0, 1.0, -4.0], [-0.2, 0.1, 9.0], [0.0, -5.0, 0.3]):
-        shown = view_colours(splats, look_at("v", np.array(centre), 8, 8, 8.0))
-        torch.testing.assert_close(shown, torch.from_numpy(wanted / 255).float(), atol=1e-6, rtol=0)
+        actual = view_colours(splats, look_at("v", np.array(centre), 8, 8, 8.0))
+        torch.testing.assert_close(actual, torch.from_numpy(expected / 255).float(), atol=1e-6, rtol=0)
     before, after = rows_of(path.read_bytes()), rows_of((tmp_path / "coloured.ply").read_bytes())
     coloured = ("f_dc", "f_rest", "sh0", "sb_params")
     for name in names:
@@ -346,15 +350,15 @@ def test_red_green_and_blue_are_the_colour_where_no_harmonics_are(kind, full, ch
     content = ply_bytes([*DIALECTS["no colour"], *channels], types=types, **columns)
     path = with_ply(tmp_path, content)
     splats = read_splats(path)
-    seen = view_colours(splats, look_at("v", np.array([3.0, 1.0, -4.0]), 8, 8, 8.0))
-    torch.testing.assert_close(seen, torch.from_numpy(levels).float(), atol=2e-5, rtol=0)
+    colours = view_colours(splats, look_at("v", np.array([3.0, 1.0, -4.0]), 8, 8, 8.0))
+    torch.testing.assert_close(colours, torch.from_numpy(levels).float(), atol=2e-5, rtol=0)
     write_splats(tmp_path / "again.ply", splats)
     assert (tmp_path / "again.ply").read_bytes() == content
-    wanted = np.random.default_rng(2).integers(0, 256, (5, 3)).astype(np.uint8)
-    wanted[:3] |= 2  # most of them above 1 of 255
-    copy = rows_of(b"".join(recoloured(path, wanted)))
-    shown = np.stack([copy[name] for name in channels], axis=1) / full
-    np.testing.assert_allclose(shown, wanted / 255, atol=1e-5)
+    expected = np.random.default_rng(2).integers(0, 256, (5, 3)).astype(np.uint8)
+    expected[:3] |= 2  # most of them above 1 of 255
+    copy = rows_of(b"".join(recoloured(path, expected)))
+    actual = np.stack([copy[name] for name in channels], axis=1) / full
+    np.testing.assert_allclose(actual, expected / 255, atol=1e-5)
     assert read_splats(path, colour=False).sh is None
 
 
@@ -387,7 +391,7 @@ def test_splats_take_the_memory_of_their_file_and_a_copy_that_of_a_few_blocks(tm
     names, count = DIALECTS["inria degree 3"], 10 * BLOCK_ROWS
     path = with_ply(tmp_path, ply_bytes(names, count=count))
     assert peak_of(lambda: read_splats(path)) < 1.15 * path.stat().st_size
-    kept, black = np.ones(count, bool), np.zeros((count, 3), np.uint8)
-    for copy in (some_rows(path, kept), recoloured(path, black)):
+    mask, black = np.ones(count, bool), np.zeros((count, 3), np.uint8)
+    for copy in (some_rows(path, mask), recoloured(path, black)):
         peak = peak_of(lambda copy=copy: sum(map(len, copy)))
         assert peak - 24 * count < 4 * (BLOCK_ROWS * 4 * len(names))  # beside the colours, or the rows to keep

@@ -19,9 +19,9 @@ from tests.unit.command_line import run
 
 
 def write_rank(path: Path, splats: Splats, rows: slice) -> None:
-    own = {"means": splats.means[rows], "quats": splats.quats[rows], "scales": splats.log_scales[rows]}
-    own |= {"opacities": splats.opacity_logits[rows]}
-    torch.save({"step": 29_999, "splats": {name: value.clone() for name, value in own.items()}}, path)
+    tensors = {"means": splats.means[rows], "quats": splats.quats[rows], "scales": splats.log_scales[rows]}
+    tensors |= {"opacities": splats.opacity_logits[rows]}
+    torch.save({"step": 29_999, "splats": {name: value.clone() for name, value in tensors.items()}}, path)
 
 
 def write_ranks(folder: Path, splats: Splats, step: int = 29_999) -> Path:
@@ -35,10 +35,10 @@ def test_a_folder_of_ranks_is_the_whole_scene_in_their_order(tmp_path: Path) -> 
     splats = random_splats(3, 50)
     folder = write_ranks(tmp_path / "ckpts", splats)
     write_ranks(folder, random_splats(4, 50), step=6_999)  # an earlier step
-    found = read_splats(folder)
+    actual = read_splats(folder)
     for name in ("means", "quats", "log_scales", "opacity_logits"):
-        assert torch.equal(getattr(found, name), getattr(splats, name))
-    assert found.warnings == ()
+        assert torch.equal(getattr(actual, name), getattr(splats, name))
+    assert actual.warnings == ()
     assert torch.equal(torch.from_numpy(read_places(folder)), splats.means)
     assert inspect_file(folder)["bytes"] == sum(file.stat().st_size for file in folder.glob("ckpt_29999*"))
     before = input_file(folder).sha256
@@ -64,16 +64,16 @@ def test_every_command_says_that_one_rank_is_a_part_and_takes_the_folder(
     folder, out = write_ranks(tmp_path / "ckpts", read_splats(splats)), tmp_path / "l.safetensors"
     first, words = folder / "ckpt_29999_rank0.pt", "ckpt_29999_rank1.pt, ckpt_29999_rank2.pt beside ckpt_29999_rank0"
     lift = ("-o", out, "--set", "preset=row-sum")
-    for command, more in (
+    for command, arguments in (
         ("inspect", ()),
         ("plan", (cameras, packs)),
         ("check", (cameras,)),
         ("lift", (cameras, packs)),
     ):
-        status, text, err = run(capsys, command, first, *more, *(lift if command == "lift" else ()))
+        status, text, err = run(capsys, command, first, *arguments, *(lift if command == "lift" else ()))
         assert status == (2 if command == "check" else 0), (command, text, err)  # a part fills few rays
         assert words in text
-        status, text, err = run(capsys, command, folder, *more, *(lift if command == "lift" else ()))
+        status, text, err = run(capsys, command, folder, *arguments, *(lift if command == "lift" else ()))
         assert status == 0 and "beside" not in text, (command, text, err)
     scene = Scene(out)
     assert scene.splats.count == 50 and scene.axes.shape == (3, 50)

@@ -1,4 +1,4 @@
-"""How splats were trained is read where their file says it, decides how they are lifted, and is told."""
+"""The render mode that splats were trained with: read from their file, used by the lift, and reported."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ CLASSIC, MIP, DISCS = (Kernel.GAUSSIAN_3D, False), (Kernel.GAUSSIAN_3D, True), (
 def ply_saying(folder: Path, *lines: str, splats: Splats | None = None) -> Path:
     path = folder / "s.ply"
     write_splats(path, splats or random_splats(3))
-    said = "".join(f"{line}\n" for line in lines).encode()
-    path.write_bytes(path.read_bytes().replace(b"element vertex", said + b"element vertex"))
+    comments = "".join(f"{line}\n" for line in lines).encode()
+    path.write_bytes(path.read_bytes().replace(b"element vertex", comments + b"element vertex"))
     return path
 
 
@@ -52,9 +52,9 @@ def spz_saying(folder: Path, version: int, flags: int) -> Path:
         return folder / "s.spz"
     import gzip
 
-    plain = bytearray(gzip.decompress(bytes(content)))
-    plain[14] = flags
-    (folder / "s.spz").write_bytes(gzip.compress(bytes(plain)))
+    payload = bytearray(gzip.decompress(bytes(content)))
+    payload[14] = flags
+    (folder / "s.spz").write_bytes(gzip.compress(bytes(payload)))
     return folder / "s.spz"
 
 
@@ -70,9 +70,9 @@ def sog_saying(folder: Path, model: Any) -> Path:
 
 def checkpoint_beside(folder: Path, name: str, text: str) -> Path:
     splats = random_splats(3)
-    own = {"means": splats.means, "quats": splats.quats, "scales": splats.log_scales}
+    tensors = {"means": splats.means, "quats": splats.quats, "scales": splats.log_scales}
     (folder / "ckpts").mkdir()
-    torch.save({"splats": own | {"opacities": splats.opacity_logits}}, folder / "ckpts" / "c.pt")
+    torch.save({"splats": tensors | {"opacities": splats.opacity_logits}}, folder / "ckpts" / "c.pt")
     (folder / name).write_text(text)
     return folder / "ckpts" / "c.pt"
 
@@ -115,30 +115,32 @@ def test_a_file_is_taken_at_its_word(case: str, tmp_path: Path) -> None:
         splats = read_splats(path, colour=colour)
         assert (splats.kernel, splats.antialiased) == (kernel, antialiased)
         assert LiftSettings.of().for_splats(splats).lift_params.antialiased is antialiased
-    found = inspect_file(path)
-    assert found["kernel"] == str(kernel)
+    report = inspect_file(path)
+    assert report["kernel"] == str(kernel)
     if source is None:
-        assert found["render_mode"] is None
+        assert report["render_mode"] is None
     else:
-        assert found["render_mode"] == ("antialiased" if antialiased else "2dgs" if kernel is DISCS[0] else "classic")
-        assert source in found["render_mode_source"]
+        assert report["render_mode"] == (
+            "antialiased" if antialiased else "2dgs" if kernel is DISCS[0] else "classic"
+        )
+        assert source in report["render_mode_source"]
 
 
 def test_what_a_file_says_is_contradicted_aloud(tmp_path: Path) -> None:
-    def warned(path: Path, **kernel: Any) -> str:
+    def warnings_of(path: Path, **kernel: Any) -> str:
         return " | ".join(read_splats(path, **kernel).warnings)
 
-    assert "contradict each other" in warned(
+    assert "contradict each other" in warnings_of(
         ply_saying(tmp_path, "comment antialiased 1", "comment SplatRenderMode: 2dgs")
     )
-    assert "not known" in warned(ply_saying(tmp_path, "comment SplatRenderMode: wavelets"))
-    assert "not known" in warned(sog_saying(tmp_path, ["mip"]))
+    assert "not known" in warnings_of(ply_saying(tmp_path, "comment SplatRenderMode: wavelets"))
+    assert "not known" in warnings_of(sog_saying(tmp_path, ["mip"]))
     beta = ply_saying(tmp_path, "comment SplatRenderMode: 2dgs", splats=random_splats(3, kernel=Kernel.BETA))
-    assert read_splats(beta).kernel is Kernel.BETA and "taken for dbs" in warned(beta)
+    assert read_splats(beta).kernel is Kernel.BETA and "taken for dbs" in warnings_of(beta)
     discs = ply_saying(tmp_path, "comment antialiased 1", splats=random_splats(3, kernel=Kernel.GAUSSIAN_2D))
-    assert not read_splats(discs).antialiased and "taken for 2dgs" in warned(discs)
+    assert not read_splats(discs).antialiased and "taken for 2dgs" in warnings_of(discs)
     forced = ply_saying(tmp_path, "comment SplatRenderMode: 2dgs")
-    assert read_splats(forced, "3dgs").kernel is Kernel.GAUSSIAN_3D and "taken for 3dgs" in warned(
+    assert read_splats(forced, "3dgs").kernel is Kernel.GAUSSIAN_3D and "taken for 3dgs" in warnings_of(
         forced, kernel="3dgs"
     )
 
@@ -173,14 +175,14 @@ def test_properties_that_change_what_is_rendered_and_are_not_read_are_named(
 
 def test_exports_say_how_their_splats_were_trained(tmp_path: Path) -> None:
     mip = spz_saying(tmp_path, 4, 1)
-    every = np.ones(40, bool)
+    mask = np.ones(40, bool)
     for suffix in (".ply", ".spz"):
-        (tmp_path / f"copy{suffix}").write_bytes(b"".join(some_rows(mip, every, suffix)))
+        (tmp_path / f"copy{suffix}").write_bytes(b"".join(some_rows(mip, mask, suffix)))
         assert read_splats(tmp_path / f"copy{suffix}").antialiased
     (tmp_path / "c.ply").write_bytes(b"".join(with_columns(mip, {"score": np.ones(40, np.float32)})))
     assert read_splats(tmp_path / "c.ply").antialiased
-    plain = ply_saying(tmp_path, "comment SplatRenderMode: mip")
-    (tmp_path / "c.ply").write_bytes(b"".join(some_rows(plain, every)))
+    mip_ply = ply_saying(tmp_path, "comment SplatRenderMode: mip")
+    (tmp_path / "c.ply").write_bytes(b"".join(some_rows(mip_ply, mask)))
     assert read_splats(tmp_path / "c.ply").antialiased
     discs = sog_saying(tmp_path, "2dgs")
     (tmp_path / "c.ply").write_bytes(b"".join(some_rows(discs, np.ones(300, bool))))
@@ -188,19 +190,19 @@ def test_exports_say_how_their_splats_were_trained(tmp_path: Path) -> None:
 
 
 def test_values_in_memory_carry_their_mode_into_every_call() -> None:
-    plain = random_splats(3)
-    mip = replace(plain, render_mode="antialiased")
+    splats = random_splats(3)
+    mip = replace(splats, render_mode="antialiased")
     camera, values = random_camera(0), torch.ones(40)
-    given = lc.CompositingParams(antialiased=True)
-    assert torch.equal(lc.render(mip, camera, values), lc.render(plain, camera, values, given))
-    assert not torch.equal(lc.render(mip, camera, values), lc.render(plain, camera, values))
-    assert torch.equal(lc.render(mip, camera, values, lc.CompositingParams()), lc.render(plain, camera, values))
+    params = lc.CompositingParams(antialiased=True)
+    assert torch.equal(lc.render(mip, camera, values), lc.render(splats, camera, values, params))
+    assert not torch.equal(lc.render(mip, camera, values), lc.render(splats, camera, values))
+    assert torch.equal(lc.render(mip, camera, values, lc.CompositingParams()), lc.render(splats, camera, values))
     with pytest.raises(InvalidSplats, match="render_mode: expected classic or antialiased or 2dgs, got 'mip'"):
-        replace(plain, render_mode="mip")
+        replace(splats, render_mode="mip")
     cameras = {f"v{number}": random_camera(number, name=f"v{number}") for number in range(3)}
     views = {name: observed(number, 0) for number, name in enumerate(cameras)}
     lifted = lc.lift(mip, cameras, views, "row-sum", device="cpu")
-    by_hand = lc.lift(plain, cameras, views, "row-sum", device="cpu", antialiased=True)
+    by_hand = lc.lift(splats, cameras, views, "row-sum", device="cpu", antialiased=True)
     assert torch.equal(lifted.features, by_hand.features) and lifted.settings.antialiased is True
     assert lifted.diagnostics["plan"]["antialiased"] is True
     assert lifted.diagnostics["plan"]["rendering"] == "render_mode of the splats says so"
@@ -209,13 +211,13 @@ def test_values_in_memory_carry_their_mode_into_every_call() -> None:
     assert torch.equal(engine.features, lifted.features) and engine.settings == lifted.settings
     assert engine.diagnostics["plan"]["rendering"] == lifted.diagnostics["plan"]["rendering"]
     weights = lc.region_weights(mip, cameras, views, "row-sum", device="cpu")
-    other = lc.region_weights(plain, cameras, views, "row-sum", device="cpu", antialiased=True)
+    other = lc.region_weights(splats, cameras, views, "row-sum", device="cpu", antialiased=True)
     assert torch.equal(weights.weight, other.weight)
     assert (
         lc.plan(mip, cameras, views).antialiased and not lc.plan(mip, cameras, views, antialiased=False).antialiased
     )
     against = lc.lift(mip, cameras, views, "row-sum", device="cpu", antialiased=False)
-    assert torch.equal(against.features, lc.lift(plain, cameras, views, "row-sum", device="cpu").features)
+    assert torch.equal(against.features, lc.lift(splats, cameras, views, "row-sum", device="cpu").features)
     assert any("antialiased=false is set by hand" in text for text in against.diagnostics["warnings"])
     with pytest.raises(InvalidSettings, match="antialiased"):
         lc.lift(random_splats(3, kernel=Kernel.BETA), cameras, views, antialiased=True)
@@ -238,9 +240,9 @@ def test_commands_follow_the_file_tell_it_and_take_a_setting_by_hand(
     assert run(capsys, "lift", splats, cameras, packs, "-o", out, "--set", "preset=row-sum")[0] == 0
     scene = Scene(out)
     assert scene.compositing.antialiased and params_of_renders(scene).antialiased
-    found = inspect_file(out)
-    assert found["settings"]["antialiased"] is True
-    assert "says so" in found["diagnostics"]["plan"]["rendering"]
+    report = inspect_file(out)
+    assert report["settings"]["antialiased"] is True
+    assert "says so" in report["diagnostics"]["plan"]["rendering"]
     assert run(capsys, "lift", splats, cameras, packs, "-o", out, "--set", "antialiased=false")[0] == 0
     assert not Scene(out).compositing.antialiased
 
@@ -274,10 +276,10 @@ def test_a_splat_below_a_pixel_is_lifted_as_it_was_trained(tmp_path: Path) -> No
     write_splats(tmp_path / "classic.ply", splats)
     path = ply_saying(tmp_path, "comment SplatRenderMode: mip", splats=splats)
     camera = lc.Camera(np.eye(4), [[32.0, 0, 32], [0, 32, 24], [0, 0, 1]], 64, 48, name="v")
-    whole = float(lc.render(splats_of(splats, 400), camera, torch.ones(1))[20:28, 28:36].mean())
+    expected = float(lc.render(splats_of(splats, 400), camera, torch.ones(1))[20:28, 28:36].mean())
     shares = []
     for file in (tmp_path / "classic.ply", path):
         ball_alone = torch.zeros(401)
         ball_alone[400] = 1.0
         shares.append(float(lc.render(read_splats(file), camera, ball_alone)[20:28, 28:36].mean()))
-    assert shares[0] < 0.8 * whole and shares[1] > 0.99 * whole
+    assert shares[0] < 0.8 * expected and shares[1] > 0.99 * expected

@@ -48,44 +48,44 @@ def scene(kernel: Kernel) -> Splats:
 
 
 def parts(splats: Splats) -> dict[str, np.ndarray]:
-    """What a viewer draws, of any kernel as Gaussians: logarithms of scales, and turns that quaternions mean."""
+    """Return what a viewer draws, any kernel as Gaussians: logarithms of scales, quaternions as rotation matrices."""
     (rows,) = gaussian_rows(splats)
     assert splats.sh is not None
     sh = splats.sh.numpy()
-    found = {"means": splats.positions(), "log_scales": np.log(rows.scales), "opacities": rows.opacities}
-    return found | {"turns": rotation_matrices(rows.quats), "base": sh[:, 0], "sh": sh[:, 1:]}
+    arrays = {"means": splats.positions(), "log_scales": np.log(rows.scales), "opacities": rows.opacities}
+    return arrays | {"turns": rotation_matrices(rows.quats), "base": sh[:, 0], "sh": sh[:, 1:]}
 
 
 @pytest.mark.parametrize("kernel", Kernel)
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_every_kernel_comes_back_through_every_format(kernel: Kernel, suffix: str, tmp_path: Path) -> None:
-    expected, made, path = scene(kernel), labels(), tmp_path / f"s{suffix}"
+    expected, label_table, path = scene(kernel), labels(), tmp_path / f"s{suffix}"
     write_splats(tmp_path / "s.ply", expected)
     if suffix == ".splat":
         path.write_bytes(b"".join(blocks_as(expected, suffix)))
     else:
-        path.write_bytes(b"".join(labelled(tmp_path / "s.ply", made, suffix)))
+        path.write_bytes(b"".join(labelled(tmp_path / "s.ply", label_table, suffix)))
         columns = read_labels(path).columns
-        assert columns.keys() == made.columns.keys()
-        for name, values in made.columns.items():
+        assert columns.keys() == label_table.columns.keys()
+        for name, values in label_table.columns.items():
             np.testing.assert_array_equal(columns[name], values)
-    one, other = parts(read_splats(path)), parts(expected)
+    actual_parts, expected_parts = parts(read_splats(path)), parts(expected)
     for name, step in STEPS[suffix].items():
-        size = np.abs(other[name]).max() if name == "means" or suffix in (".glb", ".usdc", ".usdz") else 1.0
-        most = step * max(1.0, size) * 1.001 + 1e-6
-        np.testing.assert_allclose(one[name], other[name], rtol=0, atol=most, err_msg=name)
-    assert suffix != ".splat" or one["sh"].shape == (P, 0, 3)
+        size = np.abs(expected_parts[name]).max() if name == "means" or suffix in (".glb", ".usdc", ".usdz") else 1.0
+        tolerance = step * max(1.0, size) * 1.001 + 1e-6
+        np.testing.assert_allclose(actual_parts[name], expected_parts[name], rtol=0, atol=tolerance, err_msg=name)
+    assert suffix != ".splat" or actual_parts["sh"].shape == (P, 0, 3)
 
 
 @pytest.mark.parametrize("kernel", Kernel)
 def test_a_ply_keeps_every_number_of_every_kernel(kernel: Kernel, tmp_path: Path) -> None:
-    expected, made = some_splats(kernel), labels()
+    expected, label_table = some_splats(kernel), labels()
     write_splats(tmp_path / "s.ply", expected)
-    (tmp_path / "t.ply").write_bytes(b"".join(labelled(tmp_path / "s.ply", made, ".ply")))
-    found = read_splats(tmp_path / "t.ply")
-    assert found.kernel is kernel
+    (tmp_path / "t.ply").write_bytes(b"".join(labelled(tmp_path / "s.ply", label_table, ".ply")))
+    copy = read_splats(tmp_path / "t.ply")
+    assert copy.kernel is kernel
     for name in ("means", "quats", "log_scales", "opacity_logits", "beta", "sh", "sb_params"):
-        one, other = getattr(found, name), getattr(expected, name)
-        assert (one is None) == (other is None) and (one is None or torch.equal(one, other)), name
-    for name, values in made.columns.items():
-        np.testing.assert_array_equal(found.extras[name].numpy(), values)
+        a, b = getattr(copy, name), getattr(expected, name)
+        assert (a is None) == (b is None) and (a is None or torch.equal(a, b)), name
+    for name, values in label_table.columns.items():
+        np.testing.assert_array_equal(copy.extras[name].numpy(), values)

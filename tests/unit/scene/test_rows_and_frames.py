@@ -40,22 +40,22 @@ def coloured(kernel: Kernel, degree: int = 3) -> lc.Splats:
 )
 def test_chosen_rows_have_all_their_columns(keep: Any) -> None:
     splats = coloured(Kernel.BETA)
-    some = splats[keep]
-    assert len(some) == some.count == 20
+    subset = splats[keep]
+    assert len(subset) == subset.count == 20
     for name in ("means", "quats", "log_scales", "opacity_logits", "beta", "sh", "sb_params"):
-        assert torch.equal(getattr(some, name), getattr(splats, name)[1::3]), name
-    assert some.extras["mask"].tolist() == list(range(1, 60, 3)) and some.kernel is splats.kernel
+        assert torch.equal(getattr(subset, name), getattr(splats, name)[1::3]), name
+    assert subset.extras["mask"].tolist() == list(range(1, 60, 3)) and subset.kernel is splats.kernel
 
 
 def test_rows_may_come_in_another_order_and_keep_an_origin_of_map_coordinates() -> None:
     splats = random_splats(1)
     far = replace(splats, means=splats.means.double() + torch.tensor([5e5, 5.4e6, 300.0]).double(), origin=None)
-    some = far[::-1]
-    assert some.origin == far.origin != (0, 0, 0)
-    np.testing.assert_array_equal(some.positions(), far.positions()[::-1])
-    moved = far.transformed(MATRIX)
+    reverse = far[::-1]
+    assert reverse.origin == far.origin != (0, 0, 0)
+    np.testing.assert_array_equal(reverse.positions(), far.positions()[::-1])
+    transformed = far.transformed(MATRIX)
     np.testing.assert_allclose(
-        moved.positions(), far.positions() @ MATRIX[:3, :3].T + MATRIX[:3, 3], rtol=0, atol=1e-4
+        transformed.positions(), far.positions() @ MATRIX[:3, :3].T + MATRIX[:3, 3], rtol=0, atol=1e-4
     )
 
 
@@ -82,27 +82,31 @@ def test_what_chooses_no_rows_is_refused(keep: Any, message: str) -> None:
 def test_cameras_moved_with_the_splats_see_the_same(kernel: Kernel) -> None:
     splats, camera = coloured(kernel), random_camera(3)
     values = np.random.default_rng(2).random((60, 2))
-    moved, seen_from = splats.transformed(**MOVE), camera.transformed(MATRIX)
-    np.testing.assert_allclose(moved.positions(), splats.positions() @ MATRIX[:3, :3].T + MATRIX[:3, 3], atol=1e-4)
-    image, other = lc.render(splats, camera, values), lc.render(moved, seen_from, values)
+    transformed, seen_from = splats.transformed(**MOVE), camera.transformed(MATRIX)
+    np.testing.assert_allclose(
+        transformed.positions(), splats.positions() @ MATRIX[:3, :3].T + MATRIX[:3, 3], atol=1e-4
+    )
+    image, other = lc.render(splats, camera, values), lc.render(transformed, seen_from, values)
     assert float(image.max()) > 0.1 and float((image - other).abs().max()) < 2e-3
-    colours, others = view_colours(splats, camera), view_colours(moved, seen_from)
-    assert torch.allclose(colours, others, atol=2e-3) and float(colours.std()) > 0.1
-    normals = [torch.stack([one.extras[name] for name in ("nx", "ny", "nz")], dim=1) for one in (splats, moved)]
+    colours, other_colours = view_colours(splats, camera), view_colours(transformed, seen_from)
+    assert torch.allclose(colours, other_colours, atol=2e-3) and float(colours.std()) > 0.1
+    normals = [
+        torch.stack([item.extras[name] for name in ("nx", "ny", "nz")], dim=1) for item in (splats, transformed)
+    ]
     np.testing.assert_allclose(TURN.apply(normals[0].numpy()), normals[1].numpy(), atol=1e-12)
     assert lc.Cameras([camera]).transformed(**MOVE)["v0"].centre.tolist() == pytest.approx(seen_from.centre.tolist())
 
 
 def test_moving_back_gives_the_splats_and_a_quaternion_is_a_rotation() -> None:
     splats = coloured(Kernel.GAUSSIAN_3D)
-    w, *others = np.roll(TURN.as_quat(), 1)
-    moved = splats.transformed(scale=2.5, rotation=[w, *others], translation=torch.tensor([3.0, -1.0, 7.0]))
-    assert torch.allclose(moved.means, splats.transformed(MATRIX).means, atol=1e-5)
-    back = moved.transformed(np.linalg.inv(MATRIX))
+    w, *xyz = np.roll(TURN.as_quat(), 1)
+    transformed = splats.transformed(scale=2.5, rotation=[w, *xyz], translation=torch.tensor([3.0, -1.0, 7.0]))
+    assert torch.allclose(transformed.means, splats.transformed(MATRIX).means, atol=1e-5)
+    back = transformed.transformed(np.linalg.inv(MATRIX))
     for name in ("means", "log_scales", "sh"):
         assert torch.allclose(getattr(back, name), getattr(splats, name), atol=1e-4), name
-    same = splats.transformed(np.eye(4))
-    assert torch.equal(same.means, splats.means) and torch.equal(same.quats, splats.quats)
+    identity = splats.transformed(np.eye(4))
+    assert torch.equal(identity.means, splats.means) and torch.equal(identity.quats, splats.quats)
 
 
 def test_zero_quaternions_turn_as_identities() -> None:
@@ -112,7 +116,7 @@ def test_zero_quaternions_turn_as_identities() -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("keywords", "message"),
     [
         ({"matrix": np.diag([1.0, 1, -1, 1])}, "matrix: expected a rotation times a scale, no reflection"),
         ({"matrix": np.diag([1.0, 2, 3, 1])}, "matrix: expected a proper rotation"),
@@ -129,7 +133,7 @@ def test_zero_quaternions_turn_as_identities() -> None:
         ({"translation": "up"}, "translation: expected finite numbers"),
     ],
 )
-def test_what_is_no_similarity_is_refused_by_its_name(given: dict[str, Any], message: str) -> None:
+def test_what_is_no_similarity_is_refused_by_its_name(keywords: dict[str, Any], message: str) -> None:
     for value in (random_splats(0), random_camera(0)):
         with pytest.raises(lc.InvalidInput, match=message):
-            value.transformed(**given)
+            value.transformed(**keywords)

@@ -54,15 +54,15 @@ FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 HIGHEST = float(np.log((1 - LEAST_ALPHA) / LEAST_ALPHA))
 
 
-def assert_alike(found: Splats, expected: Splats) -> None:
-    assert torch.allclose(found.means, expected.means, atol=1e-6)
-    assert torch.allclose(found.log_scales, expected.log_scales, atol=1e-6)
-    turned = (torch.nn.functional.normalize(found.quats) * torch.nn.functional.normalize(expected.quats)).sum(dim=1)
-    assert torch.allclose(turned.abs(), torch.ones(found.count), atol=2e-4)  # .splat's zero is read as 127.5 or 128
+def assert_alike(actual: Splats, expected: Splats) -> None:
+    assert torch.allclose(actual.means, expected.means, atol=1e-6)
+    assert torch.allclose(actual.log_scales, expected.log_scales, atol=1e-6)
+    cosines = (torch.nn.functional.normalize(actual.quats) * torch.nn.functional.normalize(expected.quats)).sum(dim=1)
+    assert torch.allclose(cosines.abs(), torch.ones(actual.count), atol=2e-4)  # .splat's zero is read as 127.5 or 128
     clamped = expected.opacity_logits.clamp(-HIGHEST, HIGHEST)  # infinite in some of splat-transform's
-    assert torch.allclose(found.opacity_logits, clamped, atol=1e-4)
-    assert found.sh is not None and expected.sh is not None and found.sh.shape == expected.sh.shape
-    assert torch.allclose(found.sh, expected.sh, atol=1e-6)
+    assert torch.allclose(actual.opacity_logits, clamped, atol=1e-4)
+    assert actual.sh is not None and expected.sh is not None and actual.sh.shape == expected.sh.shape
+    assert torch.allclose(actual.sh, expected.sh, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -89,9 +89,9 @@ def test_every_format_is_read_as_its_own_tool_reads_it(name: str, tmp_path: Path
         assert splat_files(tmp_path / "folder") == parts
         (tmp_path / "folder" / document).write_text("{}")
         assert input_file(tmp_path / "folder").sha256 != before
-    bare, whole = read_splats(unnamed, colour=False), read_splats(unnamed)
-    assert bare.sh is None and torch.equal(bare.means, whole.means) and torch.equal(bare.quats, whole.quats)
-    assert np.array_equal(read_places(unnamed), whole.means.numpy())
+    bare, full = read_splats(unnamed, colour=False), read_splats(unnamed)
+    assert bare.sh is None and torch.equal(bare.means, full.means) and torch.equal(bare.quats, full.quats)
+    assert np.array_equal(read_places(unnamed), full.means.numpy())
     assert np.array_equal(read_places(FILES / f"{name}.decoded.ply"), expected.means.numpy())
 
 
@@ -102,18 +102,23 @@ def test_the_finest_level_of_each_leaf_of_a_streamed_sog_is_one_scene(tmp_path: 
     fine, coarse = read_splats(FILES / "degree1.sog"), read_splats(FILES / "degree3.sog")
 
     def leaf(**levels: tuple[int, int, int]) -> dict[str, Any]:
-        rows = {level[1:]: dict(zip(("file", "offset", "count"), own, strict=True)) for level, own in levels.items()}
+        rows = {
+            level[1:]: dict(zip(("file", "offset", "count"), numbers, strict=True))
+            for level, numbers in levels.items()
+        }
         return {"lods": rows}
 
-    def read(*leaves: dict[str, Any], names: Any = ("degree3/meta.json", "degree1/meta.json"), **more: Any) -> Splats:
-        document = {"filenames": names, "tree": {"children": [{"children": leaves[:1]}, *leaves[1:]]}, **more}
+    def read(
+        *leaves: dict[str, Any], names: Any = ("degree3/meta.json", "degree1/meta.json"), **fields: Any
+    ) -> Splats:
+        document = {"filenames": names, "tree": {"children": [{"children": leaves[:1]}, *leaves[1:]]}, **fields}
         (tmp_path / "lod-meta.json").write_text(json.dumps(document))
         return read_splats(tmp_path / "lod-meta.json")
 
-    whole = read(leaf(_1=(0, 9, 5), _0=(1, 200, 100)), leaf(_2=(0, 30, 10)), leaf(_0=(1, 0, 40)), environment="env")
-    assert torch.equal(whole.means, torch.cat([coarse.means[30:], fine.means[:40], fine.means[200:]]))
-    assert whole.sh is not None and whole.sh_degree == 3 and not whole.sh[10:, 4:].any()
-    assert any("environment" in warning for warning in whole.warnings)
+    splats = read(leaf(_1=(0, 9, 5), _0=(1, 200, 100)), leaf(_2=(0, 30, 10)), leaf(_0=(1, 0, 40)), environment="env")
+    assert torch.equal(splats.means, torch.cat([coarse.means[30:], fine.means[:40], fine.means[200:]]))
+    assert splats.sh is not None and splats.sh_degree == 3 and not splats.sh[10:, 4:].any()
+    assert any("environment" in warning for warning in splats.warnings)
     wrong: dict[str, tuple[tuple[Any, ...], dict[str, Any]]] = {
         "rows of their own": ((leaf(_0=(1, 0, 40)), leaf(_0=(1, 39, 2))), {}),
         "rows within the 300": ((leaf(_0=(1, 0, 301)),), {}),
@@ -133,29 +138,29 @@ def test_the_finest_level_of_each_leaf_of_a_streamed_sog_is_one_scene(tmp_path: 
         7,
     )
     wrong |= {
-        f"in the folder.*{number}": ((leaf(_0=(0, 0, 1)),), {"names": [one]}) for number, one in enumerate(outside)
+        f"in the folder.*{number}": ((leaf(_0=(0, 0, 1)),), {"names": [path]}) for number, path in enumerate(outside)
     }
-    for match, (leaves, more) in wrong.items():
+    for match, (leaves, fields) in wrong.items():
         with pytest.raises(InvalidSplats, match=match.split(".*")[0]):
-            read(*leaves, **more)
+            read(*leaves, **fields)
 
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_exports_of_every_format_are_plys_of_the_same_rows(name: str, tmp_path: Path) -> None:
-    whole = read_splats(FILES / name)
-    kept = np.arange(whole.count) % 3 == 1
-    (tmp_path / "some.ply").write_bytes(b"".join(some_rows(FILES / name, kept)))
-    some = read_splats(tmp_path / "some.ply")
+    full = read_splats(FILES / name)
+    mask = np.arange(full.count) % 3 == 1
+    (tmp_path / "some.ply").write_bytes(b"".join(some_rows(FILES / name, mask)))
+    subset = read_splats(tmp_path / "some.ply")
     for field in FIELDS:
-        assert torch.equal(getattr(some, field), getattr(whole, field)[torch.from_numpy(kept)])
-    colours = np.random.default_rng(0).integers(0, 256, (whole.count, 3)).astype(np.uint8)
+        assert torch.equal(getattr(subset, field), getattr(full, field)[torch.from_numpy(mask)])
+    colours = np.random.default_rng(0).integers(0, 256, (full.count, 3)).astype(np.uint8)
     (tmp_path / "coloured.ply").write_bytes(b"".join(recoloured(FILES / name, colours)))
     coloured = read_splats(tmp_path / "coloured.ply")
     terms = torch.from_numpy(constant_terms(colours / 255).astype(np.float32))
     assert coloured.sh is not None and torch.equal(coloured.sh[:, 0], terms)
-    assert torch.equal(coloured.means, whole.means)
-    with pytest.raises(InvalidSplats, match=f"as many as were lifted, got {whole.count}"):
-        list(some_rows(FILES / name, kept[:-1]))
+    assert torch.equal(coloured.means, full.means)
+    with pytest.raises(InvalidSplats, match=f"as many as were lifted, got {full.count}"):
+        list(some_rows(FILES / name, mask[:-1]))
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -163,12 +168,12 @@ def test_damage_of_any_kind_is_splats_or_an_error_of_ours(name: str, tmp_path: P
     content, path, random = (FILES / name).read_bytes(), tmp_path / "damaged", np.random.default_rng(1)
     damaged = [content[:cut] for cut in random.integers(0, len(content), 25)]
     for _ in range(60):
-        changed = bytearray(content)
+        copy = bytearray(content)
         for place in random.integers(0, min(len(content), 2000), 3):
-            changed[place] = random.integers(256)
-        damaged.append(bytes(changed))
-    for one in damaged:
-        path.write_bytes(one)
+            copy[place] = random.integers(256)
+        damaged.append(bytes(copy))
+    for variant in damaged:
+        path.write_bytes(variant)
         try:
             assert read_splats(path).count > 0
         except InvalidSplats as error:
@@ -241,14 +246,14 @@ def test_small_files_that_say_they_are_large_are_refused(kind: str, message: str
 def test_sog_that_says_something_else_is_refused(
     part: str, key: str, value: Any, message: str, tmp_path: Path
 ) -> None:
-    with zipfile.ZipFile(FILES / "degree3.sog") as given, zipfile.ZipFile(tmp_path / "a", "w") as made:
-        for name in given.namelist():
-            content = given.read(name)
+    with zipfile.ZipFile(FILES / "degree3.sog") as archive, zipfile.ZipFile(tmp_path / "a", "w") as output:
+        for name in archive.namelist():
+            content = archive.read(name)
             if name == "meta.json":
                 meta = json.loads(content)
                 (meta[part] if part else meta)[key] = value
                 content = json.dumps(meta).encode() if key else b"{"
-            made.writestr(name, content)
+            output.writestr(name, content)
     with pytest.raises(InvalidSplats, match=message):
         read_splats(tmp_path / "a")
 
@@ -293,11 +298,11 @@ def test_the_frame_that_an_spz_declares_is_its_own(tmp_path: Path) -> None:
     extensions = struct.pack("<III", FRAME_EXTENSION, 4, RDF) + struct.pack("<II3x", 0x12340001, 3)
     place = struct.pack("<I", 32 + len(extensions))
     (tmp_path / "declared.spz").write_bytes(content[:16] + place + content[20:32] + extensions + content[32:])
-    turned, plain = read_splats(tmp_path / "declared.spz"), read_splats(FILES / "degree3.v4.spz")
-    assert torch.equal(turned.means, plain.means * torch.tensor([1.0, -1.0, -1.0]))
-    assert torch.allclose(turned.quats, plain.quats * torch.tensor([1.0, 1.0, -1.0, -1.0]))
-    assert turned.sh is not None and plain.sh is not None
-    assert torch.allclose(turned.sh[:, 1:4], plain.sh[:, 1:4] * torch.tensor([-1.0, -1.0, 1.0])[:, None])
+    actual, stored = read_splats(tmp_path / "declared.spz"), read_splats(FILES / "degree3.v4.spz")
+    assert torch.equal(actual.means, stored.means * torch.tensor([1.0, -1.0, -1.0]))
+    assert torch.allclose(actual.quats, stored.quats * torch.tensor([1.0, 1.0, -1.0, -1.0]))
+    assert actual.sh is not None and stored.sh is not None
+    assert torch.allclose(actual.sh[:, 1:4], stored.sh[:, 1:4] * torch.tensor([-1.0, -1.0, 1.0])[:, None])
 
 
 LETTERS = {"R": (0, 1), "L": (0, -1), "D": (1, 1), "U": (1, -1), "F": (2, 1), "B": (2, -1)}  # axis and sign in RDF
@@ -310,26 +315,26 @@ def test_every_frame_that_an_spz_may_declare_is_turned_by_its_letters(
 ) -> None:
     """Places, covariances and colours from all around are those of the file in the axes that its letters name."""
     content, extension = (FILES / f"degree3.v{version}.spz").read_bytes(), struct.pack("<III", FRAME_EXTENSION, 4, 0)
-    declared = extension[:8] + struct.pack("<I", number)
+    frame_bytes = extension[:8] + struct.pack("<I", number)
     if version == 4:
-        place = struct.pack("<I", 32 + len(declared))
-        content = content[:16] + place + content[20:32] + declared + content[32:]
+        place = struct.pack("<I", 32 + len(frame_bytes))
+        content = content[:16] + place + content[20:32] + frame_bytes + content[32:]
     else:
-        plain = gzip.decompress(content)
-        content = gzip.compress(plain[:14] + b"\x02" + plain[15:] + declared)
+        payload = gzip.decompress(content)
+        content = gzip.compress(payload[:14] + b"\x02" + payload[15:] + frame_bytes)
     (tmp_path / "a.spz").write_bytes(content)
-    found, stored = read_splats(tmp_path / "a.spz"), read_splats(FILES / f"degree3.v{version}.spz")
+    actual, stored = read_splats(tmp_path / "a.spz"), read_splats(FILES / f"degree3.v{version}.spz")
     axes = np.zeros((3, 3))  # from the frame to RDF
     for column, letter in enumerate(FRAMES[number - 1]):
         axis, sign = LETTERS[letter]
         axes[axis, column] = sign
     axes = axes @ np.diag([1.0, -1.0, -1.0])  # from RDF as that is read from RUB, which stands for the stored numbers
-    np.testing.assert_allclose(found.means.numpy(), stored.means.numpy() @ axes.T, atol=1e-5)
-    assert torch.equal(found.log_scales, stored.log_scales)
-    np.testing.assert_allclose(covariances(found), axes @ covariances(stored) @ axes.T, atol=1e-5)
+    np.testing.assert_allclose(actual.means.numpy(), stored.means.numpy() @ axes.T, atol=1e-5)
+    assert torch.equal(actual.log_scales, stored.log_scales)
+    np.testing.assert_allclose(covariances(actual), axes @ covariances(stored) @ axes.T, atol=1e-5)
     directions = np.random.default_rng(0).normal(size=(20, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    np.testing.assert_allclose(radiance(found, directions), radiance(stored, directions @ axes), atol=1e-4)
+    np.testing.assert_allclose(radiance(actual, directions), radiance(stored, directions @ axes), atol=1e-4)
 
 
 def covariances(splats: Splats) -> np.ndarray:
@@ -356,11 +361,11 @@ def test_rotations_of_a_band_turn_what_it_shows(band: int) -> None:
     directions = generator.normal(size=(30, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     terms = generator.normal(size=2 * band + 1)
-    turned = band_values(band, directions) @ band_rotation(band, rotation) @ terms
-    np.testing.assert_allclose(turned, band_values(band, directions @ rotation) @ terms, atol=1e-9)
+    values = band_values(band, directions) @ band_rotation(band, rotation) @ terms
+    np.testing.assert_allclose(values, band_values(band, directions @ rotation) @ terms, atol=1e-9)
     if band < 4:
-        own = _sh_basis(torch.from_numpy(directions), 3)[:, band**2 : (band + 1) ** 2]
-        np.testing.assert_allclose(band_values(band, directions), own, atol=1e-6)
+        expected = _sh_basis(torch.from_numpy(directions), 3)[:, band**2 : (band + 1) ** 2]
+        np.testing.assert_allclose(band_values(band, directions), expected, atol=1e-6)
 
 
 def test_a_frame_beyond_those_is_refused(tmp_path: Path) -> None:
@@ -377,21 +382,21 @@ def trained() -> Splats:
 
 def gsplat_checkpoint(splats: Splats) -> dict[str, Any]:
     assert splats.sh is not None
-    own = {"means": splats.means, "quats": splats.quats, "scales": splats.log_scales}
-    own |= {"opacities": splats.opacity_logits, "sh0": splats.sh[:, :1], "shN": splats.sh[:, 1:]}
-    return {"step": 6999, "splats": {name: torch.nn.Parameter(value) for name, value in own.items()}}
+    tensors = {"means": splats.means, "quats": splats.quats, "scales": splats.log_scales}
+    tensors |= {"opacities": splats.opacity_logits, "sh0": splats.sh[:, :1], "shN": splats.sh[:, 1:]}
+    return {"step": 6999, "splats": {name: torch.nn.Parameter(value) for name, value in tensors.items()}}
 
 
 def nerfstudio_checkpoint(splats: Splats, before: str) -> dict[str, Any]:
     assert splats.sh is not None
-    own = {"means": splats.means, "quats": splats.quats, "scales": splats.log_scales}
-    own |= {"opacities": splats.opacity_logits[:, None], "features_dc": splats.sh[:, 0]}
-    own |= {"features_rest": splats.sh[:, 1:], "other": torch.zeros(1)}
+    tensors = {"means": splats.means, "quats": splats.quats, "scales": splats.log_scales}
+    tensors |= {"opacities": splats.opacity_logits[:, None], "features_dc": splats.sh[:, 0]}
+    tensors |= {"features_rest": splats.sh[:, 1:], "other": torch.zeros(1)}
     rates = {
         "_last_lr": [np.float64(1e-4), np.float32(1e-3)],
         "last_epoch": np.int64(7),
     }  # as its schedulers have them
-    pipeline = {f"{before}{name}": value for name, value in own.items()}
+    pipeline = {f"{before}{name}": value for name, value in tensors.items()}
     return {"step": 1, "pipeline": pipeline, "schedulers": {"means": rates}}
 
 
@@ -400,10 +405,10 @@ def test_checkpoints_of_trainers_are_read_as_tensors(kind: str, tmp_path: Path) 
     splats, path = trained(), tmp_path / "step-000029999.ckpt"
     torch.save(gsplat_checkpoint(splats) if kind == "gsplat" else nerfstudio_checkpoint(splats, kind), path)
     assert format_of(path) is SplatFormat.CHECKPOINT
-    found = read_splats(path)
+    actual = read_splats(path)
     for field in FIELDS:
-        assert torch.equal(getattr(found, field), getattr(splats, field))
-    write_splats(tmp_path / "again.ply", found)
+        assert torch.equal(getattr(actual, field), getattr(splats, field))
+    write_splats(tmp_path / "again.ply", actual)
     assert torch.equal(read_splats(tmp_path / "again.ply").means, splats.means)
 
 
@@ -439,23 +444,23 @@ def test_kernels_of_formats_without_columns_are_3dgs_or_2dgs() -> None:
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_large_files_are_decoded_in_blocks_to_the_same_rows(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = read_splats(FILES / name)
+    expected = read_splats(FILES / name)
     monkeypatch.setattr("liftcore.io.quantised.BLOCK_ROWS", 7)
-    again = read_splats(FILES / name)
+    actual = read_splats(FILES / name)
     for field in FIELDS:
-        assert torch.equal(getattr(again, field), getattr(whole, field))
+        assert torch.equal(getattr(actual, field), getattr(expected, field))
 
 
 @pytest.mark.parametrize("version", [2, 3])
 def test_an_spz_that_we_write_is_read_as_the_file_that_it_is_of(version: int, tmp_path: Path) -> None:
     splats = read_splats(FILES / f"degree3.v{version}.spz")
     (tmp_path / "again.spz").write_bytes(b"".join(spz_blocks(splats)))
-    again = read_splats(tmp_path / "again.spz")
-    turned = again.quats * torch.nn.functional.normalize(splats.quats, dim=1)
-    assert float(turned.sum(dim=1).abs().min()) > 0.99999
-    for field, most in (("means", 1e-6), ("log_scales", 1e-6), ("sh", 1e-6)):
-        assert torch.allclose(getattr(again, field), getattr(splats, field), atol=most), field
-    assert torch.allclose(again.opacity_logits.sigmoid(), splats.opacity_logits.sigmoid(), atol=1e-6)
+    copy = read_splats(tmp_path / "again.spz")
+    products = copy.quats * torch.nn.functional.normalize(splats.quats, dim=1)
+    assert float(products.sum(dim=1).abs().min()) > 0.99999
+    for field, tolerance in (("means", 1e-6), ("log_scales", 1e-6), ("sh", 1e-6)):
+        assert torch.allclose(getattr(copy, field), getattr(splats, field), atol=tolerance), field
+    assert torch.allclose(copy.opacity_logits.sigmoid(), splats.opacity_logits.sigmoid(), atol=1e-6)
 
 
 def test_random_bytes_are_no_splats(tmp_path: Path) -> None:

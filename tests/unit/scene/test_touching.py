@@ -30,16 +30,16 @@ def by_pairs(splats: Splats) -> np.ndarray:
     groups = np.arange(count)
     for j in range(count):
         for k in range(j):
-            apart = means[j] - means[k]
-            distance = np.linalg.norm(apart)
-            line = apart / distance if distance else np.zeros(3)
+            offset = means[j] - means[k]
+            distance = np.linalg.norm(offset)
+            line = offset / distance if distance else np.zeros(3)
             if distance <= REACH * sum(np.linalg.norm(axes[i].T @ line) for i in (j, k)):
                 groups[groups == groups[j]] = groups[k]
     return groups
 
 
-def same_partition(one: np.ndarray, other: np.ndarray) -> bool:
-    return bool(((one[:, None] == one) == (other[:, None] == other)).all())
+def same_partition(a: np.ndarray, b: np.ndarray) -> bool:
+    return bool(((a[:, None] == a) == (b[:, None] == b)).all())
 
 
 @settings(max_examples=60, deadline=None)

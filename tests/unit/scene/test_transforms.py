@@ -43,8 +43,8 @@ def test_opengl_camera_looks_along_its_negative_z(tmp_path: Path) -> None:
     assert camera.fx == pytest.approx(50)
     assert camera.fy == camera.fx
     assert (camera.cx, camera.cy) == (50, 25)
-    ahead = camera.viewmat @ [0, 1, 0, 1]  # below the camera along -z, and above it along y
-    assert np.allclose(ahead, [0, -1, 5, 1])
+    point = camera.viewmat @ [0, 1, 0, 1]  # below the camera along -z, and above it along y
+    assert np.allclose(point, [0, -1, 5, 1])
 
 
 def test_frame_intrinsics_come_before_shared_ones(tmp_path: Path) -> None:
@@ -58,7 +58,7 @@ GOOD_FRAME = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
 SIZED = {"fl_x": 5, "w": 9, "h": 9, "frames": [GOOD_FRAME]}
 
 
-def posed(matrix: Any) -> dict[str, Any]:
+def document_with_pose(matrix: Any) -> dict[str, Any]:
     return {"frames": [{"file_path": "a", "transform_matrix": matrix}]}
 
 
@@ -81,12 +81,12 @@ BAD_TRANSFORMS = [
     ({"fl_x": None, "camera_angle_x": 4}, "an angle"),
     ({"fl_x": 0, "fl_y": 5}, "positive focal"),
     (
-        posed(np.diag([2.0, 2, 2, 1]).tolist()),
+        document_with_pose(np.diag([2.0, 2, 2, 1]).tolist()),
         "camera 'a' pose: expected a proper rotation, got a rotation scaled by 2",
     ),
-    (posed(np.diag([4.0, 2, 1, 1]).tolist()), "expected a proper rotation, got a matrix off by"),
-    (posed([*np.eye(4).tolist()[:3], [1]]), "4x4 matrix as nested lists"),
-    (posed((2 * np.eye(4)).tolist()), "0 0 0 1 as the last row, got 0 0 0 2"),
+    (document_with_pose(np.diag([4.0, 2, 1, 1]).tolist()), "expected a proper rotation, got a matrix off by"),
+    (document_with_pose([*np.eye(4).tolist()[:3], [1]]), "4x4 matrix as nested lists"),
+    (document_with_pose((2 * np.eye(4)).tolist()), "0 0 0 1 as the last row, got 0 0 0 2"),
     ({"distortion_params": [0, 0.02]}, r"the 6 numbers k1, k2, k3, k4, p1, p2, got \[0, 0\.02\]"),
     ({"distortion_params": "k1"}, "a list of the 6 numbers .*, got 'k1'"),
     ({"distortion_params": [0, 0, 0, 0, 0, "x"]}, r"distortion_params\[5\]: expected a finite number, got 'x'"),
@@ -104,17 +104,17 @@ BAD_TRANSFORMS = [
 
 
 PARAMETERS = {"k1": 0.1, "k2": -0.02, "p1": 0.001, "p2": -0.002}
-LISTED = [0.1, -0.02, 0.0, 0.0, 0.001, -0.002]
+DISTORTION_PARAMS = [0.1, -0.02, 0.0, 0.0, 0.001, -0.002]
 BROWN = Brown(k1=0.1, k2=-0.02, p1=0.001, p2=-0.002)
 
 
 @pytest.mark.parametrize(
-    ("shared", "own", "lens"),
+    ("shared", "per_frame", "lens"),
     [
         (PARAMETERS, {}, BROWN),
         ({}, PARAMETERS, BROWN),
         (PARAMETERS, PARAMETERS, BROWN),
-        ({}, {"distortion_params": LISTED, **PARAMETERS}, BROWN),
+        ({}, {"distortion_params": DISTORTION_PARAMS, **PARAMETERS}, BROWN),
         ({"k3": 0.1, "camera_model": "OPENCV"}, {}, Brown(k3=0.1)),
         ({"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k4": 0.01}, {}, Fisheye(k1=0.1, k4=0.01)),
         ({"camera_model": "OPENCV_FISHEYE"}, {}, Fisheye()),
@@ -123,9 +123,9 @@ BROWN = Brown(k1=0.1, k2=-0.02, p1=0.001, p2=-0.002)
     ],
 )
 def test_distortion_of_transforms(
-    shared: dict[str, Any], own: dict[str, Any], lens: Brown | Fisheye | None, tmp_path: Path
+    shared: dict[str, Any], per_frame: dict[str, Any], lens: Brown | Fisheye | None, tmp_path: Path
 ) -> None:
-    document = {"fl_x": 90, "fl_y": 80, "w": 100, "h": 64, **shared, "frames": [{**GOOD_FRAME, **own}]}
+    document = {"fl_x": 90, "fl_y": 80, "w": 100, "h": 64, **shared, "frames": [{**GOOD_FRAME, **per_frame}]}
     [view] = read_cameras(with_json(tmp_path, document)).values()
     assert view.lens == (None if lens is None else Lens(100, 64, 90.0, 80.0, 50.0, 32.0, lens))
 
@@ -189,7 +189,7 @@ def change(path: Path, **changes: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "frame", "paths"),  # a model's folder or a transforms.json; where the run's file lies; what is read
+    ("source", "frame", "paths"),  # a model's folder or a transforms.json; where the run's file lies; what is read
     [
         ("transforms.json", ".", ["", "transforms.json", "zip"]),
         ("transforms_train.json", ".", ["transforms_train.json", "zip"]),
@@ -201,17 +201,17 @@ def change(path: Path, **changes: Any) -> None:
     ],
 )
 def test_cameras_are_moved_as_nerfstudio_moves_them(
-    given: str, frame: str, paths: list[str], run: Path, model: Path, expected: Cameras, tmp_path: Path
+    source: str, frame: str, paths: list[str], run: Path, model: Path, expected: Cameras, tmp_path: Path
 ) -> None:
     scene = tmp_path / "scene"
     for folder in (scene / frame, scene / ".ipynb_checkpoints"):
         folder.mkdir(parents=True)
     shutil.copy(run / "transforms.json", scene / ".ipynb_checkpoints")  # which does not count
     shutil.copy(run / FRAME_FILE, scene / frame)
-    if given.endswith(".json"):
-        shutil.copy(run / "transforms.json", scene / given)
+    if source.endswith(".json"):
+        shutil.copy(run / "transforms.json", scene / source)
     else:
-        shutil.copytree(model, scene / given, dirs_exist_ok=True)
+        shutil.copytree(model, scene / source, dirs_exist_ok=True)
     for path in paths:
         cameras = read_cameras(zipped(scene) if path == "zip" else scene / path)
         assert cameras.frame == FRAME_FILE
@@ -229,7 +229,7 @@ def test_what_was_applied_before_is_not_applied_twice(run: Path, model: Path, ex
     assert_same(read_cameras(run), expected)
     change(run / "transforms.json", applied_scale=None, applied_transform=None)  # of poses that are no model's
     change(run / FRAME_FILE, scale=SCALE, transform=oriented()[:3].tolist())
-    shutil.copytree(model, run / "colmap/sparse/0")  # the transforms.json comes before it, as the frame is told
+    shutil.copytree(model, run / "colmap/sparse/0")  # with a frame, a transforms.json is preferred
     for path in (run, zipped(run)):
         assert_same(read_cameras(path), expected)
 
@@ -299,16 +299,16 @@ def test_frame_of_another_model_of_a_zip_is_refused(run: Path, model: Path, expe
     assert_same(read_cameras(zipped(run)), expected)
 
 
-def test_the_frame_is_told_or_where_to_take_it_from(run: Path, model: Path) -> None:
-    found = inspect_file(run)
-    assert (found["frame"], found["warnings"]) == (FRAME_FILE, [])
-    assert found["bytes"] == sum(path.stat().st_size for path in run.iterdir())
+def test_the_frame_is_reported_or_where_to_take_it_from(run: Path, model: Path) -> None:
+    report = inspect_file(run)
+    assert (report["frame"], report["warnings"]) == (FRAME_FILE, [])
+    assert report["bytes"] == sum(path.stat().st_size for path in run.iterdir())
     (run / FRAME_FILE).unlink()
     for absent in ("ply_file_path", "applied_transform"):  # nerfstudio's own converter writes them, others do not
         change(run / "transforms.json", **{"ply_file_path": "sparse_pc.ply", absent: None})
         for path in (run, run / "transforms.json"):
-            [told] = inspect_file(path)["warnings"]
-            assert "--orientation-method none" in told and f"Put its run's {FRAME_FILE} beside" in told
+            [warning] = inspect_file(path)["warnings"]
+            assert "--orientation-method none" in warning and f"Put its run's {FRAME_FILE} beside" in warning
     shutil.copytree(model, run / "colmap/sparse/0")
     for path in (run, run / "colmap/sparse/0", run / "colmap/sparse/0/cameras.bin", zipped(run)):
         assert any("the COLMAP model was read, and beside it" in text for text in inspect_file(path)["warnings"])
@@ -335,14 +335,14 @@ def test_link_counts_where_it_lies_in_the_lift_and_after(run: Path, expected: Ca
     scene.mkdir()
     (scene / "transforms.json").symlink_to(run / "transforms.json")
     (run / FRAME_FILE).rename(scene / FRAME_FILE)
-    remembered = camera_input(scene / "transforms.json")
-    assert_same(read_cameras(Path(remembered.path)), expected)
+    entry = camera_input(scene / "transforms.json")
+    assert_same(read_cameras(Path(entry.path)), expected)
     change(scene / FRAME_FILE, scale=2 * SCALE)
-    assert camera_input(Path(remembered.path)).sha256 != remembered.sha256
+    assert camera_input(Path(entry.path)).sha256 != entry.sha256
 
 
-@pytest.mark.parametrize(("kind", "said"), [("link", "a broken link"), ("folder", "no regular file")])
-def test_frame_that_is_no_file_is_told(kind: str, said: str, run: Path, model: Path) -> None:
+@pytest.mark.parametrize(("kind", "got"), [("link", "a broken link"), ("folder", "no regular file")])
+def test_frame_that_is_no_file_is_refused(kind: str, got: str, run: Path, model: Path) -> None:
     (run / FRAME_FILE).unlink()
     if kind == "link":
         (run / FRAME_FILE).symlink_to("outputs/nowhere")
@@ -350,19 +350,19 @@ def test_frame_that_is_no_file_is_told(kind: str, said: str, run: Path, model: P
         (run / FRAME_FILE).mkdir()
     shutil.copytree(model, run / "sparse/0")
     for path in (run, run / "transforms.json", run / "sparse/0"):
-        with pytest.raises(InvalidCameras, match=rf"{FRAME_FILE}: expected a file, got {said}; copy the file itself"):
+        with pytest.raises(InvalidCameras, match=rf"{FRAME_FILE}: expected a file, got {got}; copy the file itself"):
             read_cameras(path)
 
 
 def test_frame_beside_a_zip_counts_where_the_zip_has_none(run: Path, expected: Cameras) -> None:
-    beside = run.parent / FRAME_FILE
-    shutil.copy(run / FRAME_FILE, beside)
-    change(beside, scale=5 * SCALE)
+    frame_file = run.parent / FRAME_FILE
+    shutil.copy(run / FRAME_FILE, frame_file)
+    change(frame_file, scale=5 * SCALE)
     assert_same(read_cameras(zipped(run)), expected)
-    (run / FRAME_FILE).rename(beside)
+    (run / FRAME_FILE).rename(frame_file)
     before = camera_input(zipped(run))
     assert_same(read_cameras(zipped(run)), expected)
-    beside.unlink()
+    frame_file.unlink()
     assert camera_input(zipped(run)).sha256 != before.sha256
 
 
@@ -383,8 +383,8 @@ def photo(path: Path, size: tuple[int, int], orientation: int = 1) -> None:
     content = io.BytesIO()
     kind = {"jpg": "JPEG", "jpeg": "JPEG", "png": "PNG", "webp": "WEBP"}[path.suffix[1:].lower()]
     Image.effect_noise(size, 90).convert("RGB").save(content, format=kind, exif=exif)
-    whole = content.getvalue()
-    path.write_bytes(whole if kind == "WEBP" else whole[: len(whole) * 2 // 3])
+    data = content.getvalue()
+    path.write_bytes(data if kind == "WEBP" else data[: len(data) * 2 // 3])
 
 
 def blender(*paths: str) -> dict[str, Any]:
@@ -469,18 +469,18 @@ def test_a_folder_of_train_and_test_reads_train_and_names_the_others(tmp_path: P
     for path in (scene, zipped(scene)):
         cameras = read_cameras(path)
         assert cameras["r_0"].fx == pytest.approx(15)
-        [told] = cameras.warnings
-        assert re.search("transforms_train.json was read, and transforms_test.json, transforms_val.json not", told)
+        [warning] = cameras.warnings
+        assert re.search("transforms_train.json was read, and transforms_test.json, transforms_val.json not", warning)
     assert read_cameras(scene / "transforms_test.json").warnings == ()
 
 
-def exported(cameras: Cameras, path: Path, **own: Any) -> Path:
-    """What ``ns-export cameras`` writes of cameras in the frame of the splats: camera to world, y up and z back."""
+def exported(cameras: Cameras, path: Path, **fields: Any) -> Path:
+    """Write cameras in the frame of the splats as ``ns-export cameras`` does: camera to world, y up and z back."""
     records = []
     for camera in cameras.values():
         pose = np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])
         records.append(
-            {"file_path": f"/data/scene/images_2/{camera.name}.jpg", "transform": pose[:3].tolist(), **own}
+            {"file_path": f"/data/scene/images_2/{camera.name}.jpg", "transform": pose[:3].tolist(), **fields}
         )
     path.write_text(json.dumps(records))
     return path
@@ -493,8 +493,8 @@ def test_an_export_of_nerfstudio_has_poses_of_the_splats_and_intrinsics_of_the_d
     path = exported(Cameras(list(expected.values())[:2]), run / "transforms_train.json")
     exported(Cameras(list(expected.values())[2:]), run / "transforms_eval.json")
     two = Cameras(list(expected.values())[:2])
-    for given in (path, run, zipped(run)):
-        cameras = read_cameras(given)
+    for source in (path, run, zipped(run)):
+        cameras = read_cameras(source)
         assert_same(cameras, two)
         assert all("trains in another frame" not in text for text in cameras.warnings)
     assert any("transforms_eval.json not" in text for text in read_cameras(run).warnings)
@@ -509,8 +509,8 @@ def test_an_export_of_nerfstudio_takes_intrinsics_of_the_colmap_model_beside_it(
 ) -> None:
     shutil.copytree(model, tmp_path / "sparse/0")
     path = exported(expected, tmp_path / "transforms_train.json")
-    for given in (path, tmp_path):
-        assert_same(read_cameras(given), expected)
+    for source in (path, tmp_path):
+        assert_same(read_cameras(source), expected)
     before = camera_input(path)
     (tmp_path / "sparse/0/images.bin").write_bytes((tmp_path / "sparse/0/images.bin").read_bytes() + b"more")
     assert camera_input(path).sha256 != before.sha256
@@ -518,21 +518,21 @@ def test_an_export_of_nerfstudio_takes_intrinsics_of_the_colmap_model_beside_it(
 
 def test_the_frame_of_a_run_does_not_move_its_export_again(run: Path, expected: Cameras) -> None:
     path = exported(expected, run / "transforms_train.json")
-    for given in (path, run, zipped(run)):
-        assert_same(read_cameras(given), expected)
+    for source in (path, run, zipped(run)):
+        assert_same(read_cameras(source), expected)
 
 
 def test_an_export_without_intrinsics_is_refused_as_what_it_is(run: Path, expected: Cameras, tmp_path: Path) -> None:
-    alone = exported(expected, tmp_path / "transforms_train.json")
+    path = exported(expected, tmp_path / "transforms_train.json")
     with pytest.raises(
         InvalidCameras, match=r"export \(ns-export cameras\), which has poses alone; put the transforms"
     ):
-        read_cameras(alone)
-    own = {"fl_x": 50.0, "w": 64, "h": 48}
-    [view, *_] = read_cameras(exported(expected, alone, **own)).values()
+        read_cameras(path)
+    fields = {"fl_x": 50.0, "w": 64, "h": 48}
+    [view, *_] = read_cameras(exported(expected, path, **fields)).values()
     assert (view.fx, view.fy, view.width, view.cx) == (50.0, 50.0, 64, 32.0)
     of_another = {"frames": [{"file_path": "other.jpg", "fl_x": 5, "w": 9, "h": 9}]}
-    exported(expected, alone)
+    exported(expected, path)
     (tmp_path / "transforms.json").write_text(json.dumps(of_another))
     with pytest.raises(InvalidCameras, match="got none of 'frame 1'"):
-        read_cameras(alone)
+        read_cameras(path)

@@ -61,10 +61,10 @@ def test_objects_are_subsets_index_for_index_and_validators_find_nothing(tmp_pat
     expected = labels()
     write_splats(tmp_path / "s.ply", some_splats())
     (tmp_path / "s.usdc").write_bytes(b"".join(labelled(tmp_path / "s.ply", expected, ".usdc")))
-    found = read_labels(tmp_path / "s.usdc")
-    assert {kind: found.document[kind] for kind in expected.document} == expected.document
+    actual = read_labels(tmp_path / "s.usdc")
+    assert {kind: actual.document[kind] for kind in expected.document} == expected.document
     for name, values in expected.columns.items():
-        np.testing.assert_array_equal(found.columns[name], values)
+        np.testing.assert_array_equal(actual.columns[name], values)
     stage = pxr.Usd.Stage.Open(str(tmp_path / "s.usdc"))
     for row in expected.document["instances"]:
         subset = pxr.UsdGeom.Subset.Get(stage, f"/Scene/Splats/instance_{row['instance_id']}")
@@ -83,13 +83,13 @@ def test_objects_as_prims_of_their_own_come_back_row_for_row(kernel: Kernel, suf
     pxr, expected = open_library(), labels()
     write_splats(tmp_path / "s.ply", some_splats(kernel))
     (tmp_path / f"s{suffix}").write_bytes(b"".join(labelled(tmp_path / "s.ply", expected, suffix, prims=True)))
-    found, splats = read_labels(tmp_path / f"s{suffix}"), read_splats(tmp_path / f"s{suffix}")
+    actual, splats = read_labels(tmp_path / f"s{suffix}"), read_splats(tmp_path / f"s{suffix}")
     assert_same(splats, some_splats(kernel))
     np.testing.assert_array_equal(read_places(tmp_path / f"s{suffix}"), splats.positions())
-    assert {kind: found.document[kind] for kind in expected.document} == expected.document
-    assert found.columns.keys() == expected.columns.keys()
+    assert {kind: actual.document[kind] for kind in expected.document} == expected.document
+    assert actual.columns.keys() == expected.columns.keys()
     for name, values in expected.columns.items():
-        np.testing.assert_array_equal(found.columns[name], values)
+        np.testing.assert_array_equal(actual.columns[name], values)
     stage = pxr.Usd.Stage.Open(str(tmp_path / f"s{suffix}"))
     for row in expected.document["instances"]:
         prim = stage.GetPrimAtPath(f"/Scene/instance_{row['instance_id']}")
@@ -124,11 +124,11 @@ def test_stages_of_others_are_turned_and_their_subsets_are_instances(tmp_path: P
     pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.z)
     pxr.UsdGeom.XformCommonAPI(stage.GetPrimAtPath("/Scene")).SetTranslate((1.0, 2.0, 3.0))
     stage.GetRootLayer().Export(str(tmp_path / "t.usda"))
-    found = read_splats(tmp_path / "t.usda")
+    actual = read_splats(tmp_path / "t.usda")
     # What was up (z) is minus y, what was y is to the front.
     turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) @ np.diag([1.0, -1.0, -1.0])
-    assert_same(found, some_splats().transformed(rotation=turn, translation=[1.0, -3.0, 2.0]))
-    assert sorted(np.unique(found.extras["instance_id"], return_counts=True)[1].tolist()) == [13, 13, 14]
+    assert_same(actual, some_splats().transformed(rotation=turn, translation=[1.0, -3.0, 2.0]))
+    assert sorted(np.unique(actual.extras["instance_id"], return_counts=True)[1].tolist()) == [13, 13, 14]
 
 
 @needs_usd

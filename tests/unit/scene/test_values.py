@@ -36,13 +36,13 @@ def arrays(count: int = 3, scales: int = 3) -> dict[str, Any]:
 
 def test_splats_come_of_arrays_of_any_float_type_without_a_copy_of_float32() -> None:
     for dtype in (np.float16, np.float32, np.float64):
-        given: dict[str, Any] = {name: values.numpy().astype(dtype) for name, values in arrays().items()}
-        splats = Splats(**given)
+        columns: dict[str, Any] = {name: values.numpy().astype(dtype) for name, values in arrays().items()}
+        splats = Splats(**columns)
         assert splats.kernel is Kernel.GAUSSIAN_3D
-        for name, values in given.items():
-            found = getattr(splats, name)
-            assert found.dtype == torch.float32 and np.array_equal(found.numpy(), values.astype(np.float32))
-            assert np.shares_memory(found.numpy(), values) is (dtype == np.float32)
+        for name, values in columns.items():
+            tensor = getattr(splats, name)
+            assert tensor.dtype == torch.float32 and np.array_equal(tensor.numpy(), values.astype(np.float32))
+            assert np.shares_memory(tensor.numpy(), values) is (dtype == np.float32)
     means = torch.rand(3, 3, requires_grad=True)
     splats = Splats(**{**arrays(scales=2), "means": means}, kernel="2dgs")
     assert splats.means.data_ptr() == means.data_ptr() and not splats.means.requires_grad
@@ -74,17 +74,17 @@ def test_wrong_arrays_are_refused_by_their_name(name: str, values: Any, message:
 
 
 def test_arrays_of_any_order_and_opacities_in_a_column_are_splats() -> None:
-    given = {name: values.numpy() for name, values in arrays().items()}
-    turned = {
-        "means": given["means"][::-1].copy()[::-1],
-        "quats": np.asfortranarray(given["quats"]),
-        "log_scales": given["log_scales"].astype(">f8"),
-        "opacity_logits": given["opacity_logits"][:, None],
+    columns = {name: values.numpy() for name, values in arrays().items()}
+    variants = {
+        "means": columns["means"][::-1].copy()[::-1],
+        "quats": np.asfortranarray(columns["quats"]),
+        "log_scales": columns["log_scales"].astype(">f8"),
+        "opacity_logits": columns["opacity_logits"][:, None],
     }
-    turned["means"].setflags(write=False)
-    plain, found = Splats(**given), Splats(**turned)
-    for name in given:
-        assert torch.equal(getattr(found, name), getattr(plain, name)), name
+    variants["means"].setflags(write=False)
+    expected, actual = Splats(**columns), Splats(**variants)
+    for name in columns:
+        assert torch.equal(getattr(actual, name), getattr(expected, name)), name
 
 
 @pytest.mark.parametrize("make", [np.asarray, torch.tensor, np.ndarray.tolist])
@@ -92,8 +92,8 @@ def test_cameras_come_of_numpy_torch_or_lists(make: Any) -> None:
     camera = Camera(make(np.eye(4)), make(K), 64, 48)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (50.0, 51.0, 32.0, 24.0)
     assert camera.viewmat.dtype == camera.K.dtype == np.float64 and camera.lens is None
-    moved = replace(camera.replace(cx=31.0), name="moved")
-    assert (moved.name, moved.cx, moved.fx, moved.width) == ("moved", 31.0, 50.0, 64)
+    copy = replace(camera.replace(cx=31.0), name="moved")
+    assert (copy.name, copy.cx, copy.fx, copy.width) == ("moved", 31.0, 50.0, 64)
     wrong: list[tuple[Any, Any, str]] = [
         (np.eye(3), K, "pose: expected a finite 4x4 matrix"),
         (np.eye(4) * 2, K, "pose: expected 0 0 0 1 as the last row"),
@@ -159,17 +159,17 @@ def test_every_view_of_a_rig_keeps_its_folder_in_every_format(kind: str, tmp_pat
 def test_a_view_is_found_by_its_last_part_and_else_its_neighbours_are_named() -> None:
     """Lifts of before name the views of a rig that are alone with their number without its folder."""
 
-    def named(*names: str) -> Cameras:
+    def cameras_of(*names: str) -> Cameras:
         return Cameras([Camera.pinhole(name, 4, 4, 5.0, 5.0, 2.0, 2.0, np.eye(4)) for name in names])
 
-    cameras = named("images/camA/000", "images/camB/000", "images/camA/001")
+    cameras = cameras_of("images/camA/000", "images/camB/000", "images/camA/001")
     assert cameras["001"].name == cameras["camA/001"].name == "images/camA/001"
     for unclear in ("000", "camB/001", "images/camB/001"):
         with pytest.raises(NotFound, match="nearest: images/cam"):
             cameras[unclear]
-    with pytest.raises(NotFound, match="nearest:") as caught:
-        named(*(f"{k:06}" + "x" * 300 for k in range(20)))["000001" + "y" * 494]
-    assert len(str(caught.value)) < 500
+    with pytest.raises(NotFound, match="nearest:") as error:
+        cameras_of(*(f"{k:06}" + "x" * 300 for k in range(20)))["000001" + "y" * 494]
+    assert len(str(error.value)) < 500
 
 
 @pytest.mark.parametrize("kind", ["binary", "text", "transforms", "inria"])
@@ -179,8 +179,8 @@ def test_more_views_than_a_scene_may_have_are_refused_before_they_are_read(
     monkeypatch.setattr("liftcore.scene.cameras.MAX_VIEWS", 2)
     path = write_files(tmp_path / "many", (text_files if kind == "text" else binary_files)())
     if kind == "binary":
-        announced = struct.pack("<Q", 3) + b"\0" * 3 * 73  # nothing that could be read
-        path = write_files(tmp_path / "many", {"images.bin": announced})
+        content = struct.pack("<Q", 3) + b"\0" * 3 * 73  # nothing that could be read
+        path = write_files(tmp_path / "many", {"images.bin": content})
     elif kind == "transforms":
         path = with_json(tmp_path, {"frames": [{}] * 3})
     elif kind == "inria":
@@ -223,7 +223,7 @@ def test_names_pair_as_they_are_or_by_their_last_part_where_it_is_one_of_a_kind(
 
 
 @pytest.mark.parametrize(
-    ("views", "cameras", "how"),
+    ("views", "cameras", "difference"),
     [
         (["img_1", "img_2"], ["IMG_1", "IMG_2"], "capital letters"),
         (["frame_1", "frame_2"], ["frame_0001", "frame_0002"], "leading zeros"),
@@ -234,6 +234,6 @@ def test_names_pair_as_they_are_or_by_their_last_part_where_it_is_one_of_a_kind(
         (["left", "right"], ["IMG_1", "IMG_2"], "a view is named after its image"),
     ],
 )
-def test_names_that_do_not_pair_say_how_they_differ(views: list[str], cameras: list[str], how: str) -> None:
-    with pytest.raises(InvalidFeatures, match=f"none in common; .*{how}"):
+def test_names_that_do_not_pair_say_how_they_differ(views: list[str], cameras: list[str], difference: str) -> None:
+    with pytest.raises(InvalidFeatures, match=f"none in common; .*{difference}"):
         require_pairs(views, cameras)

@@ -1,4 +1,4 @@
-"""Which way is up and how long a unit is: known where a file says it, given, carried along, and read back."""
+"""The up direction and the unit of length of a scene: read from files, set by hand, transformed and stored."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ def frames(turn: np.ndarray) -> list[dict[str, Any]]:
     return poses
 
 
-def nerfstudio(folder: Path, turn: np.ndarray, **more: Any) -> Path:
+def nerfstudio(folder: Path, turn: np.ndarray, **fields: Any) -> Path:
     folder.mkdir(exist_ok=True)
-    document = {"w": 64, "h": 48, "fl_x": 50, "frames": frames(turn), **more}
+    document = {"w": 64, "h": 48, "fl_x": 50, "frames": frames(turn), **fields}
     (folder / "transforms.json").write_text(json.dumps(document))
     return folder / "transforms.json"
 
@@ -50,22 +50,22 @@ TIPPED = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # z to y
 
 def test_nerfstudio_says_that_z_is_up_where_its_cameras_stand_so(tmp_path: Path) -> None:
     applied = {"applied_transform": np.eye(4)[:3].tolist(), "applied_scale": 2.0}
-    own = lc.read_cameras(nerfstudio(tmp_path, np.eye(3), **applied))
-    assert own.world == WorldFrame(up=(0, 0, 1)), "an applied scale is a ratio, and no length"
+    cameras = lc.read_cameras(nerfstudio(tmp_path, np.eye(3), **applied))
+    assert cameras.world == WorldFrame(up=(0, 0, 1)), "an applied scale is a ratio, and no length"
     assert lc.read_cameras(nerfstudio(tmp_path, TIPPED, **applied)).world == UNKNOWN
     assert lc.read_cameras(nerfstudio(tmp_path, np.eye(3))).world == UNKNOWN, "another program's has no convention"
-    moved = {"transform": np.column_stack([TIPPED.T, np.zeros(3)]).tolist(), "scale": 0.5}
-    (tmp_path / FRAME_FILE).write_text(json.dumps(moved))
+    frame = {"transform": np.column_stack([TIPPED.T, np.zeros(3)]).tolist(), "scale": 0.5}
+    (tmp_path / FRAME_FILE).write_text(json.dumps(frame))
     assert lc.read_cameras(nerfstudio(tmp_path, TIPPED)).world == WorldFrame(up=(0, 0, 1))
 
 
 def test_a_frame_moves_with_its_scene() -> None:
     move: dict[str, Any] = {"scale": 4.0, "rotation": TIPPED}
     splats = replace(some_splats(), world=WorldFrame(up=(0, 0, 1), metres_per_unit=2))
-    moved = WorldFrame(up=(0, -1, 0), metres_per_unit=0.5)
-    assert splats.transformed(**move).world == moved and splats[:3].world == splats.world
+    expected = WorldFrame(up=(0, -1, 0), metres_per_unit=0.5)
+    assert splats.transformed(**move).world == expected and splats[:3].world == splats.world
     cameras = lc.Cameras([lc.Camera.pinhole("a", 8, 8, 8, 8, 4, 4, np.eye(4))], world=splats.world)
-    assert cameras.transformed(**move).world == moved
+    assert cameras.transformed(**move).world == expected
 
 
 @pytest.mark.parametrize("world", WORLDS, ids=repr)
@@ -74,10 +74,10 @@ def test_a_file_has_its_frame_and_its_splats_as_they_were(world: WorldFrame, suf
     for origin in ((0.0, 0.0, 0.0), (5e5, -2e4, 300.0)):
         splats = replace(some_splats(), world=world, origin=origin)
         write_splats(tmp_path / f"s{suffix}", splats)
-        found = read_splats(tmp_path / f"s{suffix}")
-        assert found.world == world
-        np.testing.assert_allclose(found.positions(), splats.positions(), rtol=1e-12, atol=1e-6)
-        assert_same(replace(found, origin=splats.origin, means=splats.means), splats)
+        copy = read_splats(tmp_path / f"s{suffix}")
+        assert copy.world == world
+        np.testing.assert_allclose(copy.positions(), splats.positions(), rtol=1e-12, atol=1e-6)
+        assert_same(replace(copy, origin=splats.origin, means=splats.means), splats)
 
 
 @pytest.mark.parametrize("world", WORLDS, ids=repr)
@@ -85,10 +85,10 @@ def test_other_readers_of_gltf_see_metres_with_y_up(world: WorldFrame, tmp_path:
     """By the format alone, without what our file says of itself."""
     document, binary = parts_of(write(tmp_path / "s.glb", replace(some_splats(), world=world)))
     del document["asset"]["extras"]
-    found = read_splats(join(tmp_path / "t.glb", document, binary))
-    assert found.world == WorldFrame(up=(0, -1, 0), metres_per_unit=1)
+    actual = read_splats(join(tmp_path / "t.glb", document, binary))
+    assert actual.world == WorldFrame(up=(0, -1, 0), metres_per_unit=1)
     turn = np.eye(3) if world.up is None else shortest_turn(np.array(world.up), np.array([0, -1.0, 0]))
-    assert_same(found, some_splats().transformed(scale=world.metres_per_unit or 1.0, rotation=turn))
+    assert_same(actual, some_splats().transformed(scale=world.metres_per_unit or 1.0, rotation=turn))
 
 
 def shortest_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -113,10 +113,10 @@ def test_usd_has_the_metadata_of_the_stage_and_says_only_what_others_wrote(tmp_p
     assert pxr.UsdGeom.GetStageMetersPerUnit(stage) == 0.25 and pxr.UsdGeom.GetStageUpAxis(stage) == "Y"
     stage.GetRootLayer().ClearCustomLayerData()
     stage.GetRootLayer().Export(str(tmp_path / "other.usdc"))
-    found = read_splats(tmp_path / "other.usdc")
-    assert found.world == WorldFrame(up=(0, -1, 0), metres_per_unit=0.25)
+    actual = read_splats(tmp_path / "other.usdc")
+    assert actual.world == WorldFrame(up=(0, -1, 0), metres_per_unit=0.25)
     assert_same(
-        found, some_splats().transformed(rotation=shortest_turn(np.array(SIDEWAYS.up), np.array([0, -1.0, 0])))
+        actual, some_splats().transformed(rotation=shortest_turn(np.array(SIDEWAYS.up), np.array([0, -1.0, 0])))
     )
     for name in ("upAxis", "metersPerUnit"):
         stage.ClearMetadata(name)
@@ -127,11 +127,11 @@ def test_usd_has_the_metadata_of_the_stage_and_says_only_what_others_wrote(tmp_p
 @pytest.mark.parametrize("suffix", [".glb", ".spz", pytest.param(".usdz", marks=needs_usd)])
 def test_labels_bring_their_frame_along(suffix: str, tmp_path: Path) -> None:
     write_splats(tmp_path / "s.ply", some_splats())
-    made = labels()
-    made.document["world"] = SIDEWAYS.model_dump(mode="json")
-    (tmp_path / f"o{suffix}").write_bytes(b"".join(labelled(tmp_path / "s.ply", made, suffix)))
-    found = read_labels(tmp_path / f"o{suffix}").document["world"]
-    assert WorldFrame.model_validate(found) == SIDEWAYS
+    label_table = labels()
+    label_table.document["world"] = SIDEWAYS.model_dump(mode="json")
+    (tmp_path / f"o{suffix}").write_bytes(b"".join(labelled(tmp_path / "s.ply", label_table, suffix)))
+    world = read_labels(tmp_path / f"o{suffix}").document["world"]
+    assert WorldFrame.model_validate(world) == SIDEWAYS
     for colour in (True, False):
         splats = read_splats(tmp_path / f"o{suffix}", colour=colour)
         assert splats.world == SIDEWAYS
@@ -146,15 +146,15 @@ WRONG: list[dict[str, Any]] = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("given", WRONG, ids=str)
-def test_what_is_no_direction_or_length_is_refused_by_its_name(given: dict[str, Any]) -> None:
-    with pytest.raises(InvalidInput, match=f"^{list(given)[-1]}.*: expected"):
-        WorldFrame(**given)
+@pytest.mark.parametrize("fields", WRONG, ids=str)
+def test_what_is_no_direction_or_length_is_refused_by_its_name(fields: dict[str, Any]) -> None:
+    with pytest.raises(InvalidInput, match=f"^{list(fields)[-1]}.*: expected"):
+        WorldFrame(**fields)
 
 
 def test_a_known_distance_gives_the_length_of_a_unit() -> None:
-    known: Any = {"between": ((0, 0, 0), (0, 3, 4)), "metres": 2}
-    assert WorldFrame(distance=known) == WorldFrame(metres_per_unit=0.4)
+    distance: Any = {"between": ((0, 0, 0), (0, 3, 4)), "metres": 2}
+    assert WorldFrame(distance=distance) == WorldFrame(metres_per_unit=0.4)
 
 
 def test_a_lift_knows_its_frame_and_lifts_of_before_know_none(tmp_path: Path) -> None:
@@ -167,9 +167,9 @@ def test_a_lift_knows_its_frame_and_lifts_of_before_know_none(tmp_path: Path) ->
     lift = lc.lift(splats, cameras, {f"v{k}": observed(2, k) for k in range(2)}, preset="row-sum", progress=False)
     assert lift.metadata.world == WorldFrame(up=(0, 0, 1), metres_per_unit=2), "splats come before cameras"
     lift.with_world(WorldFrame(up=(0, -1, 0))).save(tmp_path / "l.safetensors")
-    opened = open_lift(tmp_path / "l.safetensors")
-    assert opened.metadata.world == WorldFrame(up=(0, -1, 0), metres_per_unit=2)
-    assert opened.transformed(scale=2.0).metadata.world == WorldFrame(up=(0, -1, 0), metres_per_unit=1)
-    told = opened.metadata.model_dump()
-    del told["world"]
-    assert LiftMetadata(**told).world == UNKNOWN
+    copy = open_lift(tmp_path / "l.safetensors")
+    assert copy.metadata.world == WorldFrame(up=(0, -1, 0), metres_per_unit=2)
+    assert copy.transformed(scale=2.0).metadata.world == WorldFrame(up=(0, -1, 0), metres_per_unit=1)
+    fields = copy.metadata.model_dump()
+    del fields["world"]
+    assert LiftMetadata(**fields).world == UNKNOWN

@@ -31,16 +31,16 @@ def test_columns_are_properties_that_other_programs_read(tmp_path: Path) -> None
     assert [table.dtype[name].str for name in ("object", "class_id", "chosen", "score", "weight")] == [
         "<i4", "<i4", "|u1", "<f4", "<f8",
     ]  # fmt: skip
-    again = lc.read_splats(tmp_path / "s.ply")
-    assert torch.equal(again.means, splats.means) and set(again.extras) >= set(COLUMNS)
+    copy = lc.read_splats(tmp_path / "s.ply")
+    assert torch.equal(copy.means, splats.means) and set(copy.extras) >= set(COLUMNS)
 
 
 def test_columns_of_a_file_that_was_read_stay_and_one_of_the_same_name_is_replaced(tmp_path: Path) -> None:
     lc.write_splats(tmp_path / "s.ply", random_splats(3), {"mask": np.arange(P), "score": np.zeros(P, np.float32)})
-    again = lc.read_splats(str(tmp_path / "s.ply"))
-    lc.write_splats(str(tmp_path / "t.ply"), again[::2], {"score": np.arange(0, P, 2)})
-    found = lc.read_splats(tmp_path / "t.ply").extras
-    assert found["mask"].tolist() == found["score"].tolist() == list(range(0, P, 2))
+    copy = lc.read_splats(str(tmp_path / "s.ply"))
+    lc.write_splats(str(tmp_path / "t.ply"), copy[::2], {"score": np.arange(0, P, 2)})
+    extras = lc.read_splats(tmp_path / "t.ply").extras
+    assert extras["mask"].tolist() == extras["score"].tolist() == list(range(0, P, 2))
 
 
 @pytest.mark.parametrize("suffix", [".splat", ".spz", ".glb"])
@@ -53,9 +53,9 @@ def test_the_suffix_names_the_format(suffix: str, tmp_path: Path) -> None:
             lc.write_splats(path, random_splats(3), COLUMNS)
         return
     lc.write_splats(path, random_splats(3), COLUMNS)
-    found = lc.read_splats(path).extras
+    extras = lc.read_splats(path).extras
     for name, values in COLUMNS.items():
-        np.testing.assert_allclose(found[name], np.asarray(values).reshape(P), rtol=1e-6)
+        np.testing.assert_allclose(extras[name], np.asarray(values).reshape(P), rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -29,11 +29,11 @@ def test_overlapping_masks_lift_as_the_sum_of_what_each_says() -> None:
     splats, camera = random_splats(1), random_camera(1)
     rng = np.random.default_rng(0)
     masks = rng.random((5, 9, 11)) < 0.4
-    both = lc.Regions.from_masks(masks, rng.normal(size=(5, 6)))
-    W = lc.region_weights(splats, {"v0": camera}, {"v0": both}, "row-sum").matrix(splats.count)
+    regions = lc.Regions.from_masks(masks, rng.normal(size=(5, 6)))
+    W = lc.region_weights(splats, {"v0": camera}, {"v0": regions}, "row-sum").matrix(splats.count)
     for number in range(5):
-        alone = lc.Regions.from_masks(masks[number : number + 1], np.ones((1, 6)))
-        column = lc.region_weights(splats, {"v0": camera}, {"v0": alone}, "row-sum").matrix(splats.count)
+        single = lc.Regions.from_masks(masks[number : number + 1], np.ones((1, 6)))
+        column = lc.region_weights(splats, {"v0": camera}, {"v0": single}, "row-sum").matrix(splats.count)
         np.testing.assert_allclose(W[:, [number]].toarray(), column.toarray(), rtol=1e-6)
 
 

@@ -33,18 +33,18 @@ def scene() -> tuple[lc.Splats, lc.Cameras, lc.LiftResult]:
 def test_rows_of_a_lift_are_its_columns_and_answer_as_those_of_the_whole(scene, tmp_path: Path) -> None:
     splats, _, result = scene
     keep = splats.means[:, 0] > -0.2
-    some, whole = result[keep], result
+    subset, full = result[keep], result
     for name in ("features", "total_weight", "agreement", "seen", "confidence"):
-        assert torch.equal(getattr(some, name), getattr(whole, name)[keep]), name
-    assert len(some) == len(splats[keep]) == int(keep.sum())
-    answer = some.query(np.eye(1, 6), splats=splats[keep], threshold=0.5)
+        assert torch.equal(getattr(subset, name), getattr(full, name)[keep]), name
+    assert len(subset) == len(splats[keep]) == int(keep.sum())
+    answer = subset.query(np.eye(1, 6), splats=splats[keep], threshold=0.5)
     np.testing.assert_array_equal(
-        answer.splats, np.asarray(whole.query(np.eye(1, 6), threshold=0.5).splats)[keep.numpy()]
+        answer.splats, np.asarray(full.query(np.eye(1, 6), threshold=0.5).splats)[keep.numpy()]
     )
-    some.save(tmp_path / "some.lift.safetensors")
-    again = lc.load_lift(tmp_path / "some.lift.safetensors")
-    assert torch.equal(again.features, some.features) and again.diagnostics["cropped_from"] == 300
-    assert again[::2].diagnostics["cropped_from"] == 300 and again.metadata.splats.path == ""
+    subset.save(tmp_path / "some.lift.safetensors")
+    copy = lc.load_lift(tmp_path / "some.lift.safetensors")
+    assert torch.equal(copy.features, subset.features) and copy.diagnostics["cropped_from"] == 300
+    assert copy[::2].diagnostics["cropped_from"] == 300 and copy.metadata.splats.path == ""
 
 
 def test_objects_and_clusters_without_splats_go_and_the_others_are_numbered_anew(scene) -> None:
@@ -52,28 +52,28 @@ def test_objects_and_clusters_without_splats_go_and_the_others_are_numbered_anew
     assert result.object is not None and result.object_views is not None and len(result.object_views) >= 2
     last = len(result.object_views) - 1
     for labels, table in (("object", "object_views"), ("cluster", "cluster_features")):
-        own = getattr(result, labels)
-        some = result[own != 0]
-        numbers = torch.unique(getattr(some, labels))
-        assert numbers[numbers >= 0].tolist() == list(range(len(getattr(some, table))))
-        kept = own[own != 0]
-        mapped = getattr(result, table)[kept[kept >= 0].long()]
-        assert torch.equal(mapped, getattr(some, table)[getattr(some, labels)[kept >= 0].long()])
-    alone = result.object == last
-    assert len(result[alone].objects(splats[alone]).objects) == 1
+        row_labels = getattr(result, labels)
+        subset = result[row_labels != 0]
+        numbers = torch.unique(getattr(subset, labels))
+        assert numbers[numbers >= 0].tolist() == list(range(len(getattr(subset, table))))
+        subset_labels = row_labels[row_labels != 0]
+        mapped = getattr(result, table)[subset_labels[subset_labels >= 0].long()]
+        assert torch.equal(mapped, getattr(subset, table)[getattr(subset, labels)[subset_labels >= 0].long()])
+    mask = result.object == last
+    assert len(result[mask].objects(splats[mask]).objects) == 1
 
 
 def test_a_lift_moves_with_its_splats(scene) -> None:
     splats, _, result = scene
-    moved = result.transformed(**MOVE)
-    assert torch.equal(moved.features, result.features) and moved.metadata.poses == ""
-    found = moved.query(np.eye(1, 6), splats=splats.transformed(**MOVE))
-    assert np.array_equal(found.splats, result.query(np.eye(1, 6), splats=splats).splats)
+    transformed = result.transformed(**MOVE)
+    assert torch.equal(transformed.features, result.features) and transformed.metadata.poses == ""
+    answer = transformed.query(np.eye(1, 6), splats=splats.transformed(**MOVE))
+    assert np.array_equal(answer.splats, result.query(np.eye(1, 6), splats=splats).splats)
     with pytest.raises(lc.InvalidSplats, match=r"row for row, got others: .*result\.transformed"):
-        moved.query(np.eye(1, 6), splats=splats)
+        transformed.query(np.eye(1, 6), splats=splats)
 
 
-OTHERS: dict[str, Callable[[lc.Splats], lc.Splats]] = {
+CHANGES: dict[str, Callable[[lc.Splats], lc.Splats]] = {
     "in another order": lambda splats: splats[::-1],
     "moved": lambda splats: splats.transformed(translation=[0.5, 0, 0]),
     "turned": lambda splats: splats.transformed(rotation=[0.9, 0.1, 0, 0]),
@@ -82,14 +82,14 @@ OTHERS: dict[str, Callable[[lc.Splats], lc.Splats]] = {
 }
 
 
-@pytest.mark.parametrize("kind", OTHERS)
+@pytest.mark.parametrize("kind", CHANGES)
 def test_splats_that_are_not_those_of_the_lift_are_refused(scene, kind: str) -> None:
     splats, _, result = scene
-    for own, lift in ((OTHERS[kind](splats), result), (OTHERS[kind](splats)[:200], result[:200])):
+    for other, lift in ((CHANGES[kind](splats), result), (CHANGES[kind](splats)[:200], result[:200])):
         with pytest.raises(lc.InvalidSplats, match=r"splats: expected the .* Splats that were lifted, row for row"):
-            lift.query(np.eye(1, 6), splats=own)
+            lift.query(np.eye(1, 6), splats=other)
         with pytest.raises(lc.InvalidSplats, match="row for row"):
-            lift.objects(own)
+            lift.objects(other)
 
 
 def test_splats_of_a_quantised_copy_are_those_of_the_lift(scene) -> None:
@@ -103,12 +103,12 @@ def test_lift_of_files_knows_its_splats_in_memory(tmp_path: Path) -> None:
     loaded = lc.read_splats(splats)
     result = lc.lift(loaded, lc.read_cameras(cameras), lc.read_features(pack), preset="row-sum")
     result.save(tmp_path / "lift.safetensors")
-    again = lc.load_lift(tmp_path / "lift.safetensors")
-    again.query(np.eye(1, 6), splats=loaded)
+    copy = lc.load_lift(tmp_path / "lift.safetensors")
+    copy.query(np.eye(1, 6), splats=loaded)
     with pytest.raises(lc.InvalidSplats, match="row for row"):
-        again.query(np.eye(1, 6), splats=loaded[::-1])
+        copy.query(np.eye(1, 6), splats=loaded[::-1])
     with pytest.raises(lc.InvalidSplats, match=r"got 49 splats; crop a lift as its splats"):
-        again.query(np.eye(1, 6), splats=loaded[1:])
+        copy.query(np.eye(1, 6), splats=loaded[1:])
 
 
 @pytest.mark.parametrize("digest", ["0" * 64, "", "**x", "../../etc/*"])
