@@ -1,4 +1,4 @@
-"""Blending eight pixels, by itself: what the cut-offs do on their edges, and with numbers that are none."""
+"""Blending of eight pixels in isolation: the cut-offs at their limits, and with NaN and infinity."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ def blended(state, shape, fade):
 
 
 def active(floor: float = ALPHA_FLOOR, cap: float = CAP, transmittance: float = 1.0) -> np.ndarray:
-    """A tile's state with so much transmittance on the first segment."""
+    """Return a tile's state with this transmittance on the first segment."""
     state = new_state(floor, cap, STOP)
     state[TRANSMITTANCE : TRANSMITTANCE + LANES] = transmittance
     return state
 
 
 def weights_of(state: np.ndarray, shape: GaussianSegment, opacity: float) -> np.ndarray:
-    """The weights of a splat on the first segment; its transmittance moves on."""
+    """Return the weights of a splat on the first segment, and update its transmittance."""
     blended(state, shape, F(-math.log2(opacity)))
     return state[WEIGHTS : WEIGHTS + LANES].copy()
 

@@ -91,13 +91,13 @@ def as_bytes(write: Callable[[Path], object]) -> bytes:
 
 
 def whole_pack(path: Path) -> list[ViewFeatures]:
-    """Every view of a pack."""
+    """Read every view of a pack."""
     packs = read_features(path)
     return [packs[view] for view in packs.views]
 
 
 def whole_model(path: Path) -> Cameras:
-    """The cameras of the folder that a file lies in."""
+    """Read the cameras of the folder of a file."""
     return read_cameras(path.parent)
 
 

@@ -1,4 +1,4 @@
-"""An anchor outside of this project: gsplat's own torch functions project as ours do, on random scenes.
+"""A reference outside of this project: gsplat's torch functions give the same projection, on random scenes.
 
 gsplat's wheel is pure Python and imports on a CPU; its CUDA kernels are not needed for this.
 """
@@ -36,7 +36,7 @@ def of_gsplat(splats: Splats, camera: Camera) -> dict[str, np.ndarray]:
 
 
 def centres(camera: Camera) -> np.ndarray:
-    """[H * W, 2] px, of the pixels."""
+    """Return the centres of the pixels, [H * W, 2] px."""
     y, x = np.mgrid[: camera.height, : camera.width]
     return np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
 

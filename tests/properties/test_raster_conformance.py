@@ -1,4 +1,4 @@
-"""Every raster backend is held to the dense float64 oracle: tight inside, a counted band at the cut-offs."""
+"""Raster backends compared with the dense float64 reference: close inside, a counted band at the cut-offs."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ every_footprint = pytest.mark.parametrize("footprint", FOOTPRINTS)
 def draw_case(
     data: st.DataObject, footprint: str, backend: Backend, *, strided: bool = False
 ) -> tuple[Splats, Camera, ViewFeatures, CompositingParams]:
-    """A scene of the kernel, a view, what it observes, and a walk, over some of its pixels if asked."""
+    """Draw a scene of the kernel, a view with its features, and parameters, with a stride if ``strided``."""
     kernel, antialiased = FOOTPRINTS[footprint]
     splats, camera, observation = data.draw(scenes(kernel, backend.splats, backend.size))
     params = replace(data.draw(st.sampled_from(PARAMS)), antialiased=antialiased)
@@ -82,7 +82,7 @@ def draw_case(
 
 
 def seeded(footprint: str, seed: int, count: int) -> tuple[Splats, CompositingParams]:
-    """A random scene of the kernel, and its plain walk."""
+    """Return a random scene of the footprint, and its parameters."""
     kernel, antialiased = FOOTPRINTS[footprint]
     return random_splats(seed, count, kernel=kernel), CompositingParams(antialiased=antialiased)
 
@@ -154,7 +154,7 @@ def test_every_weighting_equals_the_oracle_and_few_rays_are_too_close_to_call(ba
 
 
 def test_of_equal_weights_the_nearest_counts():
-    """Behind an alpha of 1/4, an alpha of 1/3 weighs 1/4 too; some float near log 1/2 makes it so to the bit."""
+    """Behind an alpha of 1/4, an alpha of 1/3 also weighs 1/4; some float near log 1/2 makes both bitwise equal."""
     camera = random_camera(0, 9, 9).replace(cx=4.5, cy=4.5, fx=9.0, fy=9.0, viewmat=np.eye(4))
     means, scales = torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, 2.0]]), torch.ones(2, 3)  # the second is the nearer
 

@@ -1,4 +1,4 @@
-"""A lift in blocks is the lift: the same bits where its views are one group, whoever does which piece, and when."""
+"""A lift in blocks equals the lift: bitwise identical with one group of views, in any order and on any worker."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ VIEWS = 10  # two pieces
 
 
 class Shuffled(LocalEngine):
-    """Does pieces in any order, some of them twice."""
+    """An engine that runs pieces in any order, some of them twice."""
 
     def run(self, work: Any, job: Any, pieces: int) -> Iterator[int]:
         order = np.random.default_rng(pieces).permutation(pieces).tolist()
@@ -44,7 +44,7 @@ class Shuffled(LocalEngine):
 
 
 class Twice(LocalEngine):
-    """Has each piece done by two workers at once, as a cluster may that believes one of them dead."""
+    """An engine that runs each piece on two workers at once, as a cluster may that takes one for dead."""
 
     def run(self, work: Any, job: Any, pieces: int) -> Iterator[int]:
         with ThreadPoolExecutor(2) as pool:
@@ -56,7 +56,7 @@ class Twice(LocalEngine):
 
 
 def halves_and_quarters(camera: lc.Camera, rng: np.random.Generator) -> np.ndarray:
-    """[2, 12, 16] i32: the halves of the plane z = 0 that a camera sees and, on another level, its quarters.
+    """Return labels [2, 12, 16] i32: halves of the plane z = 0 as a camera sees it and, on another level, quarters.
 
     Some pixels are astray or without. Views agree on what is one thing, and on what its parts are.
     """
@@ -74,7 +74,7 @@ def halves_and_quarters(camera: lc.Camera, rng: np.random.Generator) -> np.ndarr
 
 @pytest.fixture(scope="module")
 def scene() -> dict[str, Any]:
-    """Splats of which a view sees a part, in three blocks, and views of regions and of grids."""
+    """Return splats that a view sees in part, in three blocks, and views of regions and of grids."""
     rng = np.random.default_rng(1)
     splats = random_splats(3, COUNT, spread=6.0)
     splats = replace(splats, means=splats.means * torch.tensor([1.0, 1.0, 0.05]))  # a sheet: views see the same
@@ -107,7 +107,7 @@ def assert_same(left: lc.LiftResult, right: lc.LiftResult) -> None:
 
 
 def assert_same_metadata(left: lc.LiftResult, right: lc.LiftResult) -> None:
-    """Compare all that lifts remember, the plan too; but for the seconds."""
+    """Compare the metadata of lifts, including the plan but without timings."""
     first, second = (lift.metadata.model_dump(exclude={"timings"}) for lift in (left, right))
     assert first == second
 

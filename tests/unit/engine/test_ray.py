@@ -1,4 +1,4 @@
-"""Ray's workers lift to the same bits as one process, also where a worker or a node dies in the middle."""
+"""A lift on Ray's workers is bitwise identical to one process, also where a worker or a node dies."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ with_ray = pytest.mark.filterwarnings("ignore")  # Ray's own
 
 @contextmanager
 def loopback_alone() -> Iterator[None]:
-    """A network namespace with nothing but loopback, for this thread and what it starts, where that is allowed.
+    """Enter a network namespace with loopback only, for this thread and its children, where that is allowed.
 
-    Where it is not (it takes root) the cluster's token is what keeps others out.
+    Without it (it requires root) only the cluster's token keeps other processes out.
     """
     system = ctypes.CDLL(None, use_errno=True)
     with Path("/proc/thread-self/ns/net").open() as before:
@@ -54,7 +54,7 @@ def loopback_alone() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
-    """Two nodes of one core each, which ask for a token; a third for tests that take one away."""
+    """Start two nodes of one core each, which require a token; tests that remove a node add a third."""
     with loopback_alone():
         yield from running_cluster()
 
@@ -82,7 +82,7 @@ def stored(scene: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> d
 
 
 class Deadly(RayEngine):
-    """Its workers die of some pieces, once each."""
+    """An engine whose workers die in some pieces, once each."""
 
     def run(self, work: Any, job: Any, pieces: int) -> Iterator[int]:
         def deadly(job: Any, piece: int, threads: int | None) -> None:
@@ -125,7 +125,7 @@ def _full(job: Any, piece: int, threads: int | None) -> None:
 
 
 def _broken(views: Any) -> Any:
-    """A view of another number of channels than its header lets one expect, which only its reader notices."""
+    """Return views that declare one channel more than their packs have, which only a reader notices."""
     return replace(views, channels=views.channels + 1, paths=())
 
 

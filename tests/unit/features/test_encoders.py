@@ -1,4 +1,4 @@
-"""Photos become grids of whole patches; encoders give what their libraries compute, where they look."""
+"""Photos become grids of whole patches; encoders give the values of their libraries, at the right cells."""
 
 from __future__ import annotations
 
@@ -299,7 +299,7 @@ def small_resnet() -> Any:
 
 
 class Holder(nn.Module):
-    """As much of a CLIP model as an image encoder needs."""
+    """The part of a CLIP model that an image encoder uses."""
 
     def __init__(self, visual: Any) -> None:
         super().__init__()
@@ -381,7 +381,7 @@ def test_a_change_in_a_patch_moves_its_own_cell_most(kind: str) -> None:
 
 
 def test_cells_of_a_resnet_are_brought_back_to_their_patches() -> None:
-    """Without it they look 15.5 pixels up and left, so a patch moves the cell below and right of it as well."""
+    """Without this shift cells are 15.5 pixels off, and a patch also changes the cell below and right of it."""
     resnet, images = backbone("resnet18"), torch.randn(4, 3, 5 * 32, 5 * 32)
     spotted = images.clone()
     spotted[..., 64:96, 64:96] += torch.randn(4, 3, 32, 32)

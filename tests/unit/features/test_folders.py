@@ -1,4 +1,4 @@
-"""Field formats become packs with nothing lost; damaged or dangerous files are refused by name."""
+"""Formats of other projects become packs without loss; damaged or dangerous files are refused by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""JSON documents of masks by phrase: what they mask is read, and what they do not decide is left without a label."""
+"""JSON documents of masks by phrase: masks are read, and undecided pixels have no label."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def rle(mask: np.ndarray, *, as_string: bool = True) -> dict[str, Any]:
 
 
 def coco(*masks: tuple[int, int, Any], images: int = 2, **entries: dict[str, Any]) -> dict[str, Any]:
-    """A data set of so many images, with (image, category, segmentation) annotated, and more for images by name."""
+    """Return a data set of images, annotated with (image, category, segmentation); entries add fields to an image."""
     image_records = [{"id": k, "file_name": f"{k}.jpg", "height": HEIGHT, "width": WIDTH} for k in range(images)]
     for image in image_records:
         image.update(entries.get(f"image_{image['id']}", {}))
@@ -44,7 +44,7 @@ def coco(*masks: tuple[int, int, Any], images: int = 2, **entries: dict[str, Any
 
 
 def write(folder: Path, **documents: Any) -> Path:
-    """JSON documents by their names, ``__`` for a folder; arrays and pictures with what follows ``_as_``."""
+    """Write JSON documents by their names, ``__`` for a folder; arrays and images with the suffix behind ``_as_``."""
     for name, content in documents.items():
         stem, _, suffix = name.partition("_as_")
         path = folder / f"{stem.replace('__', '/')}.{suffix or 'json'}"
@@ -90,7 +90,7 @@ def test_images_that_nobody_annotated_are_left_out_unless_they_are_negatives(tmp
 
 
 def test_a_file_that_says_what_is_absent_is_believed(tmp_path: Path) -> None:
-    """LVIS: image 1 has neither, image 2 was searched for a bowl alone, image 3 has more mugs than are masked."""
+    """LVIS: image 1 has neither, image 2 was searched for bowls only, image 3 has more mugs than masks."""
     image_fields = {
         "image_0": {"neg_category_ids": [], "not_exhaustive_category_ids": []},
         "image_1": {"neg_category_ids": [1, 2], "not_exhaustive_category_ids": []},
@@ -106,7 +106,7 @@ def test_a_file_that_says_what_is_absent_is_believed(tmp_path: Path) -> None:
 
 
 def test_pairs_of_a_photo_and_a_phrase_decide_that_phrase_alone(tmp_path: Path) -> None:
-    """SA-Co: photo a was asked for both and has a mug, photo b was asked for a bowl, and has none."""
+    """SA-Co: photo a was searched for both phrases and has a mug, photo b has neither."""
     pairs = [("a", "red mug"), ("a", "bowl"), ("b", "bowl"), ("b", "red mug"), ("c", "bowl")]
     images = [{"id": k, "file_name": f"{name}.jpg", "text_input": text} for k, (name, text) in enumerate(pairs)]
     annotations = [{"image_id": 0, "segmentation": rle(MUG)}, {"image_id": 4, "segmentation": rle(BOWL)}]
@@ -136,7 +136,7 @@ def test_polygons_and_run_lengths_of_one_image_are_masks_alike(tmp_path: Path) -
 
 
 def test_polygons_are_filled_as_coco_fills_them() -> None:
-    """Each within a pixel of its outline; the masks are of pycocotools 2.0.11, ``frPyObjects`` and ``merge``."""
+    """Each mask is within a pixel of the outline; the masks are of pycocotools 2.0.11, ``frPyObjects`` and ``merge``."""
     cases = [
         ([[2.3, 1.2, 10.7, 2.1, 8.4, 9.6]], "U12:100O2N1O1OM3MU1"),
         ([[1, 1, 9, 1, 9, 9, 1, 9], [5.5, 4.5, 12.5, 4.5, 12.5, 11, 5.5, 11]], "=84000000002N0004L0000007"),
@@ -245,7 +245,7 @@ def test_ids_without_their_file_or_their_name_are_refused(tmp_path: Path) -> Non
 
 
 def test_segments_of_a_panoptic_picture_are_masks_of_their_categories(tmp_path: Path) -> None:
-    """COCO's panoptic, whose 0 nobody decided, and DEVA's, which needs the names of its categories."""
+    """COCO's panoptic images, whose 0 is undecided, and DEVA's, which need the names of their categories."""
     colours = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     colours[MUG], colours[BOWL] = (1, 2, 0), (0, 0, 3)  # 1 + 256 * 2, 65536 * 3
     segments = [{"id": 513, "category_id": 1}, {"id": 196_608, "category_id": 2}]
@@ -264,7 +264,7 @@ def test_segments_of_a_panoptic_picture_are_masks_of_their_categories(tmp_path: 
 
 
 def test_videos_are_data_sets_of_their_frames(tmp_path: Path) -> None:
-    """YouTube-VIS and SA-Co: a mask a frame, null where the object is not seen."""
+    """YouTube-VIS and SA-Co: a mask a frame, null where the object is not visible."""
     video = {"id": 1, "file_names": ["v/00.jpg", "v/01.jpg"], "height": HEIGHT, "width": WIDTH}
     annotations = [
         {"video_id": 1, "category_id": 1, "segmentations": [rle(MUG), None]},
@@ -314,7 +314,7 @@ def test_masks_of_several_files_of_one_image_are_combined_with_a_warning(tmp_pat
 
 
 def test_photos_beside_documents_that_name_them_are_no_masks(tmp_path: Path) -> None:
-    """As Roboflow exports them, under names of its own."""
+    """Roboflow exports photos under names of its own."""
     file_name = "0_jpg.rf.0123456789abcdef0123456789abcdef.jpg"
     content = coco((0, 1, MUG_POLYGON), images=1, image_0={"file_name": file_name})
     photo = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
@@ -377,7 +377,7 @@ def test_counts_in_pythons_text_of_bytes_are_counts(tmp_path: Path) -> None:
 
 
 def test_pixels_that_nobody_decided_have_no_label(tmp_path: Path) -> None:
-    """The 255 of VOC and its kin, in pictures of numbers, palettes and binary pictures."""
+    """The 255 of VOC and the like, in images of numbers, images with a palette and binary images."""
     void = np.zeros((HEIGHT, WIDTH), bool)
     void[0] = True
     expected = drawing(MUG, BOWL)

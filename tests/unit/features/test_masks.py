@@ -33,7 +33,7 @@ LARGE = np.random.default_rng(0).integers(0, 4, (128, 128), np.uint8)
 
 
 def save(folder: Path, files: dict[str, Any]) -> None:
-    """Each file as its suffix and its content have it; texts and bytes as they are."""
+    """Write each file by its suffix and content; texts and bytes as they are."""
     for name, content in files.items():
         path = folder / name
         path.parent.mkdir(exist_ok=True)
@@ -277,7 +277,7 @@ def test_what_is_no_mask_is_refused(segmentation: Any, message: str) -> None:
 
 @st.composite
 def boxes(draw: st.DrawFn) -> np.ndarray:
-    """[K, 9, 12] bool, boxes and their differences, some empty."""
+    """Generate masks [K, 9, 12] bool: boxes and their differences, some empty."""
     masks = np.zeros((draw(st.integers(1, 12)), 9, 12), bool)
     for mask in masks:
         for value in (True, False):

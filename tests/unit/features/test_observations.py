@@ -1,4 +1,4 @@
-"""Levels put together, and maps of distorted photos as a pinhole sees them."""
+"""Combined levels, and maps of distorted photos resampled to a pinhole."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.scenes import random_grid, random_regions
 
 
 def dense_sums(regions: Regions) -> np.ndarray:
-    """[h * w, F], pixel by pixel: the normalised sum of the embeddings of its labels, zero without any."""
+    """Return [h * w, F]: per pixel, the normalised sum of the embeddings of its labels, zero without any."""
     labels, codebook = regions.labels.numpy(), regions.codebook.double().numpy()
     _, rows, columns = labels.shape
     dense = np.zeros((rows, columns, codebook.shape[1]))
@@ -35,7 +35,7 @@ def dense_sums(regions: Regions) -> np.ndarray:
 
 
 def read(regions: Regions) -> np.ndarray:
-    """[h * w, F]: the row that each pixel of a one-level map reads, zero without a label."""
+    """Return [h * w, F]: the row that each pixel of a one-level map refers to, zero without a label."""
     labels = regions.labels.long().flatten()
     return np.where(labels[:, None] >= 0, regions.codebook.double().numpy()[labels], 0.0)
 

@@ -1,4 +1,4 @@
-"""Values check themselves; views are read alike from packs, memory and iterators; errors name the view."""
+"""Validation of values; views from packs, memory and iterators are the same; errors name the view."""
 
 from __future__ import annotations
 

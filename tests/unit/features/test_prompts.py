@@ -1,4 +1,4 @@
-"""Masks by phrase become a pack that is asked in its phrases, the same from every kind of file."""
+"""Masks by phrase become a pack with its own words, the same from every kind of file."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def records(view: str, key: str = "class_name", *, as_string: bool = False) -> l
 
 
 def save(folder: Path, files: dict[str, Any]) -> Path:
-    """Pictures of arrays, bytes and texts as they are, and all else as JSON."""
+    """Write arrays as images, bytes and texts as they are, and other values as JSON."""
     for name, content in files.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -75,7 +75,7 @@ def data_set() -> dict[str, Any]:
 
 
 def pairs() -> dict[str, Any]:
-    """As SA-Co does it: an image for each photo and phrase."""
+    """Return a document like SA-Co's: an image for each photo and phrase."""
     view_phrases = [(view, phrase) for view in MASKS for phrase in PHRASES.values()]
     images = [
         {"id": number, "file_name": f"{view}.jpg", "text_input": phrase}
@@ -101,7 +101,7 @@ def with_legend(view: str) -> bytes:
 
 
 def corner_of(mask: np.ndarray) -> tuple[list[int], str]:
-    """Corner (x, y) of the smallest picture of a mask, and that as a PNG in base64."""
+    """Return the corner (x, y) of the smallest image of a mask, and this image as a PNG in base64."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     content = io.BytesIO()
     Image.fromarray(mask[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]).save(content, "PNG")
@@ -109,14 +109,14 @@ def corner_of(mask: np.ndarray) -> tuple[list[int], str]:
 
 
 def frame(mask: np.ndarray) -> list[list[float]]:
-    """The outline of a mask that is a rectangle."""
+    """Return the outline of a mask that is a rectangle."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     (top, bottom), (left, right) = (rows[[0, -1]] + [0, 1]).tolist(), (columns[[0, -1]] + [0, 1]).tolist()
     return [[left, top], [right, top], [right, bottom], [left, bottom]]
 
 
 def programs() -> dict[str, dict[str, Any]]:
-    """Files of annotation programs, an image each."""
+    """Return files of annotation programs, one for each image."""
     files: dict[str, dict[str, Any]] = {"LabelMe": {}, "Supervisely": {}, "Darwin": {}, "Cityscapes": {}}
     for view, masks in MASKS.items():
         height, width = next(iter(masks.values())).shape

@@ -26,7 +26,7 @@ from tests.scenes import look_at, random_camera, random_regions, random_splats, 
 
 
 def ring(count: int) -> list:
-    """Cameras on a ring around the origin."""
+    """Return cameras on a ring around the origin."""
     angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
     places = [4 * np.array([np.cos(angle), 0.2, np.sin(angle)]) for angle in angles]
     return [look_at(f"v{k}", place, 40, 30, 40.0) for k, place in enumerate(places)]

@@ -1,4 +1,4 @@
-"""COLMAP models and JSON documents of cameras for tests, and what makes cameras the same."""
+"""COLMAP models and JSON documents of cameras for tests, and a comparison of cameras."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Camera files: all formats mean the same; what is meant is read, or the next step is said."""
+"""Camera files: all formats give the same cameras, and every error names a remedy."""
 
 from __future__ import annotations
 
@@ -234,12 +234,12 @@ def names(path: Path) -> list[str]:
 
 
 def zipped(root: Path, folder: str) -> Path:
-    """A zip beside a folder, of one folder in it."""
+    """Write a zip of one folder within a folder, next to it."""
     return Path(shutil.make_archive(f"{root}-zipped", "zip", root, folder))
 
 
 def one_view(place: str) -> dict[str, bytes]:
-    """A model of one image, named after where it lies."""
+    """Return the files of a model of one image, named after the folder of the model."""
     return binary_files(images=[(*IMAGES[0][:3], f"{place.replace('/', '-').replace('.', 'here')}.jpg")])
 
 
@@ -360,7 +360,7 @@ def test_error_in_a_zip_names_the_zip(tmp_path: Path) -> None:
 
 
 def test_lifts_that_remember_names_as_a_mac_wrote_them_know_their_cameras(tmp_path: Path) -> None:
-    """As lifts of before were: names decomposed (NFD), and the digest of their poses too."""
+    """Earlier lifts stored decomposed names (NFD), and a digest of poses under these names."""
     frames = [{"file_path": f"Ku\u0308che_{k}.png", "transform_matrix": np.eye(4).tolist()} for k in range(2)]
     path = with_json(tmp_path, {"w": 4, "h": 3, "fl_x": 4.0, "fl_y": 4.0, "frames": frames})
     cameras = read_cameras(path)
@@ -381,7 +381,7 @@ def test_lifts_that_remember_names_as_a_mac_wrote_them_know_their_cameras(tmp_pa
 
 
 def named_model(*names: str, shift: float = 0.0) -> dict[str, bytes]:
-    """A model of images of these names, whose places tell it from others."""
+    """Return the files of a model of images with these names, at distinct positions."""
     return binary_files(
         images=[(1, (1.0, 0.0, 0.0, 0.0), (shift, 0.0, float(k)), name) for k, name in enumerate(names)]
     )

@@ -1,4 +1,4 @@
-"""Lenses bend as OpenCV's and COLMAP's; a distorted photo has a pinhole that it shows whole."""
+"""Lenses distort as OpenCV's and COLMAP's do; a distorted photo covers the image of its pinhole."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def camera(distortion: Distortion, width: int = 64, height: int = 48, focal: flo
 
 
 def corners(view: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """The plane places of all corners of a pinhole's pixels."""
+    """Return the positions on the plane of all corners of a pinhole's pixels."""
     x, y = np.meshgrid(np.arange(view.width + 1), np.arange(view.height + 1))
     return (x - view.cx) / view.fx, (y - view.cy) / view.fy
 
@@ -126,7 +126,7 @@ def test_the_pinhole_of_a_photo_is_the_largest_that_it_shows_whole(name: str) ->
     assert (view.fx, view.fy) == (lens.fx, lens.fy)
 
     def outside(of: Camera) -> float:
-        """By how many pixels of the photo the farthest corner lies beside it."""
+        """Return the distance of the farthest corner from the photo, in pixels of the photo."""
         u, v = lens.on_photo(*corners(of))
         return float(max(-u.min(), u.max() - lens.width, -v.min(), v.max() - lens.height))
 

@@ -1,4 +1,4 @@
-"""Splats of gsplat's and nerfstudio's tensors, and cameras of camera-to-world poses."""
+"""Splats from tensors of gsplat and nerfstudio, and cameras from camera-to-world poses."""
 
 from typing import Any
 

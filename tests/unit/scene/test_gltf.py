@@ -1,4 +1,4 @@
-"""glTF with KHR_gaussian_splatting: read as splat-transform writes it, written and read back, and bounded.
+"""glTF with KHR_gaussian_splatting: read as splat-transform writes it, written and read back, within limits.
 
 ``tests/data/splats/degree3.glb`` is what splat-transform 3.7.0 makes of ``degree3.sog.decoded.ply``.
 """
@@ -38,7 +38,7 @@ def some_splats(kernel: Kernel = Kernel.GAUSSIAN_3D, degree: int = 3) -> Splats:
 
 
 def activated(splats: Splats) -> dict[str, np.ndarray]:
-    """The splats as the format has them, with quaternions as the matrices that they mean."""
+    """Return the splats as the format stores them, with quaternions as rotation matrices."""
     (rows,) = gaussian_rows(splats)
     w, x, y, z = rows.quats.T
     turns = np.stack([w * w + x * x - 0.5, x * y - w * z, x * z + w * y, w * w + y * y - 0.5, y * z - w * x])

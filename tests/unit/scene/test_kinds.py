@@ -1,4 +1,4 @@
-"""Every reader, the command line and uploads tell what a file is, and what to give in its place, by one function."""
+"""Readers, the command line and uploads identify files with one function, and name the file to use instead."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes in map coordinates: as good as at the origin, with every place in the frame of their files."""
+"""Scenes in map coordinates: as accurate as at the origin, with every position in the frame of their files."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def scene_of(kernel: Kernel) -> tuple[Splats, list[Camera], dict[str, Any]]:
 
 
 def moved_back(splats: Splats, offset: np.ndarray = UTM) -> Splats:
-    """The same splats at the origin, with the bits that they have about their own."""
+    """Return the splats translated back by the offset, with float32 means about the origin."""
     means = splats.means.double() + torch.tensor(splats.origin, dtype=torch.float64) - torch.from_numpy(offset)
     return replace(splats, means=means.float(), origin=FILE_ORIGIN)
 
@@ -349,7 +349,7 @@ def test_a_lift_in_blocks_and_its_file_keep_the_origin(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The lift of a scene of files at the origin, and of the same moved: a PLY of doubles and a transforms.json."""
+    """Lift a scene of files at the origin, and the same scene translated: a PLY of doubles and a transforms.json."""
     lifts = {}
     for name, offset in (("here", np.zeros(3)), ("far", UTM)):
         folder, tiny = tmp_path_factory.mktemp(name), make_scene()

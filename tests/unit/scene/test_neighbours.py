@@ -1,4 +1,4 @@
-"""The graph of neighbouring splats, against its formula pair by pair."""
+"""The graph of neighbouring splats, compared with its formula pair by pair."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ SEEDS = st.integers(0, 2**16)
 
 
 def dense(graph: SplatGraph) -> np.ndarray:
-    """[P, P] f64, the affinities in the splats' order."""
+    """Return the affinities [P, P] f64 in the order of the splats."""
     count = len(graph.order)
     matrix = np.zeros((count, count))
     rows = np.repeat(np.arange(count), np.diff(graph.starts))
@@ -24,7 +24,7 @@ def dense(graph: SplatGraph) -> np.ndarray:
 
 
 def by_formula(splats: Splats) -> np.ndarray:
-    """[P, P] f64, of splats of which no two share a place."""
+    """Return the affinities [P, P] f64 of splats at distinct positions."""
     means = splats.means.double().numpy()
     distances = np.linalg.norm(means[:, None] - means[None], axis=2)
     matrix = np.zeros_like(distances)

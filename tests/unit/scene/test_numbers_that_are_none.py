@@ -1,4 +1,4 @@
-"""NaN and infinity in trained splats: rows stay, no ray meets them, colours are grey, and all of it is counted."""
+"""NaN and infinity in trained splats: rows stay, no ray hits them, colours are grey, and warnings count them."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def geometry_of(splats: Splats) -> dict[str, Any]:
 
 
 def broken(splats: Splats) -> dict[str, Any]:
-    """The arrays of splats with a number that is none in four of them."""
+    """Return the arrays of splats with NaN or infinity in four rows."""
     values = geometry_of(splats)
     for name, row in BROKEN.items():
         values[name].reshape(COUNT, -1)[row, 0] = ODD[name]

@@ -1,4 +1,4 @@
-"""Panoramas: six pinholes see what the photo shows, features of the photo are theirs, and files mean the same."""
+"""Panoramas: six pinholes cover the photo, its features are resampled to them, and all formats agree."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def panorama() -> Cameras:
 
 
 def on_panorama(ray: np.ndarray) -> tuple[float, float]:
-    """COLMAP's EquirectangularCameraModel, written again."""
+    """Project a point as COLMAP's EquirectangularCameraModel does, in independent code."""
     u, v, w = ray
     return (math.atan2(u, w) / (2 * math.pi) + 0.5) * WIDTH, (
         math.atan2(v, math.hypot(u, w)) / math.pi + 0.5
@@ -52,7 +52,7 @@ def on_panorama(ray: np.ndarray) -> tuple[float, float]:
 
 
 def ray_of(x: float, y: float) -> np.ndarray:
-    """The inverse, in the panorama's camera."""
+    """Return the ray of a pixel in the panorama's camera, the inverse of ``on_panorama``."""
     across, down = (x / WIDTH - 0.5) * 2 * math.pi, (y / HEIGHT - 0.5) * math.pi
     return np.array([math.sin(across) * math.cos(down), math.sin(down), math.cos(across) * math.cos(down)])
 

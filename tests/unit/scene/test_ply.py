@@ -1,4 +1,4 @@
-"""PLYs of every dialect are read, written back and copied to the byte, or refused in one line."""
+"""PLYs of every dialect are read, written back and copied byte for byte, or refused in one line."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ DIALECTS = {
 def ply_bytes(
     names: list[str], count: int = 5, types: dict[str, str] | None = None, head: str = "", **columns: Any
 ) -> bytes:
-    """Seeded numbers but for the given columns; ``types`` other than float, ``head`` more header lines."""
+    """Return a PLY of seeded numbers but for the columns; ``types`` other than float, ``head`` more header lines."""
     types = types or {}
     codes = {"float": "f4", "double": "f8", "uchar": "u1", "ushort": "u2", "int": "i4"}
     rows = np.zeros(count, np.dtype([(name, "<" + codes[types.get(name, "float")]) for name in names]))
@@ -379,7 +379,7 @@ def test_a_file_without_colours_or_with_another_count_is_refused(tmp_path: Path)
 
 
 def peak_of(work: Callable[[], object]) -> int:
-    """Bytes that Python and NumPy hold at most while it works."""
+    """Return the peak of the bytes that Python and NumPy allocate during a call."""
     tracemalloc.start()
     work()
     peak = tracemalloc.get_traced_memory()[1]

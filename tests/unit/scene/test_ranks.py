@@ -1,4 +1,4 @@
-"""Checkpoints of several ranks: one alone says that it is a part, and their folder is the whole scene."""
+"""Checkpoints of several ranks: a single one gives a warning, and their folder is the complete scene."""
 
 from __future__ import annotations
 

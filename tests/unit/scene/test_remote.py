@@ -1,4 +1,4 @@
-"""Inputs and outputs that lie elsewhere, on fsspec's memory and local file systems."""
+"""Remote inputs and outputs, on fsspec's memory and local file systems."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_folder_of_cameras_comes_whole_and_what_changed_comes_anew(remote_folder
 
 
 class Tagged(fsspec.AbstractFileSystem):
-    """As HTTP is: addresses, sizes and entity tags, and no lists of folders."""
+    """A file system like HTTP: sizes and entity tags, and no lists of folders."""
 
     protocol = "tagged"
     content = b"one"

@@ -259,13 +259,13 @@ def test_a_lift_from_before_keeps_the_kernel_that_it_was_lifted_with(tmp_path: P
 
 
 def splats_of(splats: Splats, row: int) -> Splats:
-    """One splat of a scene."""
+    """Return one splat of a scene."""
     names = ("means", "quats", "log_scales", "opacity_logits")
     return Splats(*(getattr(splats, name)[row : row + 1] for name in names))
 
 
 def test_a_splat_below_a_pixel_is_lifted_as_it_was_trained(tmp_path: Path) -> None:
-    """A veil of splats below a pixel, as an antialiased trainer leaves them, hides next to nothing."""
+    """Splats below a pixel, as an antialiased trainer leaves them, hardly occlude the ball behind them."""
     generator = torch.Generator().manual_seed(0)
     veil = torch.rand(400, 3, generator=generator) * torch.tensor([2.0, 1.5, 0.2]) + torch.tensor([-1.0, -0.75, 1.0])
     ball = torch.tensor([[0.0, 0.0, 4.0]])

@@ -39,7 +39,7 @@ SUFFIXES = [".glb", ".spz", ".splat", *(pytest.param(usd, marks=needs_usd) for u
 
 
 def scene(kernel: Kernel) -> Splats:
-    """Splats whose colours bytes can say."""
+    """Return splats whose colours are whole numbers of bytes."""
     splats = some_splats(kernel)
     assert splats.sh is not None
     sh = splats.sh.clamp(-3, 3) / 3

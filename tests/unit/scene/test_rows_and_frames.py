@@ -1,4 +1,4 @@
-"""Some rows of splats, and splats and cameras in another frame."""
+"""Subsets of splats, and splats and cameras transformed to another frame."""
 
 from dataclasses import replace
 from typing import Any

@@ -1,4 +1,4 @@
-"""A lift in shards whose files say nonsense is refused in one line, whatever they say."""
+"""Shards of a lift with invalid headers or an invalid index are refused in one line."""
 
 import json
 from pathlib import Path

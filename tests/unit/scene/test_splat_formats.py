@@ -1,4 +1,4 @@
-"""Splat files that editors and trainers write: read as their own tools read them, bounded, and exported row by row.
+"""Splat files of editors and trainers: read as their own tools read them, within limits, and exported row by row.
 
 ``tests/data/splats`` holds seeded scenes of 300 splats (degree 1, two chunks) and 40 (degree 3) that splat-transform
 2.7.1 wrote, the ``.splat`` and the ``.spz`` of versions 1 and 2 apart, which it only reads. Each lies beside the PLY
@@ -185,7 +185,7 @@ def spz_header(version: int, count: int, streams: int = 0) -> bytes:
 
 
 def bomb(kind: str, path: Path) -> None:
-    """A small file that says it is a large one."""
+    """Write a small file whose header declares a large one."""
     if kind == "spz 4":
         sizes = [9, 1, 3, 3, 4]
         stream = zstandard.ZstdCompressor().compress(bytes(10_000_000))
@@ -313,7 +313,7 @@ LETTERS = {"R": (0, 1), "L": (0, -1), "D": (1, 1), "U": (1, -1), "F": (2, 1), "B
 def test_every_frame_that_an_spz_may_declare_is_turned_by_its_letters(
     number: int, version: int, tmp_path: Path
 ) -> None:
-    """Places, covariances and colours from all around are those of the file in the axes that its letters name."""
+    """Positions, covariances and colours from all directions are the file's, in the axes that its letters name."""
     content, extension = (FILES / f"degree3.v{version}.spz").read_bytes(), struct.pack("<III", FRAME_EXTENSION, 4, 0)
     frame_bytes = extension[:8] + struct.pack("<I", number)
     if version == 4:
@@ -347,7 +347,7 @@ def covariances(splats: Splats) -> np.ndarray:
 
 
 def radiance(splats: Splats, directions: np.ndarray) -> np.ndarray:
-    """[n, P, 3], the harmonics of all splats along directions, by the renderer's own basis."""
+    """Return the harmonics [n, P, 3] of all splats along directions, in the renderer's basis."""
     assert splats.sh is not None
     basis = _sh_basis(torch.from_numpy(directions).float(), 3)
     return torch.einsum("nk,pkc->npc", basis, splats.sh).numpy()

@@ -1,4 +1,4 @@
-"""Groups of splats that touch, against the rule pair by pair."""
+"""Groups of splats that touch, compared with the rule pair by pair."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ FEW = NEIGHBOURS + 1  # of so many splats, each looks at all others
 
 
 def by_pairs(splats: Splats) -> np.ndarray:
-    """Groups by the rule itself, for so few splats that all are neighbours."""
+    """Return groups by the rule itself, for so few splats that all are neighbours."""
     count = splats.count
     means = splats.means.double().numpy()
     axes = [
@@ -64,7 +64,7 @@ def test_groups_know_no_unit_and_no_order(seed: int, power: int) -> None:
 
 
 def needle(x: float, y: float) -> Splats:
-    """One as long as 1 along x, two points at x and y on the axes."""
+    """Return a splat of scale 1 along x, and two small ones at x and y on the axes."""
     means = torch.tensor([[0.0, 0.0, 0.0], [x, 0.0, 0.0], [0.0, y, 0.0]])
     log_scales = torch.log(torch.tensor([[1.0, 1e-3, 1e-3], [1e-3] * 3, [1e-3] * 3]))
     return Splats(means, torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 3), log_scales, torch.zeros(3))

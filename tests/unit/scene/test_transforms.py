@@ -1,4 +1,4 @@
-"""nerfstudio's files: what a transforms.json means, and the frame in which a run trained."""
+"""nerfstudio's files: cameras of a transforms.json, and the frame in which a run trained."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def zipped(folder: Path) -> Path:
 
 
 def oriented() -> np.ndarray:
-    """[4, 4], how a run turns and centres the poses of its transforms.json."""
+    """Return the matrix [4, 4] with which a run rotates and centres the poses of its transforms.json."""
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("xyz", [20, -35, 70], degrees=True).as_matrix()
     pose[:3, 3] = (0.4, -1.3, 2.2)
@@ -160,7 +160,7 @@ def model(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def run(tmp_path: Path, model: Path) -> Path:
-    """A folder with the transforms.json of the model's poses, and the file of a run."""
+    """Return a folder with the transforms.json of the model's poses, and the file of a run."""
     document = transforms_of(read_cameras(model))
     for record in document["frames"]:
         record["transform_matrix"] = (APPLIED @ np.array(record["transform_matrix"])).tolist()
@@ -173,7 +173,7 @@ def run(tmp_path: Path, model: Path) -> Path:
 
 @pytest.fixture
 def expected(model: Path) -> Cameras:
-    """The model's cameras with the poses that nerfstudio trains on: moved, then scaled."""
+    """Return the model's cameras with the poses that nerfstudio trains on: transformed, then scaled."""
     cameras, views = read_cameras(model), []
     for camera, record in zip(cameras.values(), transforms_of(cameras)["frames"], strict=True):
         pose = oriented() @ APPLIED @ np.array(record["transform_matrix"])
@@ -183,7 +183,7 @@ def expected(model: Path) -> Cameras:
 
 
 def change(path: Path, **changes: Any) -> None:
-    """Other values in a JSON file; None takes a key away."""
+    """Change values in a JSON file; None removes a key."""
     document = {**json.loads(path.read_text()), **changes}
     path.write_text(json.dumps({key: value for key, value in document.items() if value is not None}))
 
@@ -376,7 +376,7 @@ def test_full_disk_is_no_broken_zip(run: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 def photo(path: Path, size: tuple[int, int], orientation: int = 1) -> None:
-    """A photo of stored pixels, most of which end early: the header alone can be read."""
+    """Write a photo of noise that, but for WebP, ends early: only its header can be read."""
     path.parent.mkdir(parents=True, exist_ok=True)
     exif = Image.Exif()
     exif[0x0112] = orientation

@@ -1,4 +1,4 @@
-"""Splats and cameras made of arrays in memory, how views are named, and how names pair."""
+"""Splats and cameras from arrays in memory, names of views, and pairs of names."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ def test_every_view_of_a_rig_keeps_its_folder_in_every_format(kind: str, tmp_pat
 
 
 def test_a_view_is_found_by_its_last_part_and_else_its_neighbours_are_named() -> None:
-    """Lifts of before name the views of a rig that are alone with their number without its folder."""
+    """Earlier lifts name a view of a rig without its folder where its number is unique."""
 
     def cameras_of(*names: str) -> Cameras:
         return Cameras([Camera.pinhole(name, 4, 4, 5.0, 5.0, 2.0, 2.0, np.eye(4)) for name in names])

@@ -27,7 +27,7 @@ WORLDS = [UNKNOWN, UPRIGHT, SIDEWAYS, WorldFrame(up=(0, 1, 0)), WorldFrame(metre
 
 
 def frames(turn: np.ndarray) -> list[dict[str, Any]]:
-    """Three cameras that stand upright on the ground z = 0, turned."""
+    """Return three cameras that stand upright on the ground z = 0, rotated by ``turn``."""
     poses = []
     for angle in (0.0, 1.0, 2.0):
         back = np.array([math.cos(angle), math.sin(angle), 0])
@@ -82,7 +82,7 @@ def test_a_file_has_its_frame_and_its_splats_as_they_were(world: WorldFrame, suf
 
 @pytest.mark.parametrize("world", WORLDS, ids=repr)
 def test_other_readers_of_gltf_see_metres_with_y_up(world: WorldFrame, tmp_path: Path) -> None:
-    """By the format alone, without what our file says of itself."""
+    """Read by the format alone, without the metadata that splatlift adds to the file."""
     document, binary = parts_of(write(tmp_path / "s.glb", replace(some_splats(), world=world)))
     del document["asset"]["extras"]
     actual = read_splats(join(tmp_path / "t.glb", document, binary))
@@ -92,7 +92,7 @@ def test_other_readers_of_gltf_see_metres_with_y_up(world: WorldFrame, tmp_path:
 
 
 def shortest_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Rodrigues' formula, for directions that are not opposite; half a turn about z for these."""
+    """Return the rotation from a to b by Rodrigues' formula; half a turn about z for opposite directions."""
     if np.allclose(a, -b):
         return np.diag([-1.0, -1, 1])
     v, c = np.cross(a, b), float(a @ b)

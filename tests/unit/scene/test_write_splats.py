@@ -1,4 +1,4 @@
-"""Splats written with columns of one's own."""
+"""Splats written with extra columns."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""Regions of masks that may overlap: no pixel of any mask is lost, and wrong masks are refused by their name."""
+"""Regions of masks that may overlap: no pixel of any mask is lost, and invalid masks are refused by name."""
 
 from typing import Any
 

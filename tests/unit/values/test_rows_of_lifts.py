@@ -1,4 +1,4 @@
-"""Some rows of a lift, a lift in another frame, and lifts beside splats that are not theirs."""
+"""Subsets of a lift, a lift in another frame, and lifts queried with other splats."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,7 +18,7 @@ MOVE = {"scale": 2.0, "rotation": np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 
 @pytest.fixture(scope="module")
 def scene() -> tuple[lc.Splats, lc.Cameras, lc.LiftResult]:
-    """A lift with clusters and objects that masks make."""
+    """Return a lift with clusters and objects from masks."""
     splats = random_splats(4, 300)
     cameras = lc.Cameras([random_camera(k, 48, 40, name=f"v{k}") for k in range(6)])
     sides = splats.means[:, 0] > 0
