@@ -84,7 +84,7 @@ def test_any_number_in_a_pose_is_a_camera_or_an_error_of_ours(focal, value, plac
 
 
 def as_bytes(write: Callable[[Path], object]) -> bytes:
-    """Bytes that are written into a file."""
+    """Return the bytes that ``write`` writes into a file."""
     with tempfile.TemporaryDirectory() as folder:
         write(Path(folder) / "a.npy")
         return (Path(folder) / "a.npy").read_bytes()

@@ -122,7 +122,7 @@ TURNS = {  # what a stored photo is, of the one that EXIF's orientation shows
 @pytest.mark.parametrize("tag", TURNS)
 def test_a_photo_is_read_in_the_orientation_of_its_camera(tag: int, suffix: str, tmp_path: Path) -> None:
     upright = np.zeros((48, 64, 3), np.uint8)
-    upright[:16, :16], upright[:16, -16:] = (255, 0, 0), (0, 255, 0)  # two corners tell each of eight ways
+    upright[:16, :16], upright[:16, -16:] = (255, 0, 0), (0, 255, 0)  # two corners distinguish all eight orientations
     stored, path, exif = np.ascontiguousarray(TURNS[tag](upright)), tmp_path / f"a{suffix}", Image.Exif()
     exif[ORIENTATION] = tag
     options: dict[str, Any] = (
@@ -375,7 +375,7 @@ def test_a_change_in_a_patch_moves_its_own_cell_most(kind: str) -> None:
         spotted = images.clone()
         spotted[..., row * patch : (row + 1) * patch, column * patch : (column + 1) * patch] *= -1
         batch = encoder.encode(torch.cat([images, spotted]))
-        torch.testing.assert_close(batch[:1], before, atol=1e-4, rtol=1e-4)  # an image does not know its batch
+        torch.testing.assert_close(batch[:1], before, atol=1e-4, rtol=1e-4)  # independent of the rest of the batch
         change = (batch[1] - batch[0]).norm(dim=-1)
         assert divmod(int(change.argmax()), columns) == (row, column)
 
@@ -496,7 +496,7 @@ def test_weights_are_asked_of_the_cache_and_once_of_the_network(
         silent.accept()[0].close()
         with pytest.raises(BlockingIOError):
             silent.accept()
-    assert weights.fetch_weights("x", lambda: 7, "") == 7  # what is in the cache asks nobody
+    assert weights.fetch_weights("x", lambda: 7, "") == 7  # nothing is downloaded if it is cached
 
 
 def small_trunk(name: str, pool: str, proj: Any) -> Any:

@@ -136,7 +136,7 @@ def test_polygons_and_run_lengths_of_one_image_are_masks_alike(tmp_path: Path) -
 
 
 def test_polygons_are_filled_as_coco_fills_them() -> None:
-    """Each mask is within a pixel of the outline; the masks are of pycocotools 2.0.11, ``frPyObjects`` and ``merge``."""
+    """Masks equal those of pycocotools 2.0.11 (``frPyObjects``, ``merge``) within a pixel of the outline."""
     cases = [
         ([[2.3, 1.2, 10.7, 2.1, 8.4, 9.6]], "U12:100O2N1O1OM3MU1"),
         ([[1, 1, 9, 1, 9, 9, 1, 9], [5.5, 4.5, 12.5, 4.5, 12.5, 11, 5.5, 11]], "=84000000002N0004L0000007"),

@@ -205,7 +205,7 @@ def test_a_lift_of_prompts_is_asked_in_its_words_alone(tmp_path: Path, capsys: p
     (tmp_path / "cameras.json").write_bytes(tiny.cameras)
     assert run(capsys, "pack", "prompts", tmp_path / "masks", "-o", pack)[0] == 0
     assert run(capsys, "lift", tmp_path / "scene.ply", tmp_path / "cameras.json", pack, "-o", lifted)[0] == 0
-    pack.unlink()  # the lift alone is asked
+    pack.unlink()  # queries need the lift only
     status, out, err = run(capsys, "query", lifted, "a red apple", "--json")
     assert (status, err, json.loads(out)["selected"]) == (0, "", 20)
     assert (

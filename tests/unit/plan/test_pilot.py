@@ -30,7 +30,7 @@ VIEWS, CHANNELS = FEW_VIEWS + 8, 48
 
 
 def disagreeing(folder, error: float, gap: bool = False, labelled: bool = True):
-    """Write a scene of a ring of cameras, whose views have one vector with errors of this relative length; return paths."""
+    """Write a scene on a ring of cameras, a vector a view, with errors of this relative length; return its paths."""
     folder.mkdir()
     generator = torch.Generator().manual_seed(3)
     truth, labels = torch.eye(CHANNELS)[:1], torch.zeros(1, 6, 8, dtype=torch.int32)

@@ -322,7 +322,7 @@ def test_folder_without_a_usual_name_says_what_can_be_named(tmp_path: Path) -> N
 def test_camera_that_no_image_uses_may_be_of_any_model(tmp_path: Path) -> None:
     for files in (binary_files, text_files):
         assert len(names(write_files(tmp_path / files.__name__, files({**CAMERAS, 2: DISTORTED[1]})))) == 3
-    unknown = text_files({**CAMERAS, 3: (99, "CROOKED", (1.0, 2.0))})  # of a binary one nobody knows the length
+    unknown = text_files({**CAMERAS, 3: (99, "CROOKED", (1.0, 2.0))})  # a binary one would have an unknown length
     assert len(names(write_files(tmp_path / "unknown", unknown))) == 3
     files_with_bom = {name: b"\xef\xbb\xbf" + content for name, content in text_files().items()}
     assert len(names(write_files(tmp_path / "marked", files_with_bom))) == 3  # and a byte order mark is none

@@ -262,7 +262,7 @@ def test_elements_behind_the_vertices_are_passed_over(tmp_path: Path) -> None:
     with pytest.raises(InvalidSplats, match=r"and 13 bytes of other elements = 353 bytes.*got 352 bytes.*truncated"):
         read_splats(with_ply(tmp_path, content[:-1]))
     assert "1 bytes at the file's end" in read_splats(with_ply(tmp_path, content + b"x")).warnings[0]
-    faces = b"element face 1\nproperty list uchar int vertex_indices\nend_header"  # of a length that nobody knows
+    faces = b"element face 1\nproperty list uchar int vertex_indices\nend_header"  # of unknown length
     content = ply_bytes(INRIA).replace(b"end_header", faces) + b"\x03" + bytes(12)
     assert torch.equal(
         read_splats(with_ply(tmp_path, content)).means, read_splats(with_ply(tmp_path, ply_bytes(INRIA))).means

@@ -72,7 +72,7 @@ def needle(x: float, y: float) -> Splats:
 
 def test_others_do_not_connect() -> None:
     row = needle(1.9, 0.1)
-    assert touching(row, np.array([1, 2])).tolist() == [0, 1]  # the needle between them was not asked for
+    assert touching(row, np.array([1, 2])).tolist() == [0, 1]  # the needle between them is not selected
     assert touching(row, np.array([1])).tolist() == [0]
     assert touching(row, np.array([], np.int64)).tolist() == []
 

@@ -201,14 +201,14 @@ def test_bombs_of_empty_images_are_refused(tmp_path: Path) -> None:
     [
         (["a", "b"], ["b", "c"], {"b": "b"}),
         (["camA/0", "camB/1"], ["0", "1"], {"camA/0": "0", "camB/1": "1"}),  # the scene's names were all unique
-        (["0", "1"], ["camA/0", "camA/1", "camB/0"], {"1": "camA/1"}),  # nobody knows which 0 is meant
+        (["0", "1"], ["camA/0", "camA/1", "camB/0"], {"1": "camA/1"}),  # which 0 is ambiguous
         (["camA/0", "camB/0"], ["0"], {}),
         (["0", "camA/0"], ["0"], {"0": "0"}),  # the same name comes first
         (["camA/0"], ["images/camA/0"], {"camA/0": "images/camA/0"}),
         (["images/camA/0"], ["camA/0"], {"images/camA/0": "camA/0"}),
         (["train/0"], ["test/0"], {}),  # folders that disagree are other photos
         (["A/0"], ["camA/0"], {}),  # whole folders only
-        # Folders may go on before those that tell cameras of a rig apart.
+        # More folders may precede those that distinguish cameras of a rig.
         (["/d/camA/0", "/d/camB/0"], ["camA/0", "camB/0"], {"/d/camA/0": "camA/0", "/d/camB/0": "camB/0"}),
         (["0", "camB/0"], ["camA/0"], {}),
         (["K\u00fcche_0", "K\u00fcche_1"], ["Ku\u0308che_1"], {"K\u00fcche_1": "Ku\u0308che_1"}),  # of a Mac
