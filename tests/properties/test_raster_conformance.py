@@ -326,7 +326,7 @@ def test_the_oracle_is_a_backend_that_gives_the_same_products():
 
 @every_backend
 @pytest.mark.parametrize(
-    ("name", "weighting", "walk"),
+    ("name", "weighting", "params"),
     [
         ("power", Weighting(3), {}),
         ("count", Weighting(1, Selection.TOP_K, count=65), {}),
