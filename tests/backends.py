@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def gpu_raster(splats: Splats, block: int = 1 << 24) -> GpuRaster:
-    """The GPU backend, on a card where there is one and in Triton's interpreter elsewhere."""
+    """Return the GPU backend, on a GPU if there is one, else in Triton's interpreter."""
     from liftcore.raster.gpu.raster import GpuRaster
 
     return GpuRaster(splats, torch.device("cuda:0" if torch.cuda.is_available() else "cpu"), block)
@@ -41,7 +41,7 @@ class Backend:
     seeds: int  # scenes of a pooled count
     splats: int = 60  # of a random scene, at most: more than a chunk of a tile's list
     size: tuple[int, int] = (50, 40)  # of a random image, at most: more than a tile each way
-    rays: int = 2_000  # whose rows of A are asked for, at most
+    rays: int = 2_000  # maximum number of rows of A that a test requests
 
     def holds(self, *strategies: SearchStrategy[Any]) -> Callable[[Callable[..., None]], None]:
         """Run a check on examples of the strategies at once."""

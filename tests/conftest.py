@@ -9,14 +9,14 @@ import pytest
 import torch
 from hypothesis import settings
 
-# Tests compute on the processor, whatever machine this is: `make gpu` alone lets them see a card. Where they see
-# none, the GPU's kernels run in Triton's interpreter. Triton asks once, when it is imported.
+# Tests run on the CPU on every machine; only `make gpu` lets them use a GPU. Without one, the GPU's kernels run in
+# Triton's interpreter. Triton reads this variable once, at its import.
 if os.environ.get("TESTS_ON") != "cuda":
     os.environ["CUDA_VISIBLE_DEVICES"] = ""
 if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")
 
-# The same examples on every machine, however slow it is; a failure prints how to see it again.
+# The same examples on every machine, without a time limit; a failure prints how to reproduce it.
 settings.register_profile("everywhere", derandomize=True, deadline=None, print_blob=True)
 settings.load_profile("everywhere")
 
@@ -25,7 +25,7 @@ SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """The folder of real scenes beside the repository; tests that need it say so when it is not there."""
+    """Return the folder of real scenes next to the repository; skip the test if it is missing."""
     if not SHARED_DATA.is_dir():
         pytest.skip(f"shared data not found: {SHARED_DATA}")
     return SHARED_DATA
@@ -41,7 +41,7 @@ def _compiled_kernels() -> None:
 
 @pytest.fixture(scope="session")
 def every_kernel() -> None:
-    """The other kernels' compiled code too, for the tests that walk them."""
+    """Compile the other kernels too, for the tests that use them."""
     from liftcore.raster.cpu.warm_up import warm_up
     from liftcore.scene.splats import Kernel
 

@@ -1,4 +1,4 @@
-"""What the core does without any extra: read, plan, lift, save, ask with a table, render, export.
+"""Run the core without any extra: read, plan, lift, save, ask with a table, render, export.
 
     python tests/core_alone.py [--block] [--as darwin|win32]
 

@@ -37,7 +37,7 @@ def quarter(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def is_clear(x: np.ndarray, y: np.ndarray, distance: float) -> np.ndarray:
-    """Whether a place on the wall is so far from the borders of its quarter."""
+    """Return True where a point on the wall is at least `distance` from the borders of its quarter."""
     return (np.abs(x - MEETING[0]) >= distance) & (np.abs(y - MEETING[1]) >= distance)
 
 

@@ -1,7 +1,7 @@
-"""Compile what nearly all tests walk with: ``python -m tests.kernels [KERNEL...]``, which `make test` does first.
+"""Compile the kernels of nearly all tests: ``python -m tests.kernels [KERNEL...]``, which `make test` runs first.
 
-Tests run in two processes, and each would compile the same code for itself. What a few tests alone need is compiled
-there, once.
+Tests run in two processes, and each would compile the same code. Kernels of few tests are compiled in these tests,
+once.
 """
 
 from __future__ import annotations

@@ -25,19 +25,19 @@ from liftcore.values.settings import LiftSettings
 
 WIDTH, HEIGHT, FOCAL, DISTANCE = 160, 120, 100.0, 4.0
 SPACING = 0.08  # units between splats: 2 pixels
-THINGS = {"red apple": (20, 30, 60, 80), "book": (90, 20, 140, 100)}  # x1 y1 x2 y2 of the first frame, ends outside
-WORDS = ("wall", *THINGS, "object", "things", "stuff", "texture", "unicorn")
-FRAMES = {"frame_00001": 0, "frame_00002": 5}  # name -> pixels that things lie further left
+OBJECTS = {"red apple": (20, 30, 60, 80), "book": (90, 20, 140, 100)}  # x1 y1 x2 y2 of the first frame, ends outside
+WORDS = ("wall", *OBJECTS, "object", "things", "stuff", "texture", "unicorn")
+FRAMES = {"frame_00001": 0, "frame_00002": 5}  # name -> disparity: pixels that objects lie further left
 LIFTED = "frame_00001"
 
 
 def write_lift(folder: Path, name: str = "kitchen.lift.safetensors") -> Path:
-    """Splats, cameras, words and a lift that is right about every splat; the lift's path."""
+    """Write splats, cameras, words and a lift that is right about every splat; return the lift's path."""
     columns, rows = (np.arange(-0.6, size * DISTANCE / FOCAL + 0.6, SPACING) for size in (WIDTH, HEIGHT))
     x, y = (axis.ravel() for axis in np.meshgrid(columns, rows))
     pixels = np.stack([x, y], axis=1) * FOCAL / DISTANCE
     owner = np.zeros(len(x), np.int64)
-    for row, (x1, y1, x2, y2) in enumerate(THINGS.values(), start=1):
+    for row, (x1, y1, x2, y2) in enumerate(OBJECTS.values(), start=1):
         owner[((pixels >= (x1, y1)) & (pixels < (x2, y2))).all(axis=1)] = row
     count = len(x)
     middle = np.array([WIDTH, HEIGHT]) * DISTANCE / FOCAL / 2
@@ -50,9 +50,9 @@ def write_lift(folder: Path, name: str = "kitchen.lift.safetensors") -> Path:
     )
     write_splats(folder / "splats.ply", splats)
     cameras = []
-    for frame, left in FRAMES.items():
+    for frame, disparity in FRAMES.items():
         pose = np.eye(4)
-        pose[0, 3] = -left * DISTANCE / FOCAL
+        pose[0, 3] = -disparity * DISTANCE / FOCAL
         cameras.append(Camera.pinhole(frame, WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, pose))
     write_inria_cameras(Cameras(tuple(cameras)), folder / "cameras.json")
     words = torch.eye(len(WORDS))
@@ -75,11 +75,11 @@ def write_lift(folder: Path, name: str = "kitchen.lift.safetensors") -> Path:
     return path
 
 
-def truth(name: str, left: int = 0) -> np.ndarray:
-    """[120, 160] bool, where a thing is in a frame."""
+def truth(name: str, disparity: int = 0) -> np.ndarray:
+    """Return the mask of an object in a frame, [120, 160] bool."""
     mask = np.zeros((HEIGHT, WIDTH), bool)
-    x1, y1, x2, y2 = THINGS[name]
-    mask[y1:y2, x1 - left : x2 - left] = True
+    x1, y1, x2, y2 = OBJECTS[name]
+    mask[y1:y2, x1 - disparity : x2 - disparity] = True
     return mask
 
 
@@ -102,12 +102,12 @@ def write_lerf_labels(folder: Path, scene: str = "kitchen") -> Path:
     """LeRF-OVS's layout: the apple in two polygons, the second frame labelled at twice the size."""
     labels = folder / "lerf_ovs" / "label" / scene
     labels.mkdir(parents=True)
-    for scale, (frame, left) in enumerate(FRAMES.items(), start=1):
-        x1, y1, x2, y2 = THINGS["red apple"]
-        halves = [(x1 - left, y1, x1 - left + 20, y2), (x1 - left + 20, y1, x2 - left, y2)]
-        book = THINGS["book"]
+    for scale, (frame, disparity) in enumerate(FRAMES.items(), start=1):
+        x1, y1, x2, y2 = OBJECTS["red apple"]
+        halves = [(x1 - disparity, y1, x1 - disparity + 20, y2), (x1 - disparity + 20, y1, x2 - disparity, y2)]
+        book = OBJECTS["book"]
         objects = [("red apple", rectangle(*half)) for half in halves]
-        objects.append(("book", rectangle(book[0] - left, book[1], book[2] - left, book[3])))
+        objects.append(("book", rectangle(book[0] - disparity, book[1], book[2] - disparity, book[3])))
         (labels / f"{frame}.json").write_text(json.dumps(isat(objects, scale)))
     return folder / "lerf_ovs"
 
@@ -117,10 +117,10 @@ def write_3d_ovs_labels(folder: Path, scene: str = "kitchen") -> Path:
     labels = folder / "3d_ovs" / scene / "segmentations"
     labels.mkdir(parents=True)
     (labels / "classes.txt").write_text("red apple\nbook\nunicorn\n")
-    for frame, left in FRAMES.items():
+    for frame, disparity in FRAMES.items():
         (labels / frame).mkdir()
-        for name in THINGS:
-            mask = Image.fromarray(truth(name, left).astype(np.uint8) * 255)
-            suffix = "png" if left else "jpg"
+        for name in OBJECTS:
+            mask = Image.fromarray(truth(name, disparity).astype(np.uint8) * 255)
+            suffix = "png" if disparity else "jpg"
             mask.resize((WIDTH * 2, HEIGHT * 2), Image.Resampling.NEAREST).save(labels / frame / f"{name}.{suffix}")
     return folder / "3d_ovs"

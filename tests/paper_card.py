@@ -1,7 +1,7 @@
-"""A card of paper: tensors that lie in this machine's memory, and are as hard to reach from it as a card's.
+"""A fake GPU: tensors in host memory that refuse what tensors of a GPU refuse.
 
-Who has no card finds here what a card would refuse: numpy that reads its tensors, and one call with tensors of both
-places. Triton's interpreter runs the kernels. What a card computes, and how fast, only ``make gpu`` tells.
+Machines without a GPU find two kinds of mistakes with it: numpy that reads a tensor of the GPU, and a call with
+tensors of both devices. Triton's interpreter runs the kernels. Results and times of a GPU come from ``make gpu``.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ _move = Tensor.to
 
 
 class OnCard(Tensor):
-    """A tensor of the card."""
+    """A tensor of the fake GPU."""
 
     @classmethod
     def __torch_function__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Call torch with what lies behind the tensors of the card, and leave its answer there.
+        """Call torch with the host tensors behind those of the GPU, and return its output on the GPU.
 
         Raises:
-            TypeError, RuntimeError: where torch raises one for tensors of a card.
+            TypeError, RuntimeError: where torch raises one for tensors of a GPU.
         """
         name, kwargs = getattr(func, "__name__", ""), kwargs or {}
         if name == "__get__" and func.__self__.__name__ in ("device", "is_cuda"):
@@ -51,11 +51,11 @@ class OnCard(Tensor):
 
 
 def lay(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have this machine find a card of paper."""
+    """Make torch and liftcore find the fake GPU."""
     for name in MAKERS:
         monkeypatch.setattr(torch, name, _made_there(getattr(torch, name)))
     monkeypatch.setattr(Tensor, "to", _to)
-    monkeypatch.setattr(Tensor, "pin_memory", lambda own: own)
+    monkeypatch.setattr(Tensor, "pin_memory", lambda tensor: tensor)
     answers = {
         "current_device": 0, "current_stream": SimpleNamespace(synchronize=lambda: None), "device": nullcontext(),
         "empty_cache": None, "get_device_capability": (9, 0), "get_device_name": "paper", "is_available": True,
@@ -69,35 +69,39 @@ def lay(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _launch(kernel: Any, programs: int, *arguments: object, **constants: Any) -> None:
-    assert all(isinstance(own, OnCard) for own in arguments if isinstance(own, Tensor)), "a kernel reads the card's"
+    assert all(isinstance(argument, OnCard) for argument in arguments if isinstance(argument, Tensor)), (
+        "a kernel reads tensors of the GPU"
+    )
     launching.launch(kernel, programs, *map(_behind, arguments), **constants)
 
 
 def _made_there(make: Callable[..., Any]) -> Callable[..., Any]:
-    def made(*args: Any, device: Any = None, pin_memory: bool = False, **named: Any) -> Any:
+    def make_on_card(*args: Any, device: Any = None, pin_memory: bool = False, **keywords: Any) -> Any:
         if device is None or torch.device(device).type == "cpu":
-            return make(*args, device=device, **named)
-        return _on_card(make(*args, device="cpu", **named))
+            return make(*args, device=device, **keywords)
+        return _on_card(make(*args, device="cpu", **keywords))
 
-    return made
+    return make_on_card
 
 
-def _to(own: Tensor, *args: Any, non_blocking: bool = False, **named: Any) -> Tensor:
-    asked = [leaf for leaf in (*args, *named.values()) if _is_place(leaf) and torch.device(leaf).type == "cuda"]
-    if isinstance(own, OnCard) or not asked:
-        return _move(own, *args, **named)
-    args, named = tree_map(_behind, (args, named))
-    return _on_card(_move(own, *args, **named, copy=True))
+def _to(tensor: Tensor, *args: Any, non_blocking: bool = False, **keywords: Any) -> Tensor:
+    cuda_devices = [
+        leaf for leaf in (*args, *keywords.values()) if _is_place(leaf) and torch.device(leaf).type == "cuda"
+    ]
+    if isinstance(tensor, OnCard) or not cuda_devices:
+        return _move(tensor, *args, **keywords)
+    args, keywords = tree_map(_behind, (args, keywords))
+    return _on_card(_move(tensor, *args, **keywords, copy=True))
 
 
 def _mixes(name: str, args: Any, tensors: list[Tensor]) -> bool:
-    """Whether a card would refuse these tensors of both places together."""
+    """Return True if a GPU would refuse these tensors of both devices in one call."""
     if name in ("copy_", "to"):
         return False
     first, indices = tensors[0], _tensors(args[1]) if name in ("__getitem__", "__setitem__") else []
     if name == "__setitem__" and not indices:
         return False  # a slice is copied
-    # The processor's numbers, and its indices of a card's tensor, are brought there.
+    # Scalars of the host, and its indices into a tensor of the GPU, are copied to the GPU.
     host_scalars = [tensor for tensor in tensors if not isinstance(tensor, OnCard) and not tensor.dim()]
     host_scalars += indices if isinstance(first, OnCard) else []
     return (

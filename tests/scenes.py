@@ -19,8 +19,8 @@ from liftcore.values.views import ViewFeatures
 
 __all__ = [
     "IDENTITY",
+    "ROTATION",
     "ROW",
-    "TURNED",
     "Kernel",
     "camera_at_origin",
     "centred",
@@ -37,7 +37,7 @@ __all__ = [
 ]
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
-TURNED = (0.9, 0.1, 0.3, 0.2)
+ROTATION = (0.9, 0.1, 0.3, 0.2)
 ROW = tuple((0.3 * k - 0.6, 0.1 * k, 2.0 + 0.2 * k) for k in range(5))  # of five centres before a camera
 
 
@@ -72,7 +72,7 @@ def camera_at_origin(width: int = 16, height: int = 12, focal: float = 16.0, nam
 
 
 def observed(seed: int, view: int, grids: bool = False) -> ViewFeatures:
-    """What a view of a scene observes: a grid, or regions, which W takes by tuples of labels in every second view."""
+    """Return the features of a view: a grid, or regions, which have tuples of labels in every second view."""
     if grids:
         return random_grid(seed + view)
     return random_regions(seed + view, levels=4, rows=9) if view % 2 else random_regions(seed + view)

@@ -223,7 +223,7 @@ def safetensors(header: bytes, length: int | None = None) -> bytes:
 
 
 def tensor(shape: list[int], first: int, last: int) -> dict[str, Any]:
-    """What a header says of a tensor."""
+    """Return the entry of a tensor in a header."""
     return {"dtype": "F32", "shape": shape, "data_offsets": [first, last]}
 
 

@@ -49,13 +49,13 @@ def serving(data: Path, table: Path, **settings: Any) -> Iterator[TestClient]:
 
 
 def app_of(client: TestClient) -> FastAPI:
-    """The application that a client asks."""
+    """Return the application that a client calls."""
     assert isinstance(client.app, FastAPI)
     return client.app
 
 
 def parts_of(client: TestClient) -> AppState:
-    """What that application was made of."""
+    """Return the parts of a client's application."""
     return app_of(client).state.deps
 
 

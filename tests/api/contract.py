@@ -101,7 +101,7 @@ def conformance(
     without: str | None = None,
     seconds: float = SECONDS,
 ) -> str:
-    """What schemathesis found wrong, as it tells it; empty when nothing is. The same seed makes the same calls.
+    """Return the failures that schemathesis reports; empty if there are none. The same seed makes the same calls.
 
     Args:
         address: of the server.

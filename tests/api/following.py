@@ -9,7 +9,7 @@ PATIENCE_SECONDS = 900.0  # of a machine that has other things to do, kernels to
 
 
 class Client(Protocol):
-    """What httpx's client and the test client have in common."""
+    """Common interface of httpx's client and the test client."""
 
     def get(self, url: str, /) -> Any:
         """The response to a GET."""

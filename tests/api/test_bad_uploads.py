@@ -1,4 +1,4 @@
-"""Bad uploads, bombs too, are the client's problem: told in one line, they leave nothing and take little."""
+"""Bad uploads, bombs too, are the client's error: one line each; they leave no files and take little memory."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ ODD_MEDIA = ("multipart/form-data; boundary=x", "nonsense", "application/json; c
 
 @pytest.fixture(scope="module")
 def routes(client: TestClient) -> dict[str, set[str]]:
-    """What the application takes: path template -> methods."""
+    """Return the methods of each path template of the application."""
     assert isinstance(client.app, FastAPI)
     methods_by_path: dict[str, set[str]] = {}
     for context in iter_route_contexts(client.app.routes):
@@ -121,7 +121,7 @@ def test_odd_requests_are_refused_as_problems_or_taken(
             assert reply.status_code < 500, (method, route, options, reply.text)
             if reply.status_code >= 400:
                 assert_problem(reply)
-            elif "content" in options:  # many words at once need to be told nothing
+            elif "content" in options:  # queries of many words have defaults for all fields
                 by_default = path.startswith(("/query/segment", "/query/export"))
                 assert options["content"].endswith(b"{}") and by_default, (path, options)
 

@@ -112,7 +112,7 @@ class Faces:
         return [self.path, "--splats", self.splats, "--cameras", self.cameras]
 
     def run_command(self, command: str, *words: object) -> dict[str, Any]:
-        """What a command prints; nothing where it refuses."""
+        """Return the JSON that a command prints; empty if the command fails."""
         output = io.StringIO()
         with contextlib.redirect_stdout(output), contextlib.redirect_stderr(io.StringIO()):
             status = cli.main([command, *map(str, words), "--table", str(self.table), "--json"])

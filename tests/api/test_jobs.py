@@ -1,4 +1,4 @@
-"""What jobs and lifts tell of themselves over HTTP, and what jobs promise: keys, cancel, events, limits."""
+"""Jobs and lifts over HTTP: their documents, and keys, cancel, events and limits of jobs."""
 
 from __future__ import annotations
 
@@ -399,7 +399,7 @@ LACK = Unavailable("device", expected="a card", got="none", hint="take device=cp
 JOB_FOLDER = "/folder/of/a/job"
 
 
-def told(job: dict[str, Any]) -> dict[str, Any]:
+def fault_from(job: dict[str, Any]) -> dict[str, Any]:
     return child.run({"kind": "lift", "names": {}, "work": JOB_FOLDER} | job, Reporter(io.BytesIO()))["fault"]
 
 
@@ -410,15 +410,15 @@ def test_fault_of_a_job_names_what_is_missing_and_no_folder_of_the_server(monkey
         raise error
 
     monkeypatch.setattr("service.tasks.lift_as_ordered", lift)
-    assert told({}) == fault_of(LACK)
+    assert fault_from({}) == fault_of(LACK)
     error = OSError(errno.ENOSPC, "No space left on device")
-    assert told({})["kind"] == "no-space" and "delete" in told({})["hint"]
+    assert fault_from({})["kind"] == "no-space" and "delete" in fault_from({})["hint"]
     error = Unavailable("features", expected=f"disk in {tempfile.gettempdir()}", got="none")
-    assert told({})["expected"] == "disk in the server's temporary folder"
+    assert fault_from({})["expected"] == "disk in the server's temporary folder"
     error = Unavailable("checkpoint", expected=f"room for blocks in {JOB_FOLDER}", got="none")
-    assert told({})["expected"] == "room for blocks in the job's folder"
+    assert fault_from({})["expected"] == "room for blocks in the job's folder"
     error.__cause__ = OSError(errno.ENOSPC, "No space left on device")
-    assert told({})["kind"] == "no-space"
+    assert fault_from({})["kind"] == "no-space"
 
 
 def test_what_a_comparison_refuses_is_the_users_problem_and_names_no_path(
@@ -432,7 +432,7 @@ def test_what_a_comparison_refuses_is_the_users_problem_and_names_no_path(
         "splats": paths["splats"], "cameras": paths["cameras"], "features": [paths["features"]], "labels": {},
         "names": {path: f"{kind} sha256:x" for kind, path in paths.items()},
     }  # fmt: skip
-    fault = told(order)
+    fault = fault_from(order)
     assert fault["kind"] == "invalid-cameras" and str(tmp_path) not in json.dumps(fault)
     assert "sha256:x" in fault["argument"]
 

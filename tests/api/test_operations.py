@@ -1,4 +1,4 @@
-"""What an operator sees: readiness, versions, counters, the log, an orderly stop; nobody waits for another's disk."""
+"""Operation of the service: readiness, versions, counters, log, orderly stop; slow disks block no other request."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def fails(client: TestClient, check: str) -> None:
 
 
 def samples(client: TestClient) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
-    """What /metrics says, by name and labels."""
+    """Return the samples of /metrics by name and labels."""
     reply = client.get("/metrics")
     assert reply.headers["content-type"] == "text/plain; version=0.0.4; charset=utf-8"
     families = text_string_to_metric_families(reply.text)
@@ -326,12 +326,12 @@ TOUCHES = {
     "open", "sqlite3.connect", "os.mkdir", "os.remove", "os.rename", "os.rmdir", "os.scandir", "os.listdir",
     "shutil.rmtree", "subprocess.Popen", "glob.glob",
 }  # fmt: skip
-sys.addaudithook(lambda event, given: [watch(event, given) for watch in AUDIT_HOOKS] and None)
+sys.addaudithook(lambda event, arguments: [watch(event, arguments) for watch in AUDIT_HOOKS] and None)
 
 
 @contextmanager
 def touches_on_the_loop(client: TestClient, patch: pytest.MonkeyPatch) -> Iterator[list[str]]:
-    """What the thread of the event loop does to our files and the database."""
+    """Record operations of the event loop's thread on files of the service and on its database."""
     assert client.portal is not None
     loop, root = client.portal.call(threading.get_ident), str(parts_of(client).store.files.root)
     roots = (root, str(Path(__file__).parents[2] / "service" / "web"))
@@ -530,7 +530,7 @@ def test_small_pages_together_are_the_large_one(tmp_path: Path, monkeypatch: pyt
                 assert server.ask("boss", "GET", f"/{path}", params=wrong).status_code == 422
 
 
-def test_very_many_names_are_told_apart_in_pages(client: TestClient) -> None:
+def test_very_many_names_are_distinct_in_pages(client: TestClient) -> None:
     document = cameras_document()
     frame, long = document["frames"][0], "a" * 400
     names = [f"{long}{number:04}" for number in range(SHOWN_CHARACTERS // 400 + 1)]

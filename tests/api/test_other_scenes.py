@@ -150,7 +150,7 @@ def test_checkpoints_are_refused_over_http_with_a_way_on(client: TestClient) -> 
     assert "checkpoint" in problem["got"] and "ns-export" in problem["hint"]
 
 
-def test_plan_is_told_before_the_order_of_plain_views_a_rig_and_a_panorama(
+def test_plan_comes_before_the_order_of_plain_views_a_rig_and_a_panorama(
     client: TestClient, scene_assets: SceneAssets
 ) -> None:
     jobs = client.get("/jobs").json()

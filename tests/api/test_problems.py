@@ -168,7 +168,9 @@ EXAMPLE = f"{NOTATIONS}, or a vector of 1 to 65536 finite numbers"
 
 
 @pytest.mark.parametrize("media", [None, "application/x-www-form-urlencoded", "text/plain"])
-def test_json_that_nothing_calls_json_is_told_of_the_header(client: TestClient, media: str | None) -> None:
+def test_json_without_its_content_type_gives_an_error_that_names_the_header(
+    client: TestClient, media: str | None
+) -> None:
     headers = {} if media is None else {"Content-Type": media}
     problem = assert_problem(client.post("/query", content=b'{"text": ["apple"]}', headers=headers))
     assert (problem["status"], problem["argument"], problem["expected"]) == (415, "Content-Type", "application/json")
@@ -246,7 +248,7 @@ def test_texts_have_a_length_together(client: TestClient, name: str) -> None:
     assert "4000" not in client.post("/query", json={"text": ["apple"], name: ["a" * 125] * 32}).text
 
 
-def test_missing_parameter_and_a_value_of_another_type_are_told(client: TestClient) -> None:
+def test_missing_parameter_and_a_value_of_another_type_are_named(client: TestClient) -> None:
     problem = assert_problem(client.get("/render"))
     assert (problem["argument"], problem["expected"], problem["got"]) == ("view", "a value", "nothing")
     order = {"splats": NO_ASSET, "cameras": NO_ASSET, "features": [NO_ASSET]}
@@ -293,7 +295,7 @@ def test_every_route_refuses_what_it_does_not_declare(client: TestClient) -> Non
         body: dict[str, Any] = {"json": {"text": ["x"]}} if method == "post" and path.startswith("/query") else {}
         problem = assert_problem(client.request(method, address, params={"colour": "red"}, **body))
         assert (problem["status"], problem["type"]) == (422, "/problems/invalid-request"), (method, path, problem)
-        if method != "post":  # where the body is told of first
+        if method != "post":  # there the body's error comes first
             assert (problem["argument"], problem["got"]) == ("colour", "'colour'"), (method, path, problem)
             expected = f"one of {', '.join(declared_names)}" if declared_names else "no parameters"
             assert set(problem["expected"].split(", ")) == set(expected.split(", ")), (method, path, problem)

@@ -109,7 +109,7 @@ def start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Start]:
 
 
 def read_calls(folder: Path) -> list[tuple[str, list[str]]]:
-    """The calls that were asked, with those that were told to wait behind each."""
+    """Return the calls in the order of their start, with the calls that waited behind each."""
     return [tuple(json.loads(line)) for line in (folder / "asked").read_text().splitlines()]
 
 

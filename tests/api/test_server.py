@@ -42,7 +42,7 @@ ROOT = Path(__file__).parents[2]
 
 @contextmanager
 def server(data: Path, table: Path, stderr: IO[str] | None = None) -> Iterator[str]:
-    """A server process; its address. It ends with status 0 when it is told to."""
+    """Run a server process and yield its address. On SIGTERM it must exit with status 0."""
     encoders = ["--encoder", f"table:{table}", "--text-space", f"tiny=table:{table}"]
     command = [sys.executable, "-m", "service", "--port", "0", "--data", str(data), *encoders]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=stderr, text=True, cwd=ROOT)
@@ -156,7 +156,7 @@ def test_setting_that_cannot_be_is_one_line_at_the_start(
         (save({"embeddings": np.eye(2)}, {"words": '["cat"]'}), "1 words and embeddings [2, 2]"),
     ],
 )
-def test_text_table_that_is_none_is_told_at_the_start(
+def test_invalid_text_table_is_an_error_at_the_start(
     content: bytes | None, messages: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     table = tmp_path / "words.safetensors"
@@ -226,7 +226,7 @@ def test_default_encoder_stands_in_for_other_spaces_only_where_the_operator_chos
         encoder_spec(server_settings, "none", None)
 
 
-def test_encoder_is_told_without_its_file() -> None:
+def test_label_of_an_encoder_hides_its_file() -> None:
     assert encoder_label("minilm") == "minilm"
     assert encoder_label("table:/private/words.safetensors") == encoder_label("/private/w.safetensors") == "table"
     assert encoder_label("open_clip:ViT-B-32/laion2b") == "open_clip:ViT-B-32/laion2b"
@@ -362,7 +362,7 @@ def test_lift_in_memory_is_shown_until_it_is_interrupted_or_killed(folder: Path)
     assert "Fatal" not in (folder / "stderr").read_text()
 
 
-def test_lift_whose_files_moved_is_told(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_lift_whose_files_moved_is_an_error(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "s.ply").unlink()
     for lift, messages in (
         ("l.safetensors", "its splats at"),

@@ -135,7 +135,7 @@ def test_requests_over_more_connections_than_allowed_are_503_until_one_ends(tmp_
 
 
 def answers(address: tuple[str, int]) -> bool:
-    """Whether the service answers one that comes now."""
+    """Return True if the service accepts a new connection and answers it."""
     with contextlib.suppress(httpx.TransportError):  # its connection may be one of those that are closed
         return httpx.get(f"http://{address[0]}:{address[1]}/healthz").status_code == 200
     return False

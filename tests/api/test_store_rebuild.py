@@ -202,7 +202,7 @@ def without_keys(server: KeyedServer) -> None:
 
 
 def statuses(server: KeyedServer, secret: str | None = None) -> dict[str, int]:
-    """What each route answers that needs a key; no body, so what is let in is refused for that or found missing."""
+    """Return the status of each route that needs a key; requests lack a body and address nothing that exists."""
     headers = {} if secret is None else bearer(secret)
     report = {}
     for method, path in every_route(app_of(server.client)):

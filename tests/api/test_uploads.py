@@ -1,4 +1,4 @@
-"""What uploads promise: one asset for the same bytes, however they come; downloads; no more than there is room."""
+"""Uploads: one asset for the same bytes, however they come; downloads; no more than there is room."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_pack_that_was_damaged_or_lost_on_the_disk_is_not_named_anew(client: Tes
     assert client.delete(f"/assets/{asset}").status_code == 204
 
 
-def test_pack_that_takes_too_long_to_name_anew_is_told_as_a_slow_upload_is(
+def test_pack_that_takes_too_long_to_rename_gives_the_error_of_a_slow_upload(
     client: TestClient, scene_assets: SceneAssets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(assets, "run_sandboxed", lambda *arguments: None)
@@ -109,7 +109,7 @@ def test_long_header_of_a_pack_is_changed_outside_of_the_server(
     assert sum(chunk_sizes) < 1 << 20  # what it begins with is padded no more
 
 
-def test_files_sent_as_another_kind_are_told_where_they_belong(client: TestClient, scene: TinyScene) -> None:
+def test_error_of_a_file_of_another_kind_names_the_right_route(client: TestClient, scene: TinyScene) -> None:
     problem = assert_problem(client.put("/assets/splats", content=scene.cameras))
     assert "cameras" in problem["got"] and "/assets/cameras" in problem["hint"]
 
@@ -173,7 +173,7 @@ def test_asset_in_use_stays(client: TestClient, scene_assets: SceneAssets, lift:
 
 
 @pytest.mark.parametrize("remaining", [None, b"", b"another"])
-def test_file_that_somebody_damaged_is_told_and_an_upload_mends_it(
+def test_damaged_file_is_reported_and_an_upload_repairs_it(
     client: TestClient, data: Path, remaining: bytes | None
 ) -> None:
     rows = splat_rows()

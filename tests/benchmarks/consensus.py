@@ -90,12 +90,12 @@ def still_life_scene(
         for view, view_features in observe(scene, raster, encoder, mistakes, seed).items()
     }
     held_out = {view: torch.from_numpy(true_labels(scene, raster, view)[0]) for view in scene.held_out}
-    classes = normalize(torch.from_numpy(np.asarray(encoder.encode(scene.things))).float(), dim=1)
+    classes = normalize(torch.from_numpy(np.asarray(encoder.encode(scene.objects))).float(), dim=1)
     object_rows, view_features = (
-        torch.from_numpy(scene.splat_things),
+        torch.from_numpy(scene.splat_objects),
         evaluated_splats(scene.splats, scene.cameras, views),
     )
-    return Truth(raster, scene.cameras, scene.things, classes, object_rows, view_features, held_out), views
+    return Truth(raster, scene.cameras, scene.objects, classes, object_rows, view_features, held_out), views
 
 
 def ranked(truth: Truth, lifted: lc.LiftResult, values: Tensor) -> float:

@@ -53,7 +53,7 @@ from tests.benchmarks.extreme_measures import (
     view_of,
     weights_of,
 )
-from tests.scenes import ROW, TURNED, camera_at_origin, splats_at
+from tests.scenes import ROTATION, ROW, camera_at_origin, splats_at
 
 CENTRE = 6 * 16 + 8  # the ray through the axis of ``camera_at_origin``
 MIDDLE = [(0.0, 0.0, 2.0)]  # one splat there
@@ -113,7 +113,7 @@ SHAPES: tuple[Extreme, ...] = (
     view_of("scales of 1e6", at(ROW, math.log(1e6)), lambda A: A.max() > 0.7, text="larger than the scene"),
     view_of("needles and sheets: axes 1e6 apart",
         at(ROW, [[0, -13.8, -13.8], [-13.8, 0, -13.8], [-13.8, -13.8, 0], [0, 0, -13.8], [-13.8, 0, 0]],
-            quats=TURNED),
+            quats=ROTATION),
         _visible),
     view_of("discs seen edge-on, to 1e-9 of a radian",
         at([(0.0, 0.0, 2.0 + 0.1 * k) for k in range(4)], [-0.5, 0.3, -16.0], camera=camera_at_origin(24, 24),
@@ -122,8 +122,8 @@ SHAPES: tuple[Extreme, ...] = (
     view_of("quaternions of zero", at(ROW, [0.0, -2.0, -3.0], quats=(0.0, 0.0, 0.0, 0.0)),
         like=at(ROW, [0.0, -2.0, -3.0]), text="zero quaternion"),
     view_of("quaternions of length 1e-18 and 1e18",
-        at(ROW, [0.0, -2.0, -3.0], quats=[np.multiply(TURNED, 10.0**k) for k in (-18, 18, 0, 9, -9)]),
-        like=at(ROW, [0.0, -2.0, -3.0], quats=TURNED)),
+        at(ROW, [0.0, -2.0, -3.0], quats=[np.multiply(ROTATION, 10.0**k) for k in (-18, 18, 0, 9, -9)]),
+        like=at(ROW, [0.0, -2.0, -3.0], quats=ROTATION)),
     view_of("dust under the mip filter's compensation", at(ROW, DUST, params=lc.CompositingParams(antialiased=True)),
         lambda A: A.max() == 0, kernels=GAUSSIAN, text="smaller than 1e-07 scene units"),
     # A cylinder.
@@ -385,15 +385,15 @@ LENGTHS: tuple[Extreme, ...] = (
     lift_of("F = 8192", checkerboard(channels=8_192), kernels=GAUSSIAN),
     *(
         lift_of(
-            f"values to {scale:g}, given in {str(given).removeprefix('torch.')}, to be stored in float16",
-            checkerboard(5, 40, scale, given),
+            f"values to {scale:g}, given in {str(dtype).removeprefix('torch.')}, to be stored in float16",
+            checkerboard(5, 40, scale, dtype),
             lambda lift, stored=stored: lift.features.dtype == stored,
             settings={"dtype": "float16"},
             kernels=GAUSSIAN,
             bound=STEP if stored == torch.float16 else SUM,
             text="" if stored == torch.float16 else "float16 does not hold",
         )
-        for scale, given, stored in (
+        for scale, dtype, stored in (
             (65_504.0, torch.float16, torch.float16),
             (65_504.0, torch.float32, torch.float16),
             (70_000.0, torch.float32, torch.float32),

@@ -117,7 +117,7 @@ def scene_of(kind: Kind) -> Scene:
         return Scene(CpuRaster(splats), lc.Cameras(tuple(cameras)), held_out, owners)
     pieces = still_life_pieces() if kind.scene == "still life" else heap(kind.seed)
     scene = still_life(kind.seed, kind.views, kind.density, pieces)
-    owners = np.stack([scene.splat_things, scene.splat_parts], axis=1)
+    owners = np.stack([scene.splat_objects, scene.splat_parts], axis=1)
     cameras = lc.Cameras(tuple(halved(camera) for camera in scene.cameras.values()))
     return Scene(CpuRaster(scene.splats), cameras, frozenset(scene.held_out), owners)
 

@@ -220,7 +220,7 @@ def words_of(folder: Path, packs: Sequence[str], strides: Sequence[int]) -> Iter
         labels = truth.classes.numpy(), truth.objects.numpy()
         yield from compare_levels(truth, views, {f"{pack}, {len(views)} views: things": labels})
     scene, (other, views) = still_life(STILL_LIFE_SEED), still_life_scene("hard", STILL_LIFE_SEED, encoder=encoder)
-    queries = {"things": (scene.things, scene.splat_things), "parts": (scene.parts, scene.splat_parts)}
+    queries = {"things": (scene.objects, scene.splat_objects), "parts": (scene.parts, scene.splat_parts)}
     name = f"still life, {len(views)} views"
     yield from compare_levels(
         other, views, {f"{name}: {of}": (encoder.encode(a), b) for of, (a, b) in queries.items()}

@@ -339,9 +339,9 @@ def fidelity_rows(folder: Path, missing: Sequence[tuple[str, str]]) -> Iterator[
         strength = smoothness if smoothness == "auto" else float(smoothness)
         result = lc.lift(splats, cameras, views, diagnostic_rays=0, smoothness=strength, progress=False).cpu()
         fidelity = float(torch.cat([cosines(result, view) for view in maps]).mean())
-        chosen = result.diagnostics.get("smoothing", {}).get("smoothness", 0.0)
+        selected_strength = result.diagnostics.get("smoothing", {}).get("smoothness", 0.0)
         head = {"table": "fidelity", "features": f"{name}, {len(views)} views", "name": name, "kind": smoothness}
-        yield {**head, "chosen": chosen, "fidelity": fidelity}
+        yield {**head, "chosen": selected_strength, "fidelity": fidelity}
 
 
 def at_cells(camera: Camera, width: int, height: int) -> Camera:

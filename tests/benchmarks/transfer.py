@@ -67,14 +67,14 @@ class TransferTruth:
     def of_still_life(cls) -> TransferTruth:
         """The truth of the generated scene, whose masks have mistakes."""
         scene = still_life()
-        raster, words = CpuRaster(scene.splats), list(dict.fromkeys([*scene.things, *scene.parts]))
+        raster, words = CpuRaster(scene.splats), list(dict.fromkeys([*scene.objects, *scene.parts]))
         vectors = np.random.default_rng(7).standard_normal((len(words), 64)).astype(np.float32)
         encoder = TableEncoder("words", words, vectors)
         return cls(
             scene.splats,
             scene.cameras,
-            list(scene.things),
-            scene.splat_things.astype(int),
+            list(scene.objects),
+            scene.splat_objects.astype(int),
             {view: true_labels(scene, raster, view)[0] for view in scene.held_out},
             encoder,
             observe(scene, raster, encoder, Mistakes(), 7),

@@ -1,4 +1,4 @@
-"""Chromium without a screen, told what to do over two pipes: DevTools' own protocol, with no driver between."""
+"""Headless Chromium, controlled over two pipes by the DevTools protocol, without a driver."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class Browser:
         self.until("document.readyState === 'complete' && location.href !== 'about:blank'")
 
     def value(self, script: str) -> Any:
-        """What an expression, or a promise of it, comes to."""
+        """Return the value of an expression, or of its promise."""
         result = self._call("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
         if "exceptionDetails" in result:
             raise AssertionError(f"{script}: {result['exceptionDetails']}")
@@ -147,7 +147,7 @@ class Browser:
         ])  # fmt: skip
 
     def violations(self) -> dict[str, list[str]]:
-        """What axe finds on the page that is not minor: elements by rule."""
+        """Return the violations on the page that axe does not call minor: elements by rule."""
         self.value(f"(() => {{ {AXE}; }})()")
         problems = self.value("axe.run(document).then(all => all.violations)")
         return {

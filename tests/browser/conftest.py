@@ -25,7 +25,7 @@ NO_BROWSER = "no Chromium on this machine (apt-get install chromium)"
 
 @dataclass(frozen=True)
 class PageServer:
-    """Where the service is, and its one lift."""
+    """Address, lift and store of a running service."""
 
     address: str
     lift: str

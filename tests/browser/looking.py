@@ -1,4 +1,4 @@
-"""What tests read of the page: whether it is at rest, and where the picture has which colour."""
+"""Reads of the page in tests: its state of rest, and positions of colours in the picture."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ def text_of(browser: Browser, selector: str) -> str:
 
 
 def columns(browser: Browser, colour: str | None = None, near: float = 0.35, *, canvas: str = "#scene") -> list[int]:
-    """Where the 3D picture shows a colour; without one, where it shows anything."""
+    """Return the columns of the 3D picture, in hundredths of its width, with this colour; without one, with any."""
     browser.until("splatlift.viewer.settled && (!splatlift.beside.link || splatlift.beside.left?.settled)")
     return browser.value(f"{COLUMNS}({f'[{colour}]' if colour else 'null'}, {near}, '{canvas}')")
 
 
 def splat_at(browser: Browser, row: int) -> tuple[float, float]:
-    """Where a splat is seen in the 3D picture, as shares of its width and height."""
+    """Return the position of a splat in the 3D picture, as shares of its width and height."""
     place = f"splatlift.viewer.place([...splatlift.viewer.floats.slice(8 * {row}, 8 * {row} + 3)])"
     box = "splatlift.viewer.canvas.getBoundingClientRect()"
     x, y = browser.value(f"(({{x, y}}, box) => [x / box.width, y / box.height])({place}, {box})")

@@ -1,4 +1,4 @@
-"""What is dropped on the page: files that are planned, compared and lifted, lift files and photos; names of lifts."""
+"""Files dropped on the page: inputs that are planned, compared and lifted, lift files and photos; names of lifts."""
 
 from __future__ import annotations
 

@@ -477,7 +477,7 @@ def test_things_are_listed_without_a_question_and_shown(page: Browser) -> None:
     assert page.value("splatlift.ask.now.count") == 20
 
 
-def test_example_that_nothing_understands_is_told_and_taken_back(page: Browser) -> None:
+def test_invalid_example_shows_an_error_and_is_removed(page: Browser) -> None:
     page.write("#example", "left:7,12")
     page.press("#by-example button")
     page.until(f"{EXAMPLES}.join() === 'left:7,12'")

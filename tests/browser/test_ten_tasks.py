@@ -1,5 +1,5 @@
-"""What a stranger does: the example is opened, things are found, corrected, named and taken away, two lifts are
-compared, and a link opens it all again.
+"""Tasks of a new user: open the example, find objects, correct, name and export them, compare two lifts, and open
+the same state by a link.
 
 Set SPLATLIFT_PICTURES to a folder to have a picture of each step.
 """

@@ -21,18 +21,18 @@ def text(name: str) -> str:
 
 
 def blocks(name: str, language: str) -> list[str]:
-    """The fenced blocks of a language."""
+    """Return the fenced blocks of a language."""
     return re.findall(rf"^```{language}\n(.*?)^```", text(name), flags=re.MULTILINE | re.DOTALL)
 
 
 def inline_code(name: str) -> list[str]:
-    """What stands in backticks outside of the fenced blocks, each on one line."""
+    """Return the inline code outside of fenced blocks, each on one line."""
     prose = re.sub(r"^```.*?^```", "", text(name), flags=re.MULTILINE | re.DOTALL)
     return [" ".join(code.split()) for code in re.findall(r"`([^`]+)`", prose)]
 
 
 def shell_commands(name: str) -> list[str]:
-    """What lines of the shell blocks give to ``splatlift``, whatever stands before it."""
+    """Return the arguments of ``splatlift`` in lines of shell blocks, whatever precedes the command."""
     lines = "\n".join(blocks(name, "sh")).splitlines()
     # Not the first of `run splatlift splatlift keys`, which names a service of the compose file.
     matches = [re.search(r"(?:^|[ (])(?:\.venv/bin/)?splatlift (?!splatlift )([^#()]+)", line) for line in lines]

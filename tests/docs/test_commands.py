@@ -1,4 +1,4 @@
-"""What the documents tell people to type, open and set exists."""
+"""Commands, addresses and settings of the documents exist."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def _named_in_sentences(folder: Path) -> Iterator[tuple[str, ...]]:
                     yield (command, *nested, *(word.rstrip(".") for word in words if word.startswith("--")))
 
 
-def test_every_command_is_told_and_every_option_has_help() -> None:
+def test_every_command_is_documented_and_every_option_has_help() -> None:
     parsers = _commands()
     sentences = (code.removeprefix("splatlift ") for code in inline_code(GUIDE) if code.startswith("splatlift "))
     sentence = {command.split()[0] for command in (*shell_commands(GUIDE), *sentences)}
@@ -179,12 +179,12 @@ def test_every_field_of_a_question_is_in_the_sites_table_with_its_default() -> N
         assert field.description and rows[name] == f"{default} | {field.description}", name
 
 
-def test_every_preset_is_told() -> None:
+def test_every_preset_is_documented() -> None:
     heads = " ".join(table_heads(SETTINGS))
     assert all(f"`{preset}`" in heads for preset in Preset)
 
 
-def test_the_services_help_tells_every_setting_with_its_default_and_meaning(
+def test_the_services_help_lists_every_setting_with_its_default_and_meaning(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
@@ -199,7 +199,7 @@ def test_the_services_help_tells_every_setting_with_its_default_and_meaning(
         assert field.description and " ".join(field.description.split()) in " ".join(lines.split()), name
 
 
-def test_settings_of_the_service_that_are_told_exist_and_have_that_default() -> None:
+def test_documented_settings_of_the_service_exist_and_have_that_default() -> None:
     sentence = dict(re.findall(r"^\| `SPLATLIFT_([A-Z_]+)` \| (.*?) \|", text(SERVICE), flags=re.MULTILINE))
     assert {"DATA", "HOST", "KEYS", "TEXT_SPACES"} <= sentence.keys()
     for name, documented_default in sentence.items():

@@ -116,7 +116,7 @@ def test_versions_come_from_the_lock_and_torch_is_first() -> None:
     assert names <= locked
 
 
-def test_one_version_is_told_everywhere() -> None:
+def test_one_version_is_the_same_everywhere() -> None:
     assert f'\nversion = "{__version__}"\n' in text("pyproject.toml")
     versions = re.findall(r"^## ([\d.]+)(.*)$", text("CHANGELOG.md"), re.MULTILINE)
     assert next(version for version, note in versions if "not released" not in note) == __version__

@@ -19,7 +19,7 @@ from .readme import ROOT
 
 
 def run(script: str, *arguments: object) -> str:
-    """What an example prints."""
+    """Return the output of an example."""
     command = [sys.executable, str(ROOT / "examples" / script), *map(str, arguments)]
     return subprocess.run(command, check=True, capture_output=True, text=True).stdout
 

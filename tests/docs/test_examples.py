@@ -385,7 +385,7 @@ def test_notebook_is_small_and_its_cells_ran_in_order() -> None:
 
 @pytest.fixture
 def loop() -> dict[str, Any]:
-    """What a training loop holds: parameters, poses and photos of two clouds of splats, and an image encoder."""
+    """Return the state of a training loop: parameters, poses and photos of two clouds of splats, an image encoder."""
     random = torch.Generator().manual_seed(5)
     means = 0.25 * torch.randn(400, 3, generator=random)
     means[:200, 0] -= 0.8

@@ -1,4 +1,4 @@
-"""Compile what the GPU backend launches for cards that are not here: ``python -m tests.gpu.compiling``.
+"""Compile the GPU backend's kernels for GPUs that this machine lacks: ``python -m tests.gpu.compiling``.
 
 The products run on tensors of the CPU as ever, but each launch is compiled from the arguments that it came with and
 the hints that Triton takes from them (which numbers are one, which numbers and addresses are multiples of 16), down
@@ -76,7 +76,7 @@ def as_launched(kernel: Any, arguments: tuple[object, ...], warps: int, constant
 
 
 def compiled(launch: Launch, capability: int) -> dict[str, Any]:
-    """Compile a launch for a card, and say what came of it."""
+    """Compile a launch for a GPU of this compute capability; return facts of the machine code."""
     target = GPUTarget("cuda", capability, 32)
     backend, names = make_backend(target), [param.name for param in launch.kernel.params]
     types = {name: kind for name, (kind, _) in zip(names, launch.arguments, strict=True)}
@@ -105,7 +105,7 @@ def _stack(machine_code: bytes) -> int:
 
 
 def launches_of(work: Callable[[], None]) -> dict[Launch, None]:
-    """What the work launches, each once."""
+    """Return the kernel launches of the work, each once."""
     launches: dict[Launch, None] = {}
 
     def note(kernel: Any, programs: int, *arguments: Any, warps: int = launching.WARPS, **constants: object) -> None:

@@ -1,4 +1,4 @@
-"""Kernels that no card here can run are at least machine code of one: a compiler takes less than an interpreter."""
+"""Kernels compile to machine code without a GPU: the compiler accepts less than the interpreter."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SHARED_MEMORY = 64 * 1024  # bytes a block: what cards of 2018 have, later ones 
 
 @pytest.fixture(scope="module")
 def reports() -> list[dict]:
-    """What ``tests.gpu.compiling`` prints."""
+    """Return the reports that ``tests.gpu.compiling`` prints, one a line."""
     environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
     process = subprocess.run(
         [sys.executable, "-m", "tests.gpu.compiling"],
@@ -35,13 +35,13 @@ def reports() -> list[dict]:
 
 @pytest.fixture(scope="module")
 def compiled(reports) -> list[dict]:
-    """A report of every kernel that the products launch, and card."""
+    """Return a report for each kernel that the products launch, and each GPU."""
     return [report for report in reports if "card" in report]
 
 
 @pytest.fixture(scope="module")
 def lifts(reports) -> list[dict]:
-    """What lifts of each kind of splat launch, and what of it a warm-up had not."""
+    """Return a report for each kind of splat: launches of a lift, and those that a warm-up did not compile."""
     return [report for report in reports if "card" not in report]
 
 

@@ -1,4 +1,4 @@
-"""What the GPU backend promises beyond the conformance suite (tests/properties/test_raster_conformance.py)."""
+"""Promises of the GPU backend beyond the conformance suite (tests/properties/test_raster_conformance.py)."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ def as_parts(weights: RegionWeights) -> list[torch.Tensor]:
 
 
 def top_two(raster: GpuRaster, camera: Camera) -> list[torch.Tensor]:
-    """Region weights in two walks, of a scene of 16 splats."""
+    """Return top-2 region weights, which take two passes, of a scene of 16 splats."""
     choice = Weighting(1, Selection.TOP_K, count=2)
     return as_parts(raster.region_weights(camera, random_grid(8), PARAMS, choice))
 
 
 def every_product(raster: GpuRaster, camera: Camera) -> list[torch.Tensor]:
-    """One of each."""
+    """Return one of each product."""
     image = torch.rand(camera.height, camera.width, 2, generator=torch.Generator().manual_seed(0))
     pixels = torch.tensor([[16, 35], [0, 0], [10, 20], [1, 0]], dtype=torch.int32)
     rows = raster.ray_rows(camera, pixels, PARAMS)
@@ -71,7 +71,7 @@ def test_no_bit_depends_on_the_size_of_blocks(monkeypatch, kernel):
 
 
 def test_memory_that_runs_out_halves_the_block(monkeypatch):
-    """A card with less room than asked for: the same answer from smaller blocks."""
+    """On a GPU with less free memory than a block needs, smaller blocks give the same result."""
     splats, camera = random_splats(8, 24), random_camera(8, 20, 36)
     expected = gpu_raster(splats).row_sums(camera, PARAMS)
     tries = []
@@ -136,7 +136,7 @@ def test_memory_that_runs_out_for_good_is_an_error_in_words(monkeypatch, error):
         raster.row_sums(random_camera(0), CompositingParams())
     assert raised.value.got == str(error) and raised.value.hint
     monkeypatch.setattr("liftcore.raster.gpu.raster.Frame", lambda *_: broken())
-    with pytest.raises(RuntimeError, match="illegal"):  # what is no lack of memory is not told as one
+    with pytest.raises(RuntimeError, match="illegal"):  # an error that is no lack of memory is not reported as one
         raster.row_sums(random_camera(0), CompositingParams())
 
 

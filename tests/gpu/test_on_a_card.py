@@ -1,4 +1,4 @@
-"""Lifts whose tensors are a card's, and what people do with them: on a card of paper where there is no other."""
+"""Lifts with tensors on a GPU, and uses of their results; on a fake GPU where there is none."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MAPS += [{"loss": "huber"}, {"robust_steps": 2}, {"cg_steps": 1}, {"dtype": "flo
 MAPS += [{"aggregation": True}, {"aggregation": True, "aggregation_resolve": True}, {"objects": True}]
 MAPS += [{"smoothness": 1.0}, {"smoothness": "auto"}]
 MAPS += [{"aggregation": True, "aggregation_clusters": "graph"}, {"engine": lc.LocalEngine(1)}]
-CASES = [*((False, how) for how in MAPS), *((True, how) for how in GRIDS)]
+CASES = [*((False, options) for options in MAPS), *((True, options) for options in GRIDS)]
 
 
 @pytest.fixture(autouse=True)
@@ -52,7 +52,7 @@ def lifted(paths: list[Path], views: Any = None, **options: Any) -> lc.LiftResul
 
 
 @pytest.mark.parametrize(
-    ("grids", "options"), CASES, ids=[f"{number} {' '.join(how)}" for number, (_, how) in enumerate(CASES)]
+    ("grids", "options"), CASES, ids=[f"{number} {' '.join(options)}" for number, (_, options) in enumerate(CASES)]
 )
 def test_a_lift_on_a_card_is_the_processors(paths: list[Path], grids: bool, options: dict[str, Any]) -> None:
     views = None

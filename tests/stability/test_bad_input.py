@@ -1,4 +1,4 @@
-"""What a user can get wrong: one line on stderr, exit 2, nothing half-written, and stdout empty with --json."""
+"""Mistakes of users: one line on stderr, exit 2, nothing half-written, and stdout empty with --json."""
 
 from __future__ import annotations
 

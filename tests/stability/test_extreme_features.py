@@ -1,4 +1,4 @@
-"""The solution at its extremes, beside the table's rows: agreement, readings, and light that never ends."""
+"""Extremes of the solution that no table has: agreement, readings, and steps that diverge."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_agreement_is_the_same_at_any_length_of_the_vectors():
 @pytest.mark.parametrize("scale", [1e-30, 1e-7, 1e15])
 def test_diagnostics_and_scores_are_the_same_at_any_length(scale):
     views = [{f"v{k}": checkerboard(5 + k, 40, size) for k in range(2)} for size in (1.0, scale)]
-    first, second = (lifted(own, preset="row-sum", reference_channels=4) for own in views)
+    first, second = (lifted(observations, preset="row-sum", reference_channels=4) for observations in views)
     for key in ("beta", "bound", "reference"):
         assert numbers(second.diagnostics[key]) == pytest.approx(numbers(first.diagnostics[key]), rel=2e-3, abs=1e-3)
     question = first.features[first.seen][:1].numpy()

@@ -85,7 +85,7 @@ def about_x(angle: float) -> tuple[float, float, float, float]:
 
 
 def test_a_ray_that_has_stopped_takes_nothing_of_the_discs_behind():
-    # The released 2DGS kernel does not ask in its inner loop whether a ray is done: in later batches it adds
+    # The released 2DGS kernel does not check in its inner loop if a ray is done: in later batches it adds
     # alpha times the transmittance that the ray had when it stopped.
     means = [(0.0, 0.0, 1.0 + 0.01 * k) for k in range(700)]
     splats = splats_at(means, log_scales=1.0, logits=[2.0] * 8 + [-2.0] * 692, kernel=DISC)
@@ -99,7 +99,7 @@ def test_a_ray_that_has_stopped_takes_nothing_of_the_discs_behind():
 
 @pytest.mark.parametrize("thinness", [1e-2, 1e-4, 1e-6])
 def test_hairs_askew_keep_their_digits_far_from_their_middle(thinness):
-    # Along pixel centres, two columns a row, and 0.8 of the thin scale beside them: from pixel to pixel s changes
+    # Along pixel centres, two columns a row, and 0.8 of the thin scale off them: from pixel to pixel s changes
     # by up to a million, and here it is small.
     angle, offset = math.atan2(1.0, 2.0), 0.8 * thinness
     splats = splats_at(

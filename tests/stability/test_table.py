@@ -1,4 +1,4 @@
-"""Every row of the extremes' tables holds: the error is within its bound, the claim is so, and the user is told."""
+"""Each row of the tables of extremes holds: error within its bound, claim true, warning given."""
 
 import pytest
 

@@ -26,7 +26,7 @@ LEAST_REGION = 25  # pixels; SAM drops smaller masks, and so do we
 
 @dataclass(frozen=True)
 class Mistakes:
-    """How often masks go wrong, and how far. Shares are of a view's regions unless said otherwise."""
+    """Frequencies and sizes of mistakes in masks. Shares are of a view's regions unless noted otherwise."""
 
     merged: float = 0.12  # one mask with a neighbour's, one vector between both
     split: float = 0.08  # cut in two by a line
@@ -37,14 +37,14 @@ class Mistakes:
 
 
 def true_labels(scene: StillLife, raster: Raster, view: str) -> np.ndarray:
-    """What every ray shows: [2, H, W] i32, objects and parts; -1 where the ray misses the scene."""
+    """Return the labels of each ray: [2, H, W] i32, objects and parts; -1 where the ray misses the scene."""
     onehot = torch.nn.functional.one_hot(torch.from_numpy(scene.splat_parts).long(), len(scene.parts))
     sums = raster.render(scene.cameras[view], onehot.to(torch.float32), CompositingParams()).numpy()
-    owner = np.array(scene.thing_of_part)
-    things = np.zeros((*sums.shape[:2], len(scene.things)), np.float32)
-    for part, thing in enumerate(owner):
-        things[:, :, thing] += sums[:, :, part]
-    labels = np.stack([things.argmax(axis=2), sums.argmax(axis=2)]).astype(np.int32)
+    owner = np.array(scene.object_of_part)
+    object_weights = np.zeros((*sums.shape[:2], len(scene.objects)), np.float32)
+    for part, object_row in enumerate(owner):
+        object_weights[:, :, object_row] += sums[:, :, part]
+    labels = np.stack([object_weights.argmax(axis=2), sums.argmax(axis=2)]).astype(np.int32)
     labels[:, sums.sum(axis=2) < LEAST_ROW_SUM] = NO_LABEL
     return labels
 
@@ -62,7 +62,7 @@ def observe(
         seed: of the mistakes.
     """
     rng = np.random.default_rng(seed)
-    vectors = (encoder.encode(scene.things), encoder.encode(scene.parts))
+    vectors = (encoder.encode(scene.objects), encoder.encode(scene.parts))
     observed = {}
     for camera in scene.cameras.values():
         if camera.name in scene.held_out:

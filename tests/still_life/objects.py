@@ -1,4 +1,4 @@
-"""What stands on the table: surfaces, colours and how many splats each takes."""
+"""Objects on the table: surfaces, colours and numbers of splats."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 class Piece:
     """One surface of a part of an object."""
 
-    thing: str  # the object's name
-    part: str  # the part's name
+    object_name: str
+    part: str  # its name
     surface: Callable[[np.ndarray, np.ndarray], np.ndarray]
     colour: tuple[float, float, float]  # sRGB
     splats: int
@@ -26,11 +26,11 @@ class Piece:
 
 def still_life_pieces() -> list[Piece]:
     """All pieces, background first. Decimetres, z up, the table top at z = 0, cameras on the side of -y."""
-    return [*_room(), *_mug(), *_bowl(), *_fruit(), *_book(), *_lamp(), *_plant()]
+    return [*_background(), *_mug(), *_bowl(), *_fruit(), *_book(), *_lamp(), *_plant()]
 
 
 def small_things() -> list[Piece]:
-    """A sword, a ring and a nut beside larger things on a cloth, with nothing around. Frame as above."""
+    """Return a sword, a ring and a nut near larger objects on a cloth, without a background. Frame as above."""
     cloth = surfaces.rectangle((-4.0, -3.0, 0.0), (8.0, 0.0, 0.0), (0.0, 6.0, 0.0))
     kettle = surfaces.lathe((-1.6, 0.9, 0.0), (0.9, 1.15, 1.0, 0.5, 0.1), (0.0, 0.5, 1.2, 1.7, 1.9))
 
@@ -56,7 +56,7 @@ def small_things() -> list[Piece]:
     ]
 
 
-def _room() -> list[Piece]:
+def _background() -> list[Piece]:
     top = surfaces.rectangle((-7.0, -4.2, 0.0), (14.0, 0.0, 0.0), (0.0, 7.2, 0.0))
     front = surfaces.rectangle((-7.0, -4.2, -0.35), (14.0, 0.0, 0.0), (0.0, 0.0, 0.35))
     return [

@@ -24,7 +24,7 @@ TARGET = np.array([0.0, 0.2, 1.0])  # decimetres, what the cameras look at
 COVERAGE = 0.85  # standard deviation of a splat over the mean distance of its neighbours
 STRETCH = 1.25  # a splat is longer along its surface's first direction by this, and narrower across
 FLATNESS = 0.08  # thickness over width
-LIGHT = np.array([-5.0, -7.0, 9.0])  # decimetres, a window in front on the left
+LIGHT_POSITION = np.array([-5.0, -7.0, 9.0])  # decimetres, a window in front on the left
 AMBIENT, WINDOW = 0.5, 0.6
 
 
@@ -34,16 +34,16 @@ class StillLife:
 
     splats: Splats
     cameras: Cameras  # the lifted views and the held-out ones
-    held_out: tuple[str, ...]  # names of the views that no feature is given for
-    things: tuple[str, ...]  # object names
+    held_out: tuple[str, ...]  # names of the views without features
+    objects: tuple[str, ...]  # object names
     parts: tuple[str, ...]  # part names
-    thing_of_part: tuple[int, ...]  # part -> object
+    object_of_part: tuple[int, ...]  # part -> object
     splat_parts: np.ndarray  # [P] i32, rows of parts
 
     @property
-    def splat_things(self) -> np.ndarray:
-        """[P] i32, rows of things."""
-        return np.array(self.thing_of_part, dtype=np.int32)[self.splat_parts]
+    def splat_objects(self) -> np.ndarray:
+        """Return the object of each splat, [P] i32, rows of `objects`."""
+        return np.array(self.object_of_part, dtype=np.int32)[self.splat_parts]
 
 
 def still_life(
@@ -53,25 +53,25 @@ def still_life(
 
     Args:
         seed: of everything random in it.
-        views: how many cameras stand on the arc; every fifth is held out.
+        views: number of cameras on the arc; every fifth is held out.
         density: share of the usual number of splats; fewer ones are larger.
-        pieces: what stands there; None: the still life.
+        pieces: surfaces of the scene; None: the still life.
     """
     rng = np.random.default_rng(seed)
-    chosen = still_life_pieces() if pieces is None else pieces
-    pieces = [replace(piece, splats=max(1, round(density * piece.splats))) for piece in chosen]
+    base_pieces = still_life_pieces() if pieces is None else pieces
+    pieces = [replace(piece, splats=max(1, round(density * piece.splats))) for piece in base_pieces]
     samples = [sample(piece.surface, piece.splats, rng) for piece in pieces]
     parts = tuple(dict.fromkeys(piece.part for piece in pieces))
-    things = tuple(dict.fromkeys(piece.thing for piece in pieces))
-    owner = {piece.part: things.index(piece.thing) for piece in pieces}
+    objects = tuple(dict.fromkeys(piece.object_name for piece in pieces))
+    owner = {piece.part: objects.index(piece.object_name) for piece in pieces}
     cameras = arc(views)
     return StillLife(
         splats=_splats(pieces, samples, rng),
         cameras=cameras,
         held_out=tuple(camera.name for camera in list(cameras.values())[2::5]),
-        things=things,
+        objects=objects,
         parts=parts,
-        thing_of_part=tuple(owner[part] for part in parts),
+        object_of_part=tuple(owner[part] for part in parts),
         splat_parts=np.concatenate([np.full(piece.splats, parts.index(piece.part), np.int32) for piece in pieces]),
     )
 
@@ -108,7 +108,7 @@ def _splats(pieces: list[Piece], samples: list[Samples], rng: Generator) -> Spla
         size = COVERAGE * _spacing(piece)
         widths = size * np.array([STRETCH, 1 / STRETCH, FLATNESS])
         scales.append(np.log(widths) + 0.1 * rng.standard_normal((len(points.points), 3)))
-        colours.append(_lit(piece, points))
+        colours.append(_shaded_colours(piece, points))
     logits = rng.normal(4.0, 0.8, sum(piece.splats for piece in pieces)).clip(1.0, 7.0)
     shades = np.concatenate(colours).clip(0.0, 1.0)
     return Splats(
@@ -135,9 +135,9 @@ def _spacing(piece: Piece) -> float:
     return float(np.sqrt(area / piece.splats))
 
 
-def _lit(piece: Piece, points: Samples) -> np.ndarray:
+def _shaded_colours(piece: Piece, points: Samples) -> np.ndarray:
     """[n, 3] colours: the piece's under an ambient light and a window (Lambert)."""
-    towards = LIGHT - points.points
+    towards = LIGHT_POSITION - points.points
     towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
     cosine = np.abs((points.normals * towards).sum(axis=1))
     return np.array(piece.colour) * (AMBIENT + WINDOW * cosine[:, None])

@@ -56,8 +56,8 @@ def _spread(surface: Callable, count: int, rng: Generator) -> tuple[np.ndarray, 
     order = np.lexsort((np.where(row % 2 == 0, candidates[:, 1], -candidates[:, 1]), row))
     total = np.cumsum(area[order])
     marks = (np.arange(count) + rng.random(count)) / count * total[-1]
-    chosen = order[np.minimum(np.searchsorted(total, marks), len(order) - 1)]
-    return candidates[chosen, 0], candidates[chosen, 1]
+    rows = order[np.minimum(np.searchsorted(total, marks), len(order) - 1)]
+    return candidates[rows, 0], candidates[rows, 1]
 
 
 def _slopes(surface: Callable, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

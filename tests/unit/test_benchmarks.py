@@ -24,7 +24,7 @@ def test_every_benchmark_tells_its_command(name: str, monkeypatch: pytest.Monkey
 
 @pytest.mark.skipif(shutil.which("nvidia-smi") is not None, reason="there is a card here: make gpu would measure it")
 def test_make_gpu_without_a_card_says_so() -> None:
-    own = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
-    done = subprocess.run(["make", "gpu"], cwd=ROOT, env=own, capture_output=True, text=True, check=False)
-    assert done.returncode == 2 and done.stdout == ""
-    assert done.stderr.splitlines()[0] == "make gpu: nvidia-smi lists no card here, so nothing was run"
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
+    process = subprocess.run(["make", "gpu"], cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert process.returncode == 2 and process.stdout == ""
+    assert process.stderr.splitlines()[0] == "make gpu: nvidia-smi lists no card here, so nothing was run"

@@ -48,11 +48,11 @@ def retag(path: Any) -> Any:
     return lc.read_features("named.safetensors").text_space
 
 
-def checked(path: Any, form: Callable[[Any], Any]) -> Any:
-    found = evaluate.check_scene(
+def checked_views(path: Any, form: Callable[[Any], Any]) -> Any:
+    report = evaluate.check_scene(
         path("splats.ply"), path("cameras.json"), form(path("photos")), form(path("pack.safetensors"))
     )
-    return [view.view for view in found.views]
+    return [view.view for view in report.views]
 
 
 def speeds(path: Any, form: Callable[[Any], Any]) -> Any:
@@ -71,7 +71,7 @@ PATHS: dict[str, Call] = {
     "read_image": lambda path, form: files.read_image(path("photos/left.png"))[1],
     "Checkpoint": lambda path, form: lc.Checkpoint(path("kept"), 5),
     "SceneFiles": speeds,
-    "check_scene": checked,
+    "check_scene": checked_views,
 }
 
 
@@ -101,11 +101,11 @@ CHOICES: list[tuple[str, Call]] = [
     (r"folder: expected the path", lambda: lc.pack_folder(None, "x.safetensors", "npy")),  # pyright: ignore
     (r"images: expected images", lambda: lc.encode_images([], "x.safetensors", "timm:resnet18")),
     (r"^encoder: expected one of maskclip", lambda: lc.encode_images("photos", "x.safetensors", "magic")),
-    (r"^dataset: expected one of lerf-ovs, 3d-ovs, got 'lerf'", lambda: judge("lerf")),
-    (r"^protocols: expected one of P1, P2, P3, own, got 'P9'", lambda: judge(protocols=["P9"])),
-    (r"^protocols: expected one of P1", lambda: judge(protocols=[])),
-    (r"^held_out: expected a file of view names", lambda: judge(held_out="nowhere.txt")),
-    (r"^data: expected LeRF-OVS", lambda: judge(data="maps")),
+    (r"^dataset: expected one of lerf-ovs, 3d-ovs, got 'lerf'", lambda: evaluate_kitchen("lerf")),
+    (r"^protocols: expected one of P1, P2, P3, own, got 'P9'", lambda: evaluate_kitchen(protocols=["P9"])),
+    (r"^protocols: expected one of P1", lambda: evaluate_kitchen(protocols=[])),
+    (r"^held_out: expected a file of view names", lambda: evaluate_kitchen(held_out="nowhere.txt")),
+    (r"^data: expected LeRF-OVS", lambda: evaluate_kitchen(data="maps")),
     (r"kind: expected one of splats, ply", lambda: files.check_output("new.npy", [], "foo")),
     (r"kind: expected one of splats, cameras", lambda: evaluate.inspect_file("splats.ply", "foo")),
     (r"settings: expected LiftSettings, or None", lambda: lift({"speed": "fast"})),
@@ -125,7 +125,7 @@ def pack(kind: Any, **options: Any) -> Any:
     return lc.pack_folder("maps", "refused.safetensors", kind, **options)
 
 
-def judge(dataset: Any = "lerf-ovs", data: str = ".", **options: Any) -> Any:
+def evaluate_kitchen(dataset: Any = "lerf-ovs", data: str = ".", **options: Any) -> Any:
     return evaluate.evaluate_lifts(dataset, Path("kitchen.safetensors"), data, **options)
 
 
@@ -135,9 +135,9 @@ def lift(settings: Any) -> Any:
 
 @pytest.mark.parametrize(("message", "call"), CHOICES, ids=[message for message, _ in CHOICES])
 def test_wrong_choice_is_named_with_what_is_possible(message: str, call: Call, folder: Path) -> None:
-    with pytest.raises(lc.SplatliftError, match=message) as caught:
+    with pytest.raises(lc.SplatliftError, match=message) as excinfo:
         call()
-    assert "--" not in f"{caught.value.argument} {caught.value.expected}", "options are the command line's"
+    assert "--" not in f"{excinfo.value.argument} {excinfo.value.expected}", "options are the command line's"
     assert not (folder / "refused.safetensors").exists()
 
 

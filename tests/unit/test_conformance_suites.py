@@ -47,7 +47,7 @@ def suite_of(change: Callable[[CpuRaster], None]) -> RasterConformance:
 def brighter(raster: CpuRaster) -> None:
     """Let renders be a thousandth too bright."""
     render = raster.render
-    raster.render = lambda *given: render(*given) * 1.001  # pyright: ignore
+    raster.render = lambda *arguments: render(*arguments) * 1.001  # pyright: ignore
 
 
 def upside_down(raster: CpuRaster) -> None:
@@ -59,7 +59,7 @@ def upside_down(raster: CpuRaster) -> None:
 def unshifted(raster: CpuRaster) -> None:
     """Let labels be of the rays in another order."""
     labels = raster.strongest_labels
-    raster.strongest_labels = lambda *given: torch.flip(labels(*given), [1])  # pyright: ignore
+    raster.strongest_labels = lambda *arguments: torch.flip(labels(*arguments), [1])  # pyright: ignore
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Which device a lift gets, what is said where there is none, and what the diagnostics tells of it."""
+"""Choice of a lift's device, errors without one, and the device in the diagnostics."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ GIB = 1 << 30
 
 @pytest.fixture
 def card(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
-    """A machine that has all that a lift on a card needs, as torch tells it; to take things from."""
+    """Make torch report all that a lift on a GPU needs; tests remove one thing at a time."""
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
@@ -53,9 +53,9 @@ def test_what_a_card_lacks_is_said_with_a_hint_of_its_own(card: pytest.MonkeyPat
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(*change)
             assert choose_device("auto") == CPU
-            with pytest.raises(Unavailable) as caught:
+            with pytest.raises(Unavailable) as excinfo:
                 choose_device("cuda")
-            error = caught.value
+            error = excinfo.value
             assert (error.argument, lack in error.got, "device=cpu" in error.hint) == ("device", True, True)
             hints.add(error.hint)
     assert len(hints) == len(LACKS)
@@ -74,11 +74,15 @@ def test_facts_of_a_card_name_it_and_all_versions(card: pytest.MonkeyPatch) -> N
 
 def test_diagnostics_name_the_device_that_lifted(tmp_path: Path) -> None:
     scene = write_scene(tmp_path, 3)
-    made = lift_files(scene[0], scene[1], [scene[2]], LiftSettings.of(device="cpu", diagnostic_rays=10))
-    told = made.metadata.diagnostics["device"]
-    assert (told["kind"], told["name"]) == ("cpu", processor())
-    assert told["versions"]["torch"] == torch.__version__ and told["versions"].keys() == {"torch", "numba", "numpy"}
-    assert made.metadata.diagnostics["plan"]["device"] == "cpu"
+    result = lift_files(scene[0], scene[1], [scene[2]], LiftSettings.of(device="cpu", diagnostic_rays=10))
+    device = result.metadata.diagnostics["device"]
+    assert (device["kind"], device["name"]) == ("cpu", processor())
+    assert device["versions"]["torch"] == torch.__version__ and device["versions"].keys() == {
+        "torch",
+        "numba",
+        "numpy",
+    }
+    assert result.metadata.diagnostics["plan"]["device"] == "cpu"
 
 
 @pytest.mark.parametrize(

@@ -47,25 +47,25 @@ def lifted(folder: Path, lens: str, *, grids: bool = False) -> LiftResult:
     return lift_files(splats, cameras, [features], LiftSettings.of(preset="row-sum"))
 
 
-def share_of_own_quarter(made: LiftResult) -> torch.Tensor:
-    """Of each seen splat that lies clear of borders, the share of its own quarter in its feature."""
+def share_of_own_quarter(result: LiftResult) -> torch.Tensor:
+    """Return the share of its own quarter in the feature of each splat with a feature that is clear of borders."""
     x, y = (axis.numpy() for axis in wall().means.T[:2])
-    clear = is_clear(x, y, CLEAR) & made.seen.numpy()
-    own = made.features.float()[torch.arange(len(x)), torch.from_numpy(quarter(x, y))]
-    return (own / made.features.float().sum(dim=1)).nan_to_num(nan=1.0)[torch.from_numpy(clear)]
+    clear = is_clear(x, y, CLEAR) & result.seen.numpy()
+    own_weight = result.features.float()[torch.arange(len(x)), torch.from_numpy(quarter(x, y))]
+    return (own_weight / result.features.float().sum(dim=1)).nan_to_num(nan=1.0)[torch.from_numpy(clear)]
 
 
 @pytest.mark.parametrize(("lens", "grids"), [("barrel", True), *((lens, False) for lens in LENSES)])
 def test_features_reach_the_splats_that_the_photo_shows(lens: str, grids: bool, tmp_path: Path) -> None:
-    made = lifted(tmp_path, lens, grids=grids)
-    shares = share_of_own_quarter(made)
+    result = lifted(tmp_path, lens, grids=grids)
+    shares = share_of_own_quarter(result)
     assert len(shares) > 500
     assert float(shares.min()) > 0.9
-    assert any("distorted photos" in text for text in made.metadata.diagnostics["warnings"])
+    assert any("distorted photos" in text for text in result.metadata.diagnostics["warnings"])
     # The same maps taken for a pinhole's put the border elsewhere.
     document = json.loads((tmp_path / "transforms.json").read_text())
-    plain = {key: value for key, value in document.items() if key not in LENSES[lens][0]}
-    (tmp_path / "transforms.json").write_text(json.dumps(plain))
+    pinhole_document = {key: value for key, value in document.items() if key not in LENSES[lens][0]}
+    (tmp_path / "transforms.json").write_text(json.dumps(pinhole_document))
     paths = tmp_path / "splats.ply", tmp_path / "transforms.json"
     ignored = lift_files(*paths, [tmp_path / "features.safetensors"], LiftSettings.of(preset="row-sum"))
     assert float(share_of_own_quarter(ignored).min()) < 0.5
@@ -90,17 +90,17 @@ def test_masks_lie_over_the_photo(lens: str, tmp_path: Path) -> None:
         for part in np.unique(photo[photo >= 0]):
             y, x = np.argwhere(photo == part)[len(np.argwhere(photo == part)) // 2]
             answer = ask(scene, Query.of((Pixel(view, int(x), int(y)),), threshold=0.5))
-            seen = view_mask(scene, answer, view)
-            assert seen.mask.shape == photo.shape
-            found, truth = seen.mask & (photo >= 0), photo == part
-            assert (found & truth).sum() / (found | truth).sum() > 0.99
+            rendered = view_mask(scene, answer, view)
+            assert rendered.mask.shape == photo.shape
+            selected, truth = rendered.mask & (photo >= 0), photo == part
+            assert (selected & truth).sum() / (selected | truth).sum() > 0.99
     answer = ask(scene, Query.of((Region("left", 0, 1),), threshold=0.5))
-    shown = is_lifted(scene.cameras["left"]) & (photo_of("left", lens, CLEAR) == 1)
-    assert view_mask(scene, answer, "left").mask[shown].all()
+    expected = is_lifted(scene.cameras["left"]) & (photo_of("left", lens, CLEAR) == 1)
+    assert view_mask(scene, answer, "left").mask[expected].all()
     with pytest.raises(InvalidQuery, match=rf"x in 0\.\.{WIDTH - 1} and y in 0\.\.{HEIGHT - 1}, got {WIDTH},0"):
         ask(scene, Query.of((Pixel("left", WIDTH, 0),)))
-    for what in ("rgb", "pca", "depth"):
-        picture = Image.open(io.BytesIO(render_png(scene, "left", what)))
+    for channel in ("rgb", "pca", "depth"):
+        picture = Image.open(io.BytesIO(render_png(scene, "left", channel)))
         assert picture.size == (WIDTH, HEIGHT)
         assert np.asarray(picture).max() > 0
 
@@ -135,7 +135,7 @@ def test_a_model_that_comes_later_changes_no_lift(tmp_path: Path) -> None:
             )
     with pytest.raises(InvalidCameras, match="not both"):
         read_cameras(scene)
-    opened = Scene(tmp_path / "made.safetensors")
-    assert opened.cameras.distorted == tuple(VIEWS)
+    lift_scene = Scene(tmp_path / "made.safetensors")
+    assert lift_scene.cameras.distorted == tuple(VIEWS)
     with pytest.raises(InvalidCameras, match="cameras without distortion, got 'left'; keep these"):
-        write_inria_cameras(opened.cameras, tmp_path / "cameras.json")
+        write_inria_cameras(lift_scene.cameras, tmp_path / "cameras.json")

@@ -1,4 +1,4 @@
-"""What an editor shows of the library: shapes where a name is pointed at, and types that strict checkers know."""
+"""Hover texts of the library in an editor: shapes of arrays, and types that strict checkers accept."""
 
 import ast
 import importlib
@@ -19,8 +19,8 @@ SHAPE = re.compile(r"\[[A-Za-z0-9_]+( [+*] \d)?(, ?[A-Za-z0-9_.]+)*\]")
 
 
 def array_fields() -> list[tuple[str, str, str]]:
-    """Class, field and docstring of the field, of every array that a public value holds."""
-    found = []
+    """Return class, field and docstring of the field, for each array of a public value."""
+    fields = []
     for name in lc.__all__:
         value = getattr(lc, name)
         if not inspect.isclass(value) or value.__module__.split(".")[0] != "liftcore":
@@ -39,8 +39,8 @@ def array_fields() -> list[tuple[str, str, str]]:
                     if not ARRAYS.search(ast.unparse(field.annotation)):  # pyright: ignore
                         continue
                     text = after.value.value if isinstance(after, ast.Expr) else ""  # pyright: ignore
-                    found.append((cls.__name__, field.target.id, str(text)))  # pyright: ignore
-    return found
+                    fields.append((cls.__name__, field.target.id, str(text)))  # pyright: ignore
+    return fields
 
 
 def test_every_array_of_a_public_value_shows_its_shape_where_it_is_pointed_at() -> None:
@@ -53,13 +53,13 @@ def test_every_array_of_a_public_value_shows_its_shape_where_it_is_pointed_at() 
 def test_docstrings_name_every_argument(name: str) -> None:
     function = getattr(importlib.import_module("liftcore"), name)
     doc = inspect.getdoc(function) or ""
-    arguments = [one for one in inspect.signature(function).parameters if one != "settings"]
-    assert [one for one in arguments if not re.search(rf"\b{one}\b", doc)] == []
+    arguments = [argument for argument in inspect.signature(function).parameters if argument != "settings"]
+    assert [argument for argument in arguments if not re.search(rf"\b{argument}\b", doc)] == []
 
 
 @pytest.mark.slow
 def test_a_users_scripts_are_of_strict_types() -> None:
     assert EXAMPLES and all(path.read_text().startswith("# pyright: strict\n") for path in EXAMPLES)
     checker = [sys.executable, "-m", "basedpyright", "--pythonpath", sys.executable, *map(str, EXAMPLES)]
-    told = subprocess.run(checker, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert told.returncode == 0, told.stdout
+    process = subprocess.run(checker, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert process.returncode == 0, process.stdout

@@ -16,12 +16,14 @@ WITH_KERNELS = [path for path in sorted(ROOT.rglob("*.py")) if "from liftcore.ru
 
 
 def compiled_names(path: Path) -> set[str]:
-    """What a file defines for compiled code: kernels, intrinsics, and names of its own for them."""
-    found = set()
+    """Return the functions that a file defines for compiled code: kernels, intrinsics, decorated helpers."""
+    names = set()
     for node in ast.parse(path.read_text()).body:
-        if isinstance(node, ast.FunctionDef) and COMPILING & {ast.unparse(own) for own in node.decorator_list}:
-            found.add(node.name)
-    return found
+        if isinstance(node, ast.FunctionDef) and COMPILING & {
+            ast.unparse(decorator) for decorator in node.decorator_list
+        }:
+            names.add(node.name)
+    return names
 
 
 @pytest.mark.parametrize("path", WITH_KERNELS, ids=lambda path: path.stem)

@@ -1,4 +1,4 @@
-"""Old public names: read in files, settings and calls with the new ones' values, and refused beside other values."""
+"""Old public names: read in files, settings and calls like the new ones, and refused together with other values."""
 
 import json
 from collections.abc import Callable, Mapping

@@ -1,4 +1,4 @@
-"""Torch and linear algebra keep to the thread that calls them, as long as they are told to."""
+"""Torch and linear algebra use the calling thread alone within `one_thread`."""
 
 from __future__ import annotations
 
@@ -54,16 +54,16 @@ def test_it_is_one_thread_within_and_as_many_as_before_after_it():
 
 
 def test_a_lift_has_no_threads_of_torch(tmp_path, monkeypatch):
-    seen = {}
+    thread_counts = {}
 
     def watch(module, name: str) -> None:
         work = getattr(module, name)
 
-        def watched(*given):
-            seen[name] = torch.get_num_threads()
-            return work(*given)
+        def count_threads(*arguments):
+            thread_counts[name] = torch.get_num_threads()
+            return work(*arguments)
 
-        monkeypatch.setattr(module, name, watched)
+        monkeypatch.setattr(module, name, count_threads)
 
     watch(geometry, "as_regions")
     watch(geometry, "stacked")
@@ -71,13 +71,13 @@ def test_a_lift_has_no_threads_of_torch(tmp_path, monkeypatch):
     watch(closed_form, "sum_rows")
     splats, cameras, features = write_scene(tmp_path, 3)[:3]
     lift_files(splats, cameras, [features], LiftSettings.of(robust_steps=1))
-    assert seen == dict.fromkeys(("as_regions", "stacked", "row_blocks", "sum_rows"), 1)
+    assert thread_counts == dict.fromkeys(("as_regions", "stacked", "row_blocks", "sum_rows"), 1)
     assert torch.get_num_threads() == 3
 
 
 @pytest.mark.parametrize("first_fails", [False, True])
 def test_two_threads_within_it_at_once_leave_nothing_behind(first_fails: bool):
-    both, first_left, looked = Barrier(2), Event(), Event()
+    barrier, first_left, second_counted = Barrier(2), Event(), Event()
 
     def number_of_a_new_thread() -> int:
         with ThreadPoolExecutor(1) as pool:
@@ -86,30 +86,30 @@ def test_two_threads_within_it_at_once_leave_nothing_behind(first_fails: bool):
     def first() -> int:
         torch.set_num_threads(3)
         with suppress(ValueError), one_thread():
-            both.wait(10)
+            barrier.wait(10)
             if first_fails:
                 raise ValueError("no")
         first_left.set()
-        assert looked.wait(10)
+        assert second_counted.wait(10)
         return torch.get_num_threads()
 
     def second() -> tuple[int, int, int]:
         torch.set_num_threads(3)
         with one_thread():
-            both.wait(10)
+            barrier.wait(10)
             assert first_left.wait(10) and all_are(1)
             within = torch.get_num_threads(), number_of_a_new_thread()
-            looked.set()
+            second_counted.set()
         return *within, torch.get_num_threads()
 
     with ThreadPoolExecutor(2) as pool:
-        ended = pool.submit(first), pool.submit(second)
-        assert ended[1].result() == (1, 1, 3)
-        assert ended[0].result() == 3
+        futures = pool.submit(first), pool.submit(second)
+        assert futures[1].result() == (1, 1, 3)
+        assert futures[0].result() == 3
     assert number_of_a_new_thread() == 3 and all_are(3)
 
 
-def test_libraries_that_are_loaded_within_it_are_held_by_whoever_comes_next():
+def test_libraries_that_are_loaded_within_it_are_limited_by_the_next_one():
     code = """
 import numpy
 from threadpoolctl import ThreadpoolController
@@ -117,17 +117,17 @@ from liftcore.runtime.one_thread import one_thread
 
 def numbers():
     libraries = ThreadpoolController().select(user_api="blas").lib_controllers
-    return {one.filepath: one.num_threads for one in libraries}
+    return {library.filepath: library.num_threads for library in libraries}
 
 with one_thread():
     before = numbers()
     import scipy.linalg
-    usual = numbers()
+    after_import = numbers()
     with one_thread():
         within = numbers()
 assert set(before) < set(within) and set(within.values()) == {1}, within
-assert {path: one for path, one in numbers().items() if path not in before} == {
-    path: one for path, one in usual.items() if path not in before
+assert {path: threads for path, threads in numbers().items() if path not in before} == {
+    path: threads for path, threads in after_import.items() if path not in before
 }
 """
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

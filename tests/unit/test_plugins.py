@@ -47,7 +47,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
         lines = []
         for group, entries in groups.items():
-            lines += [f"[splatlift.{group}]", *(f"{name} = theirs:{what}" for name, what in entries.items())]
+            lines += [f"[splatlift.{group}]", *(f"{name} = theirs:{target}" for name, target in entries.items())]
         (folder / "entry_points.txt").write_text("\n".join(lines) + "\n")
 
     return add
@@ -84,9 +84,9 @@ def test_broken_plugins_are_named_with_their_package(install, tmp_path: Path) ->
         ("gone", "plugin 'gone' of the package ours: .* AttributeError.*theirs:nothing imports and runs"),
     ):
         (tmp_path / f"scene.{name}").write_text("0 0 1\n")
-        for opened in (lc.open_encoder, open_image_encoder):
+        for open_plugin in (lc.open_encoder, open_image_encoder):
             with pytest.raises(lc.Unavailable, match=message):
-                opened(name)
+                open_plugin(name)
         with pytest.raises(lc.Unavailable, match=message):
             lc.read_splats(tmp_path / f"scene.{name}")
 

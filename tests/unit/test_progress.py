@@ -1,4 +1,4 @@
-"""What a caller of the library sees of work that takes a while."""
+"""Progress bars and progress callbacks of the library."""
 
 import io
 from typing import Any
@@ -21,7 +21,7 @@ def lifted(**options: Any) -> lc.LiftResult:
 
 
 def test_bars_are_drawn_on_a_terminal_alone_and_not_where_they_are_declined(monkeypatch: pytest.MonkeyPatch) -> None:
-    shown = {}
+    output = {}
     for name, stderr, options in (
         ("terminal", Terminal(), {}),
         ("declined", Terminal(), {"progress": False}),
@@ -30,17 +30,17 @@ def test_bars_are_drawn_on_a_terminal_alone_and_not_where_they_are_declined(monk
     ):
         monkeypatch.setattr("sys.stderr", stderr)
         lifted(**options)
-        shown[name] = stderr.getvalue()
-    assert "geometry: 100%" in shown["terminal"] and "2/2" in shown["terminal"]
-    assert "geometry: 100%" in shown["asked for"]
-    assert shown["declined"] == shown["file"] == ""
+        output[name] = stderr.getvalue()
+    assert "geometry: 100%" in output["terminal"] and "2/2" in output["terminal"]
+    assert "geometry: 100%" in output["asked for"]
+    assert output["declined"] == output["file"] == ""
     monkeypatch.setattr("sys.stderr", None)  # as under pythonw
     lifted()
 
 
 def test_function_is_called_and_what_is_none_is_refused() -> None:
-    heard: list[str] = []
-    lifted(progress=lambda stage, done, total, unit: heard.append(stage))
-    assert "geometry" in heard
+    stages: list[str] = []
+    lifted(progress=lambda stage, done, total, unit: stages.append(stage))
+    assert "geometry" in stages
     with pytest.raises(lc.InvalidSettings, match=r"progress: expected a function .*, True, False or None, got 'yes'"):
         lifted(progress="yes")

@@ -1,4 +1,4 @@
-"""``import liftcore as lc``: its list, what it loads, lifts of values in memory, and what a lift tells meanwhile."""
+"""``import liftcore as lc``: public names, imports, lifts of values in memory, and progress of a lift."""
 
 import ast
 import json
@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[2]
 MOST_NAMES = 60  # of `import liftcore`
 MOST_OF_ALL = 117  # with those of the public modules: each more must be worth its place
 MODULES = ("cli", "errors", "evaluate", "files", "models", "testing", "text", "text.table")
-USERS = [path for room in ("liftcore/cli", "service") for path in sorted((ROOT / room).rglob("*.py"))]
+USERS = [path for folder in ("liftcore/cli", "service") for path in sorted((ROOT / folder).rglob("*.py"))]
 
 
 @pytest.fixture
@@ -45,14 +45,14 @@ def as_numpy(view):
 
 
 def public_names() -> dict[str, list[str]]:
-    """Module -> its public names."""
-    return {name: import_module(name).__all__ for name in ("liftcore", *(f"liftcore.{one}" for one in MODULES))}
+    """Return the public names of each public module."""
+    return {name: import_module(name).__all__ for name in ("liftcore", *(f"liftcore.{module}" for module in MODULES))}
 
 
 def test_public_names_are_few_load_and_are_in_the_documents():
-    found, page = public_names(), site_text("docs/python.md")
-    assert len(found["liftcore"]) <= MOST_NAMES and len({*chain(*found.values())}) <= MOST_OF_ALL
-    for module, names in found.items():
+    names_by_module, page = public_names(), site_text("docs/python.md")
+    assert len(names_by_module["liftcore"]) <= MOST_NAMES and len({*chain(*names_by_module.values())}) <= MOST_OF_ALL
+    for module, names in names_by_module.items():
         assert len(names) == len(set(names))
         assert all(getattr(import_module(module), name) is not None for name in names)
         assert module == "liftcore" or (import_module(module).__doc__ or "").startswith("Public: ")
@@ -60,26 +60,26 @@ def test_public_names_are_few_load_and_are_in_the_documents():
 
 
 def imported_names(path):
-    """The names that a file imports of liftcore, each with its module, wherever in the file."""
-    found = []
+    """Return (module, name) of each import from liftcore in a file, at any depth."""
+    names = []
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "liftcore":
-            found += [(node.module, name.name) for name in node.names]
+            names += [(node.module, name.name) for name in node.names]
         if isinstance(node, ast.Import):
-            found += [(name.name, "") for name in node.names if name.name.startswith("liftcore.")]
-    return found
+            names += [(name.name, "") for name in node.names if name.name.startswith("liftcore.")]
+    return names
 
 
 @pytest.mark.parametrize("path", USERS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_command_line_and_service_import_public_names_alone(path):
-    """What a command or a route needs, a user's program can have: a public name, or a new one for both."""
+    """Commands and routes need nothing that a user's program cannot import: add a public name where they do."""
     public = public_names()
     public["liftcore"] = [*public["liftcore"], "__version__", *MODULES]
-    own = path.is_relative_to(ROOT / "liftcore")  # files of the command line import each other
+    in_library = path.is_relative_to(ROOT / "liftcore")  # files of the command line import each other
     private = [
         (module, name)
         for module, name in imported_names(path)
-        if name not in public.get(module, ()) and not (own and module.startswith("liftcore.cli"))
+        if name not in public.get(module, ()) and not (in_library and module.startswith("liftcore.cli"))
     ]
     assert not private
 
@@ -88,12 +88,12 @@ def test_import_loads_neither_torch_nor_numba():
     code = (
         "import sys, json, liftcore; print(json.dumps([m for m in ('torch', 'numba', 'numpy') if m in sys.modules]))"
     )
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert json.loads(told) == []
+    stdout = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert json.loads(stdout) == []
 
 
-@pytest.mark.parametrize("given", ["dict", "numpy", "iterator", "pack"])
-def test_lift_of_values_has_the_bits_of_the_lift_of_files(scene, given):
+@pytest.mark.parametrize("form", ["dict", "numpy", "iterator", "pack"])
+def test_lift_of_values_has_the_bits_of_the_lift_of_files(scene, form):
     (splats, cameras, pack), cloud, poses, views = scene
     forms = {
         "dict": lambda: views,
@@ -102,60 +102,60 @@ def test_lift_of_values_has_the_bits_of_the_lift_of_files(scene, given):
         "pack": lambda: lc.read_features(pack),
     }
     expected = lift_files(splats, cameras, [pack], lc.LiftSettings.of(preset="row-sum"))
-    found = lc.lift(cloud, poses, forms[given](), preset="row-sum")
+    result = lc.lift(cloud, poses, forms[form](), preset="row-sum")
     for name in ("features", "total_weight", "agreement", "seen"):
-        assert torch.equal(getattr(found, name), getattr(expected, name))
-    assert found.views == expected.views == ("v0", "v1", "v2")
-    assert found.diagnostics["residual"] == pytest.approx(expected.diagnostics["residual"], rel=0.5)
+        assert torch.equal(getattr(result, name), getattr(expected, name))
+    assert result.views == expected.views == ("v0", "v1", "v2")
+    assert result.diagnostics["residual"] == pytest.approx(expected.diagnostics["residual"], rel=0.5)
 
 
 def test_iterator_is_taken_one_view_at_a_time_and_once(scene):
     _, splats, cameras, views = scene
-    taken = []
+    read_names = []
 
     def each():
         for name, view in views.items():
-            taken.append(name)
+            read_names.append(name)
             yield name, view
         yield "nobody", views["v0"]
 
-    found = lc.lift(splats, cameras, each())
-    assert taken == list(views)
-    assert found.diagnostics["views_without_camera"] == ["nobody"]
+    result = lc.lift(splats, cameras, each())
+    assert read_names == list(views)
+    assert result.diagnostics["views_without_camera"] == ["nobody"]
 
 
 def test_saved_result_opens_as_it_was(scene, tmp_path):
     _, splats, cameras, views = scene
-    made = lc.lift(splats, cameras, views, robust_steps=1)
-    made.save(tmp_path / "made.safetensors")
-    back = lc.load_lift(tmp_path / "made.safetensors")
-    assert torch.equal(made.features, back.features) and back.settings == made.settings
-    assert made.settings.robust_steps == 1
+    result = lc.lift(splats, cameras, views, robust_steps=1)
+    result.save(tmp_path / "made.safetensors")
+    reopened = lc.load_lift(tmp_path / "made.safetensors")
+    assert torch.equal(result.features, reopened.features) and reopened.settings == result.settings
+    assert result.settings.robust_steps == 1
 
 
 def test_plan_chooses_what_the_lift_takes(scene):
     _, splats, cameras, views = scene
     plan = lc.plan(splats, cameras, views, coverage=1)
-    made = lc.lift(splats, cameras, views, coverage=1)
-    assert made.views == plan.views and len(plan.views) + len(plan.left_out) == 3
+    result = lc.lift(splats, cameras, views, coverage=1)
+    assert result.views == plan.views and len(plan.views) + len(plan.left_out) == 3
     strided = lc.plan(splats, cameras, views, view_stride=2)
     assert any("; 2 of 3 views" in line for line in strided.lines())
 
 
 def test_view_of_another_kind_is_refused_by_name(scene):
     _, splats, cameras, _ = scene
-    with pytest.raises(lc.InvalidFeatures, match="Regions or FeatureGrid") as told:
+    with pytest.raises(lc.InvalidFeatures, match="Regions or FeatureGrid") as excinfo:
         lc.lift(splats, cameras, {"v0": torch.ones(2, 2, 4)})  # pyright: ignore[reportArgumentType]
-    assert "v0" in told.value.argument
+    assert "v0" in excinfo.value.argument
 
 
 def test_render_composites_numbers_of_splats(scene):
     _, splats, cameras, _ = scene
     camera = cameras["v0"]
     ones = lc.render(splats, camera, np.ones(splats.count))
-    both = lc.render(splats, camera, torch.ones(splats.count, 2) * torch.tensor([1.0, 3.0]))
-    assert ones.shape == (camera.height, camera.width) and both.shape == (camera.height, camera.width, 2)
-    assert torch.allclose(both[:, :, 1], 3 * ones, atol=1e-6)
+    image = lc.render(splats, camera, torch.ones(splats.count, 2) * torch.tensor([1.0, 3.0]))
+    assert ones.shape == (camera.height, camera.width) and image.shape == (camera.height, camera.width, 2)
+    assert torch.allclose(image[:, :, 1], 3 * ones, atol=1e-6)
     share = lc.render(splats, camera, torch.ones(splats.count), normalise=True)
     assert torch.allclose(share[ones > 0], torch.ones(()), atol=1e-6)
     with pytest.raises(lc.InvalidSettings, match="a row a splat"):
@@ -164,89 +164,93 @@ def test_render_composites_numbers_of_splats(scene):
 
 def test_render_of_cameras_is_an_image_of_each_by_its_name(scene):
     _, splats, cameras, _ = scene
-    chosen = splats.means[:, 0] > 0
-    images = lc.render(splats, cameras, chosen, normalise=True)
+    selected = splats.means[:, 0] > 0
+    images = lc.render(splats, cameras, selected, normalise=True)
     assert list(images) == list(cameras)
     for name, camera in cameras.items():
-        assert torch.equal(images[name], lc.render(splats, camera, chosen, normalise=True))
+        assert torch.equal(images[name], lc.render(splats, camera, selected, normalise=True))
         assert images[name].shape == (camera.height, camera.width) and bool((images[name] > 0.5).any())
     with pytest.raises(lc.InvalidCameras, match="camera: expected a Camera, got 3"):
-        lc.render(splats, {"v0": cameras["v0"], "v1": 3}, chosen)  # pyright: ignore
+        lc.render(splats, {"v0": cameras["v0"], "v1": 3}, selected)  # pyright: ignore
 
 
 def test_region_weights_times_codebooks_are_the_lift(scene):
     _, splats, cameras, views = scene
-    found = lc.region_weights(splats, cameras, views, preset="row-sum")
-    W = found.matrix(splats.count)
-    E = np.concatenate([views[name].codebook.double().numpy() for name in found.views])
-    assert W.shape == (splats.count, len(E)) and found.offsets.tolist()[0] == 0
-    made = lc.lift(splats, cameras, views, preset="row-sum", dtype="float32")
+    weights = lc.region_weights(splats, cameras, views, preset="row-sum")
+    W = weights.matrix(splats.count)
+    E = np.concatenate([views[name].codebook.double().numpy() for name in weights.views])
+    assert W.shape == (splats.count, len(E)) and weights.offsets.tolist()[0] == 0
+    result = lc.lift(splats, cameras, views, preset="row-sum", dtype="float32")
     sums = W.sum(axis=1)
-    assert ((sums > 0) == made.seen.numpy()).all()
+    assert ((sums > 0) == result.seen.numpy()).all()
     X = np.divide(W @ E, sums[:, None], out=np.zeros((splats.count, E.shape[1])), where=sums[:, None] > 0)
-    np.testing.assert_allclose(made.features.numpy(), X, atol=1e-5)
-    again = lc.region_weights(splats, cameras, iter(views.items()), preset="row-sum", threads=2)
-    assert torch.equal(again.weight, found.weight) and torch.equal(again.region, found.region)
+    np.testing.assert_allclose(result.features.numpy(), X, atol=1e-5)
+    weights_of_iterator = lc.region_weights(splats, cameras, iter(views.items()), preset="row-sum", threads=2)
+    assert torch.equal(weights_of_iterator.weight, weights.weight) and torch.equal(
+        weights_of_iterator.region, weights.region
+    )
 
 
 @pytest.mark.parametrize("settings", [{}, {"preset": "row-sum", "loss": "huber"}])
 def test_reweighted_region_weights_times_codebooks_are_the_lift_of_any_preset(scene, settings):
     _, splats, cameras, views = scene
-    found = lc.region_weights(splats, cameras, views, reweight=True, **settings)
-    plain = lc.region_weights(splats, cameras, views, **settings)
-    W = found.matrix(splats.count)
-    E = np.concatenate([views[name].codebook.double().numpy() for name in found.views])
-    made = lc.lift(splats, cameras, views, dtype="float32", **settings)
-    seen = made.seen.numpy()
-    np.testing.assert_allclose(made.features.numpy()[seen], (W @ E)[seen] / W.sum(axis=1)[seen, None], atol=1e-5)
-    assert torch.equal(found.region, plain.region) and not torch.equal(found.weight, plain.weight)
+    reweighted = lc.region_weights(splats, cameras, views, reweight=True, **settings)
+    weights = lc.region_weights(splats, cameras, views, **settings)
+    W = reweighted.matrix(splats.count)
+    E = np.concatenate([views[name].codebook.double().numpy() for name in reweighted.views])
+    result = lc.lift(splats, cameras, views, dtype="float32", **settings)
+    has_feature = result.seen.numpy()
+    np.testing.assert_allclose(
+        result.features.numpy()[has_feature], (W @ E)[has_feature] / W.sum(axis=1)[has_feature, None], atol=1e-5
+    )
+    assert torch.equal(reweighted.region, weights.region) and not torch.equal(reweighted.weight, weights.weight)
 
 
-def test_every_stage_is_told_in_order_and_the_plan_after_the_first_views(tmp_path):
+def test_stages_are_reported_in_order_and_the_plan_after_the_first_views(tmp_path):
     splats, cameras, pack = write_scene(tmp_path, 3)
-    said = []
+    calls = []
     plans = []
 
-    def hear(stage, done, total, unit):
-        said.append((stage, done, total, unit))
+    def on_progress(stage, done, total, unit):
+        calls.append((stage, done, total, unit))
 
     def on_plan(plan):
-        plans.append((plan, {stage: done for stage, done, *_ in said}))
+        plans.append((plan, {stage: completed for stage, completed, *_ in calls}))
 
-    made = lift_files(splats, cameras, [pack], lc.LiftSettings.of(), progress=hear, on_plan=on_plan)
+    result = lift_files(splats, cameras, [pack], lc.LiftSettings.of(), progress=on_progress, on_plan=on_plan)
     [(plan, before)] = plans
     assert before == {"read": 1, "digest": 1, "compile": 1, "plan": 1, "geometry": 3}
-    assert plan.facts() == made.metadata.diagnostics["plan"]
+    assert plan.facts() == result.metadata.diagnostics["plan"]
     for stage in ("read", "digest", "compile", "plan", "certify"):
-        assert [word for word in said if word[0] == stage] == [(stage, 0, 1, "steps"), (stage, 1, 1, "steps")]
-    order = list(dict.fromkeys(stage for stage, *_ in said))
+        assert [call for call in calls if call[0] == stage] == [(stage, 0, 1, "steps"), (stage, 1, 1, "steps")]
+    order = list(dict.fromkeys(stage for stage, *_ in calls))
     assert order == ["read", "digest", "compile", "plan", "geometry", "robust", "solve", "certify"]
-    assert set(order) <= made.metadata.timings.keys()
+    assert set(order) <= result.metadata.timings.keys()
     for stage in order:
-        done = [word[1] for word in said if word[0] == stage]
-        assert done == sorted(done)
+        counts = [call[1] for call in calls if call[0] == stage]
+        assert counts == sorted(counts)
 
 
-def test_what_a_machine_lacks_goes_to_whoever_listens_else_to_the_log(tmp_path, monkeypatch, caplog):
+def test_warnings_of_memory_go_to_the_callback_else_to_the_log(tmp_path, monkeypatch, caplog):
     little_memory = "the rest of the lift may take 9.0 GiB and 1.0 GiB are free"
     monkeypatch.setattr("liftcore.lifting.planning.plan.check_memory", lambda parts, free: [little_memory])
     splats, cameras, pack = write_scene(tmp_path, 3)
-    heard = []
+    plans = []
 
     def refuse(plan):
         raise InterruptedError(plan.kernel)
 
-    with pytest.raises(InterruptedError, match="3dgs"):  # a hearer that refuses stops the lift
+    with pytest.raises(InterruptedError, match="3dgs"):  # an error of the callback stops the lift
         lift_files(splats, cameras, [pack], lc.LiftSettings.of(), on_plan=refuse)
     with caplog.at_level(logging.WARNING):
-        lift_files(splats, cameras, [pack], lc.LiftSettings.of(), on_plan=heard.append)
-        assert heard[0].warnings == (little_memory,) and little_memory not in caplog.text
+        lift_files(splats, cameras, [pack], lc.LiftSettings.of(), on_plan=plans.append)
+        assert plans[0].warnings == (little_memory,) and little_memory not in caplog.text
         lift_files(splats, cameras, [pack], lc.LiftSettings.of())
         assert caplog.text.count(little_memory) == 1
 
 
 @pytest.mark.parametrize(
-    ("changed", "error", "told"),
+    ("overrides", "error", "message"),
     [
         ({"splats": "scene.ply"}, lc.InvalidSplats, r"splats: .*got str 'scene.ply'; .*read_splats"),
         ({"cameras": "sparse/0"}, lc.InvalidCameras, r"cameras: .*got str 'sparse/0'; read_cameras"),
@@ -269,38 +273,38 @@ def test_what_a_machine_lacks_goes_to_whoever_listens_else_to_the_log(tmp_path, 
     ],
 )
 @pytest.mark.parametrize("call", [lc.lift, lc.plan, lc.region_weights])
-def test_what_is_no_such_value_is_refused_by_its_name(scene, call, changed, error, told):
+def test_what_is_no_such_value_is_refused_by_its_name(scene, call, overrides, error, message):
     _, splats, cameras, views = scene
-    given = {"splats": splats, "cameras": cameras, "views": views} | changed
-    with pytest.raises(error, match=told):
-        call(**given)
+    arguments = {"splats": splats, "cameras": cameras, "views": views} | overrides
+    with pytest.raises(error, match=message):
+        call(**arguments)
 
 
 def test_settings_and_keywords_beside_them_are_one(scene):
     _, splats, cameras, views = scene
     settings = lc.LiftSettings.of(preset="row-sum", stride=2)
-    whole = lc.region_weights(splats, cameras, views, preset="row-sum")
+    full = lc.region_weights(splats, cameras, views, preset="row-sum")
     strided = lc.region_weights(splats, cameras, views, settings, view_stride=2)
     assert lc.lift(splats, cameras, views, settings, view_stride=2).settings.stride == 2
     assert lc.plan(splats, cameras, views, settings, view_stride=2).views == strided.views == ("v0", "v2")
-    assert float(whole.weight.sum()) > 2 * float(strided.weight.sum())
-    chosen = lc.lift(splats, cameras, views, lc.LiftSettings.of(speed="fast", seed=3), speed="exact").settings
-    assert chosen == lc.LiftSettings.of(speed="exact", seed=3, antialiased=False)  # which auto came to
+    assert float(full.weight.sum()) > 2 * float(strided.weight.sum())
+    merged = lc.lift(splats, cameras, views, lc.LiftSettings.of(speed="fast", seed=3), speed="exact").settings
+    assert merged == lc.LiftSettings.of(speed="exact", seed=3, antialiased=False)  # which auto came to
     assert lc.lift(splats, cameras, views, lc.LiftSettings.of(), robust_steps=0).confidence is None
 
 
 def test_answers_refuse_splats_of_another_scene(scene):
     _, splats, cameras, views = scene
-    made = lc.lift(splats, cameras, views, preset="row-sum")
-    vectors = torch.eye(2, made.features.shape[1])
+    result = lc.lift(splats, cameras, views, preset="row-sum")
+    vectors = torch.eye(2, result.features.shape[1])
     names = ("means", "quats", "log_scales", "opacity_logits")
-    fewer = lc.Splats(**{name: getattr(splats, name)[1:] for name in names})
-    others: list[Any] = [fewer, "scene.ply"]
-    for other in others:
+    cropped = lc.Splats(**{name: getattr(splats, name)[1:] for name in names})
+    invalid_values: list[Any] = [cropped, "scene.ply"]
+    for other in invalid_values:
         for ask in (
-            lambda other=other: made.query(vectors, splats=other),
-            lambda other=other: made.segment(["a", "b"], vectors, other),
-            lambda other=other: made.objects(other),
+            lambda other=other: result.query(vectors, splats=other),
+            lambda other=other: result.segment(["a", "b"], vectors, other),
+            lambda other=other: result.objects(other),
         ):
             with pytest.raises(lc.InvalidSplats, match=f"the {splats.count} Splats that were lifted"):
                 ask()
@@ -338,10 +342,10 @@ def test_render_refuses_to_drop_a_gradient_that_is_recorded(scene):
     values = torch.ones(splats.count, 2, requires_grad=True)
     with pytest.raises(lc.InvalidSettings, match=r"values: .*gradient.*values\.detach\(\)"):
         lc.render(splats, cameras["v0"], values)
-    plain = lc.render(splats, cameras["v0"], values.detach())
+    expected = lc.render(splats, cameras["v0"], values.detach())
     for mode in (torch.no_grad(), torch.inference_mode()):
         with mode:
-            assert torch.equal(lc.render(splats, cameras["v0"], values), plain)
+            assert torch.equal(lc.render(splats, cameras["v0"], values), expected)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="with a GPU these calls run on it")
@@ -357,7 +361,7 @@ def test_the_current_card_may_be_named_by_its_number(scene):
             call(splats, cameras, views, device="cuda:3")
 
 
-def test_splats_of_activated_opacities_and_scales_are_told_in_the_plan(scene):
+def test_plan_warns_of_splats_with_activated_opacities_and_scales(scene):
     _, _, cameras, views = scene
     splats = random_splats(3, 200, spread=1.5)
     opacities, scales = torch.sigmoid(splats.opacity_logits), splats.log_scales.exp()
@@ -384,22 +388,22 @@ def test_region_weights_of_a_label_a_pixel_are_the_weights_of_rays(scene):
 @pytest.mark.parametrize("engine", [None, lc.LocalEngine(1)])
 def test_checkpoint_is_a_folder_by_its_path_or_its_text(scene, engine, tmp_path):
     _, splats, cameras, views = scene
-    made = [
+    results = [
         lc.lift(splats, cameras, views, preset="row-sum", engine=engine, checkpoint=kind(tmp_path / "kept"))
         for kind in (str, Path)
     ]
-    assert torch.equal(made[0].features, made[1].features) and any((tmp_path / "kept").iterdir())
+    assert torch.equal(results[0].features, results[1].features) and any((tmp_path / "kept").iterdir())
 
 
-def test_warnings_of_a_lift_are_logged_once_where_nobody_shows_the_plan(scene, caplog):
+def test_warnings_of_a_lift_are_logged_once_without_a_plan_callback(scene, caplog):
     _, splats, cameras, views = scene
-    turned = {name: lc.FeatureGrid(torch.ones(64, 4, 3)) for name in views}
-    made = lc.lift(splats, cameras, turned, preset="row-sum")
-    assert any("check that they are [rows, columns]" in warning for warning in made.diagnostics["warnings"])
-    assert [record.getMessage() for record in caplog.records].count(made.diagnostics["warnings"][-1]) == 1
-    assert {record.getMessage() for record in caplog.records} >= set(made.diagnostics["warnings"])
+    transposed = {name: lc.FeatureGrid(torch.ones(64, 4, 3)) for name in views}
+    result = lc.lift(splats, cameras, transposed, preset="row-sum")
+    assert any("check that they are [rows, columns]" in warning for warning in result.diagnostics["warnings"])
+    assert [record.getMessage() for record in caplog.records].count(result.diagnostics["warnings"][-1]) == 1
+    assert {record.getMessage() for record in caplog.records} >= set(result.diagnostics["warnings"])
     caplog.clear()
-    lc.lift(splats, cameras, turned, preset="row-sum", on_plan=lambda plan: None)
+    lc.lift(splats, cameras, transposed, preset="row-sum", on_plan=lambda plan: None)
     assert not caplog.records
 
 
@@ -418,7 +422,7 @@ MODES = {
     "float64": lambda: default_dtype(torch.float64),
     "bfloat16": lambda: default_dtype(torch.bfloat16),
     "autocast": lambda: torch.autocast("cpu", torch.bfloat16),
-    "another device": lambda: torch.device("meta"),  # where there is one, a card
+    "another device": lambda: torch.device("meta"),  # as a GPU may be the default
 }
 
 
@@ -431,72 +435,82 @@ def test_torch_modes_change_no_bit_and_hold_in_the_callers_iterator(scene, mode)
         modes = torch.is_inference_mode_enabled(), torch.is_autocast_enabled("cpu")
         return *modes, torch.get_default_dtype(), torch.get_default_device()
 
-    def found(given):
-        made = lc.lift(splats, cameras, given, cg_steps=1, reference_channels=2)
-        assert lc.plan(splats, cameras, views).views == made.views
-        answer = made.query(vectors, splats=splats)
+    def tensors_of(sources):
+        result = lc.lift(splats, cameras, sources, cg_steps=1, reference_channels=2)
+        assert lc.plan(splats, cameras, views).views == result.views
+        answer = result.query(vectors, splats=splats)
         W, image = lc.region_weights(splats, cameras, views), lc.render(splats, cameras["v0"], values)
         tuples = lc.lift(splats, cameras, views, preset="row-sum").features
-        return made.features, made.total_weight, answer.scores, W.weight, image, tuples
+        return result.features, result.total_weight, answer.scores, W.weight, image, tuples
 
-    def iterator(seen):
+    def iterator(log):
         for name, view in views.items():
             lc.render(splats, cameras["v0"], values)  # a call within a call
-            seen.append(modes())
+            log.append(modes())
             yield name, view
 
-    usual, seen = found(views), []
+    expected, modes_of_views = tensors_of(views), []
     with MODES[mode]():
         around = modes()
-        within = found(iterator(seen))
-        assert modes() == around and set(seen) == {around}
-    assert all(torch.equal(one, other) for one, other in zip(usual, within, strict=True))
+        within = tensors_of(iterator(modes_of_views))
+        assert modes() == around and set(modes_of_views) == {around}
+    assert all(torch.equal(a, b) for a, b in zip(expected, within, strict=True))
 
 
-def test_two_threads_lift_alike_beside_another_default_dtype(scene):
+def test_two_threads_lift_the_same_under_another_default_dtype(scene):
     _, splats, cameras, views = scene
-    usual = lc.lift(splats, cameras, views).features
+    expected = lc.lift(splats, cameras, views).features
     with default_dtype(torch.float64), ThreadPoolExecutor(2) as pool:
-        found = [pool.submit(lc.lift, splats, cameras, views) for _ in range(4)]
-        assert all(torch.equal(one.result().features, usual) for one in found)
+        futures = [pool.submit(lc.lift, splats, cameras, views) for _ in range(4)]
+        assert all(torch.equal(future.result().features, expected) for future in futures)
         assert torch.get_default_dtype() == torch.float64
 
 
-def test_every_public_value_is_shown_in_a_line_that_says_its_size(scene):
+def test_repr_of_every_public_value_is_one_line_with_its_size(scene):
     _, splats, cameras, views = scene
-    made = lc.lift(splats, cameras, views, aggregation=True, aggregation_cluster_size=2)
-    vectors = torch.eye(2, made.features.shape[1])
-    answer, words = made.query(vectors, splats=splats, threshold=0.1), ["a" * 90, "b"]
-    segmentation, catalogue = made.segment(words, vectors, splats), made.objects(splats, words, vectors)
-    sized = [splats, made, lc.region_weights(splats, cameras, views), answer, segmentation]
+    result = lc.lift(splats, cameras, views, aggregation=True, aggregation_cluster_size=2)
+    vectors = torch.eye(2, result.features.shape[1])
+    answer, words = result.query(vectors, splats=splats, threshold=0.1), ["a" * 90, "b"]
+    segmentation, catalogue = result.segment(words, vectors, splats), result.objects(splats, words, vectors)
+    sized = [splats, result, lc.region_weights(splats, cameras, views), answer, segmentation]
     sized += [lc.plan(splats, cameras, views), lc.plan_photos(splats, cameras)]
     long = lc.LiftSettings.of(**dict(lc.LiftSettings.of(speed="fast")))
-    others = [cameras, cameras["v0"].replace(name="x" * 300), *views.values(), long, lc.LiftSettings.of()]
-    others += [
+    unsized = [cameras, cameras["v0"].replace(name="x" * 300), *views.values(), long, lc.LiftSettings.of()]
+    unsized += [
         answer.objects,
         *(answer.objects.objects if answer.objects else ()),
         *segmentation.named_words,
         catalogue,
         *catalogue.objects,
     ]
-    others += [lc.CompositingParams(), lc.CompositingParams(stride=3), lc.LocalEngine(), lc.open_encoder("lvis")]
-    opened, box = made.scene(splats, cameras), ((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
-    query = lc.Query(text=["a" * 99], like=["splat:1", (1.0,) * made.features.shape[1]], absent="keep")
-    found = opened.ask(lc.Query(like=["splat:1"]))
-    thing = {"splats": 1, "share": 0.5, "score": 0.5, "box": box}
-    others += [opened, query, found, opened.objects(found), opened.view_mask(found, "v0")]
-    others += [lc.FeatureGrid(np.ones((3, 4, 5))), lc.Picture(camera=cameras["v0"])]
-    others += [models.OwnCamera.of(cameras["v0"])]
-    sized_thing: dict[str, Any] = thing | {"centre": box[0], "size": box[1]}
-    others += [lc.SelectedObject(**sized_thing), opened.world, lc.WorldFrame(up=(0, -3, 0), metres_per_unit=0.1)]
-    others += [lc.NamedSplats(word="a" * 99, row=0, value=1, colour=(1, 2, 3), margin=0.1, threshold=0.2, **thing)]
-    others += [lc.SceneObject(id=0, name=None, views=("v",) * 99, feature=(0.1,) * 512, **sized_thing)]
-    others += [lc.CoveringRegion(example="region:v:0:1", view="v" * 99, level=0, region=1, share=0.5)]
+    unsized += [lc.CompositingParams(), lc.CompositingParams(stride=3), lc.LocalEngine(), lc.open_encoder("lvis")]
+    lift_scene, box = result.scene(splats, cameras), ((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
+    query = lc.Query(text=["a" * 99], like=["splat:1", (1.0,) * result.features.shape[1]], absent="keep")
+    example_answer = lift_scene.ask(lc.Query(like=["splat:1"]))
+    summary = {"splats": 1, "share": 0.5, "score": 0.5, "box": box}
+    unsized += [
+        lift_scene,
+        query,
+        example_answer,
+        lift_scene.objects(example_answer),
+        lift_scene.view_mask(example_answer, "v0"),
+    ]
+    unsized += [lc.FeatureGrid(np.ones((3, 4, 5))), lc.Picture(camera=cameras["v0"])]
+    unsized += [models.OwnCamera.of(cameras["v0"])]
+    sized_summary: dict[str, Any] = summary | {"centre": box[0], "size": box[1]}
+    unsized += [
+        lc.SelectedObject(**sized_summary),
+        lift_scene.world,
+        lc.WorldFrame(up=(0, -3, 0), metres_per_unit=0.1),
+    ]
+    unsized += [lc.NamedSplats(word="a" * 99, row=0, value=1, colour=(1, 2, 3), margin=0.1, threshold=0.2, **summary)]
+    unsized += [lc.SceneObject(id=0, name=None, views=("v",) * 99, feature=(0.1,) * 512, **sized_summary)]
+    unsized += [lc.CoveringRegion(example="region:v:0:1", view="v" * 99, level=0, region=1, share=0.5)]
     classes = {value for name in lc.__all__ if isinstance(value := getattr(lc, name), type)}
     no_values = [kind for kind in classes if issubclass(kind, Exception) or getattr(kind, "_is_protocol", False)]
     classes -= {*no_values, lc.RayEngine, lc.Checkpoint, lc.Kernel}  # which needs Ray; a folder; a name
-    assert classes <= {kind for value in (*sized, *others) for kind in type(value).__mro__}
-    for value in (*sized, *others):
+    assert classes <= {kind for value in (*sized, *unsized) for kind in type(value).__mro__}
+    for value in (*sized, *unsized):
         line = repr(value)
         assert line.startswith(type(value).__name__ + "(") and line.endswith(")")
         assert len(line) <= 120 and "\n" not in line and len(str(value)) <= 120
@@ -512,8 +526,8 @@ def test_what_a_caller_set_stays_when_a_call_names_another_speed_or_preset() -> 
         speed="balanced", stride=3
     )
     fast = lc.LiftSettings.of(speed="fast")
-    same = lc.LiftSettings.of(speed="fast", stride=fast.stride)  # the speed's own value, but asked for
-    assert lc.LiftSettings.from_preset(same, {"speed": "exact"}).stride == fast.stride
+    explicit = lc.LiftSettings.of(speed="fast", stride=fast.stride)  # the default of this level, but explicit
+    assert lc.LiftSettings.from_preset(explicit, {"speed": "exact"}).stride == fast.stride
     assert lc.LiftSettings.from_preset(fast, {"speed": "exact"}) == lc.LiftSettings.of(speed="exact")
-    loaded = lc.LiftSettings.model_validate_json(same.model_dump_json())
-    assert loaded == same
+    loaded = lc.LiftSettings.model_validate_json(explicit.model_dump_json())
+    assert loaded == explicit

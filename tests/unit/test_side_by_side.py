@@ -1,4 +1,4 @@
-"""Views in work at the same time: in order, ended by the first error, awaited when nobody wants the rest."""
+"""Views rasterized concurrently: results in order, stopped by the first error, awaited when the iterator closes."""
 
 from __future__ import annotations
 
@@ -22,76 +22,76 @@ if TYPE_CHECKING:
 
 
 class Staged:
-    """A raster whose answers are the camera's names; what happens is noted, and a view may wait for it."""
+    """A raster that returns names of cameras and records its events; a view may wait for an event."""
 
     def __init__(self, waits: dict[str, str] | None = None) -> None:
-        self.happened: list[str] = []
-        self.forgotten = False
+        self.events: list[str] = []
+        self.is_forgotten = False
         self._waits = waits or {}
-        self._changed = threading.Condition()
+        self._condition = threading.Condition()
 
-    def note(self, what: str) -> None:
-        with self._changed:
-            self.happened.append(what)
-            self._changed.notify_all()
+    def note(self, event: str) -> None:
+        with self._condition:
+            self.events.append(event)
+            self._condition.notify_all()
 
     def region_weights(self, camera: Any, *_: Any) -> str:
         self.note(f"{camera.name} begun")
-        with self._changed:
+        with self._condition:
             awaited = self._waits.get(camera.name)
-            assert self._changed.wait_for(lambda: awaited is None or awaited in self.happened, timeout=60)
+            assert self._condition.wait_for(lambda: awaited is None or awaited in self.events, timeout=60)
         self.note(f"{camera.name} ended")
         if camera.name == "broken":
             raise ValueError(camera.name)
         return camera.name
 
     def forget(self) -> None:
-        self.forgotten = True
+        self.is_forgotten = True
 
 
-def looks(*names: str) -> Iterator[ViewRequest]:
-    nowhere = torch.empty(0, 2, dtype=torch.int32)
+def requests_of(*names: str) -> Iterator[ViewRequest]:
+    no_pixels = torch.empty(0, 2, dtype=torch.int32)
     return (
-        ViewRequest(random_camera(1, name=name), random_regions(1), CompositingParams(), Weighting(), nowhere)
+        ViewRequest(random_camera(1, name=name), random_regions(1), CompositingParams(), Weighting(), no_pixels)
         for name in names
     )
 
 
-def beside(raster: Staged, count: int) -> list[Raster]:
+def copies_of(raster: Staged, count: int) -> list[Raster]:
     return [cast("Raster", raster)] * count
 
 
 def test_views_come_in_their_order_whichever_ends_first() -> None:
     names = [f"v{k}" for k in range(9)]
-    raster = Staged({"v0": "v2 ended", "v1": "v2 ended"})  # all three are in work at the same time, or none ends
-    assert [walked.weights for walked in side_by_side(beside(raster, 3), looks(*names))] == names
-    assert raster.forgotten  # no view is kept
+    raster = Staged({"v0": "v2 ended", "v1": "v2 ended"})  # none ends unless all three run concurrently
+    assert [answer.weights for answer in side_by_side(copies_of(raster, 3), requests_of(*names))] == names
+    assert raster.is_forgotten  # no view stays cached
     assert [views_at_a_time(threads) for threads in (1, 2, 64)] == [1, 2, 4]
 
 
 def test_of_dense_maps_one_is_in_work_wherever_they_come_among_the_views() -> None:
     raster = Staged({"d0": "v1 begun", "d1": "v1 begun"})  # which waits for neither
     dense = FeatureGrid(torch.zeros(1, DENSE_ROWS + 1, 1))
-    requests = [replace(request, observation=dense) for request in looks("d0", "d1")]
-    answers = side_by_side(beside(raster, 3), [*requests, *looks("v1")])
+    requests = [replace(request, observation=dense) for request in requests_of("d0", "d1")]
+    answers = side_by_side(copies_of(raster, 3), [*requests, *requests_of("v1")])
     assert [answer.weights for answer in answers] == ["d0", "d1", "v1"]
-    begins, ends = ([raster.happened.index(f"d{k} {event}") for k in range(2)] for event in ("begun", "ended"))
+    begins, ends = ([raster.events.index(f"d{k} {event}") for k in range(2)] for event in ("begun", "ended"))
     assert min(ends) < max(begins)
 
 
 def test_an_error_comes_in_the_place_of_its_view() -> None:
-    found = side_by_side(beside(Staged(), 2), looks("v0", "v1", "broken", "v3"))
-    assert [next(found).weights, next(found).weights] == ["v0", "v1"]
+    answers = side_by_side(copies_of(Staged(), 2), requests_of("v0", "v1", "broken", "v3"))
+    assert [next(answers).weights, next(answers).weights] == ["v0", "v1"]
     with pytest.raises(ValueError, match="broken"):
-        next(found)
+        next(answers)
 
 
 def test_closing_awaits_the_views_in_work_and_begins_no_other() -> None:
     raster = Staged({"v0": "v1 begun", "v1": "released"})
-    found = side_by_side(beside(raster, 2), looks(*(f"v{k}" for k in range(50))))
-    next(found)
+    answers = side_by_side(copies_of(raster, 2), requests_of(*(f"v{k}" for k in range(50))))
+    next(answers)
     threading.Timer(0.05, raster.note, ["released"]).start()
-    found.close()
-    after = list(raster.happened)
+    answers.close()
+    after = list(raster.events)
     assert "v1 ended" in after
-    assert sum(what.endswith("begun") for what in after) == sum(what.endswith("ended") for what in after) <= 3
+    assert sum(event.endswith("begun") for event in after) == sum(event.endswith("ended") for event in after) <= 3

@@ -1,4 +1,4 @@
-"""Calls that a stranger gets wrong: each is refused with the argument's name and with what to give instead."""
+"""Wrong calls of new users: each error names the argument and a valid value."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -33,9 +33,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return Scene(splats, cameras, views, result, tmp_path_factory.mktemp("wrong"))
 
 
-def splats_with(s: Scene, **changed: Any) -> lc.Splats:
+def splats_with(s: Scene, **overrides: Any) -> lc.Splats:
     names = ("means", "quats", "log_scales", "opacity_logits")
-    return lc.Splats(**{**{name: getattr(s.splats, name) for name in names}, **changed})
+    return lc.Splats(**{**{name: getattr(s.splats, name) for name in names}, **overrides})
 
 
 Call = Callable[[Scene], Any]
@@ -117,8 +117,8 @@ CALLS: list[tuple[str, Call]] = [
 
 
 @pytest.mark.parametrize(("message", "call"), CALLS, ids=[message for message, _ in CALLS])
-def test_wrong_call_is_told_by_its_argument_and_what_to_give(scene: Scene, message: str, call: Call) -> None:
-    with pytest.raises(lc.SplatliftError, match=message) as told:
+def test_wrong_call_names_its_argument_and_what_to_give(scene: Scene, message: str, call: Call) -> None:
+    with pytest.raises(lc.SplatliftError, match=message) as excinfo:
         call(scene)
-    assert told.value.argument and told.value.expected and told.value.got
-    assert "\n" not in str(told.value) and len(str(told.value)) < 600
+    assert excinfo.value.argument and excinfo.value.expected and excinfo.value.got
+    assert "\n" not in str(excinfo.value) and len(str(excinfo.value)) < 600

@@ -24,9 +24,9 @@ def test_the_demo_finds_what_it_asks_for(tmp_path: Path, capsys: pytest.CaptureF
     assert (penguin["object"], penguin["present"], sofa["present"], sofa["iou"]) == ("penguin", True, False, None)
     assert penguin["iou"] > 0.8 and 0.2 < penguin["threshold"] < penguin["score"] < 0.4  # cosines as photos have them
     assert load_lift(Path(report["lift_file"])).features.shape[0] == report["splats"]
-    found = [name for phrase in report["phrases"] for name in phrase["pictures"].values()]
-    assert len(found) == 6
-    for name in (*report["pictures"].values(), *found):
+    phrase_pictures = [name for phrase in report["phrases"] for name in phrase["pictures"].values()]
+    assert len(phrase_pictures) == 6
+    for name in (*report["pictures"].values(), *phrase_pictures):
         with Image.open(tmp_path / name) as picture:
             assert picture.size == (640, 480) and picture.getextrema() != ((0, 0),) * 3
 
@@ -34,10 +34,10 @@ def test_the_demo_finds_what_it_asks_for(tmp_path: Path, capsys: pytest.CaptureF
 def test_shipped_scene_is_small_and_names_its_sources() -> None:
     files = [*SHIPPED.iterdir(), LVIS_TABLE]
     assert sum(file.stat().st_size for file in files) < 8_000_000
-    told = (SHIPPED / "LICENCES.md").read_text(encoding="utf-8")
-    for thing in json.loads((SHIPPED / "truth.json").read_text())["objects"]:
-        licence = thing["license"].removeprefix("procedural, ").casefold()
-        assert any(thing["class"] in line and licence in line.casefold() for line in told.splitlines()), thing
+    licences = (SHIPPED / "LICENCES.md").read_text(encoding="utf-8")
+    for entry in json.loads((SHIPPED / "truth.json").read_text())["objects"]:
+        licence = entry["license"].removeprefix("procedural, ").casefold()
+        assert any(entry["class"] in line and licence in line.casefold() for line in licences.splitlines()), entry
 
 
 def test_service_that_does_not_start_says_why(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Finding what a scene folder holds, and saying what it lacks."""
+"""Search of a scene folder for its files, and errors that name the missing ones."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ def test_a_scene_is_found_by_what_its_files_are(folder: Path, tmp_path: Path) ->
     assert scene.truth is not None
     mask = scene.truth.mask_of("the fish", "v")
     assert mask is not None and mask.tolist() == [[False, False, True]]
-    again = scene.truth.mask_of("A Fish", "v")
-    assert again is not None and np.array_equal(again, mask)
+    same_mask = scene.truth.mask_of("A Fish", "v")
+    assert same_mask is not None and np.array_equal(same_mask, mask)
     assert scene.truth.mask_of("the unknown", "v") is None
 
 
@@ -86,7 +86,7 @@ def test_what_is_missing_is_named(folder: Path, tmp_path: Path) -> None:
         find_scene(tmp_path / "none", (), tmp_path)
 
 
-def test_a_scene_that_says_nothing_of_itself_is_asked_nothing(folder: Path, tmp_path: Path) -> None:
+def test_a_scene_without_its_truth_has_no_phrases(folder: Path, tmp_path: Path) -> None:
     (folder / "truth.json").unlink()
     (folder / "cameras.json").write_text(json.dumps([INRIA_CAMERA]))
     scene = find_scene(folder, (), tmp_path)
@@ -105,6 +105,6 @@ def test_phrases_without_an_encoder_for_them_are_refused(folder: Path, tmp_path:
 def test_a_pack_that_names_no_text_space_has_the_words_of_the_table_beside_it(folder: Path, tmp_path: Path) -> None:
     save_file({"v/grid": torch.ones(1, 1, 2)}, str(folder / "grids.safetensors"))
     bare = find_scene(folder, (), tmp_path / "bare")
-    assert (bare.phrases, bare.text_space) == ((), "")  # not named, so nothing is asked
+    assert (bare.phrases, bare.text_space) == ((), "")  # without a text space the demo queries nothing
     (folder / "text_table.safetensors").touch()
     assert find_scene(folder, (), tmp_path / "worded").phrases == ("the cat", "the fish")

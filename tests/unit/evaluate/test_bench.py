@@ -1,4 +1,4 @@
-"""``splatlift bench``: what it prints."""
+"""Output of ``splatlift bench``."""
 
 import json
 
@@ -17,14 +17,14 @@ def test_every_preset_has_its_seconds_a_view(capsys: pytest.CaptureFixture[str])
     assert (document["splats"], document["views"], document["channels"]) == (2000, 2, 8)
     assert cli.main(SMALL) == 0
     lines = capsys.readouterr().out
-    for preset, found in document["presets"].items():
-        assert found["geometry_s_per_view"] > 0 and found["weights_entries_per_view"] > 0
-        assert found["stages_of_geometry"]["geometry"] == 1 and found["stages_of_geometry"]["all"] > 1
+    for preset, figures in document["presets"].items():
+        assert figures["geometry_s_per_view"] > 0 and figures["weights_entries_per_view"] > 0
+        assert figures["stages_of_geometry"]["geometry"] == 1 and figures["stages_of_geometry"]["all"] > 1
         assert preset in lines
     assert min(document["machine_speed"].values()) > 1e6
 
 
-@pytest.mark.parametrize("more", [["--size", "9"], ["--scene", "nowhere"], ["--preset", "magic"]], ids=str)
-def test_options_that_make_no_bench_are_refused(more: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main([*SMALL, *more]) == 2
+@pytest.mark.parametrize("options", [["--size", "9"], ["--scene", "nowhere"], ["--preset", "magic"]], ids=str)
+def test_options_that_make_no_bench_are_refused(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([*SMALL, *options]) == 2
     assert capsys.readouterr().err.count("\n") == 1

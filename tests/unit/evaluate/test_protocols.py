@@ -1,4 +1,4 @@
-"""The protocols against their definitions, and the labels against masks that one can count."""
+"""Protocols compared with their definitions, and labels with masks whose pixels can be counted."""
 
 from __future__ import annotations
 
@@ -52,29 +52,29 @@ def box(shape: tuple[int, int], x1: int, y1: int, x2: int, y2: int) -> np.ndarra
 
 def test_iou_and_its_means_are_those_of_counted_pixels() -> None:
     shape = (10, 10)
-    left, middle = box(shape, 0, 0, 4, 10), box(shape, 2, 0, 6, 10)  # 40 pixels each, 20 shared: 1/3
-    things = [LabelledObject("a", left, ((0, 0, 3, 9),)), LabelledObject("b", middle, ())]
+    first_mask, second_mask = box(shape, 0, 0, 4, 10), box(shape, 2, 0, 6, 10)  # 40 pixels each, 20 shared: 1/3
+    objects = [LabelledObject("a", first_mask, ((0, 0, 3, 9),)), LabelledObject("b", second_mask, ())]
     first = compare_frame(
-        P3, "one", things, {"a": Prediction(left, (0, 5)), "b": Prediction(left, (0, 0))}, lifted=True
+        P3, "one", objects, {"a": Prediction(first_mask, (0, 5)), "b": Prediction(first_mask, (0, 0))}, lifted=True
     )
     empty = np.zeros(shape, bool)
     second = compare_frame(
         P3,
         "two",
-        [LabelledObject("a", left, ()), LabelledObject("c", empty, ())],
+        [LabelledObject("a", first_mask, ()), LabelledObject("c", empty, ())],
         {"a": Prediction(empty, (9, 9)), "c": Prediction(box(shape, 0, 0, 5, 1), (0, 0))},
         lifted=False,
     )
     assert [row.iou for row in first + second] == [1.0, pytest.approx(1 / 3), 0.0, None]
-    found = means(first + second)
-    assert (found.frames, found.objects) == (2, 3)
-    assert found.object_micro == pytest.approx((1 + 1 / 3 + 0) / 3)
-    assert found.frame_macro == pytest.approx((2 / 3 + 0) / 2)
+    summary = means(first + second)
+    assert (summary.frames, summary.objects) == (2, 3)
+    assert summary.object_micro == pytest.approx((1 + 1 / 3 + 0) / 3)
+    assert summary.frame_macro == pytest.approx((2 / 3 + 0) / 2)
     assert pooled_ious(first + second) == {"a": pytest.approx(40 / 80), "b": pytest.approx(20 / 60)}
-    assert found.class_pooled == pytest.approx((1 / 2 + 1 / 3) / 2)
-    assert (found.localised, found.accuracy_25, found.accuracy_50) == (1 / 3, 2 / 3, 1 / 3)
-    other = means(second)
-    assert mean_of_scenes([found, other]).object_micro == pytest.approx((4 / 9 + 0) / 2)
+    assert summary.class_pooled == pytest.approx((1 / 2 + 1 / 3) / 2)
+    assert (summary.localised, summary.accuracy_25, summary.accuracy_50) == (1 / 3, 2 / 3, 1 / 3)
+    second_summary = means(second)
+    assert mean_of_scenes([summary, second_summary]).object_micro == pytest.approx((4 / 9 + 0) / 2)
     assert means([]).object_micro is None
 
 
@@ -92,8 +92,8 @@ def test_false_alarms_of_an_absent_class_count_where_pixels_are_pooled() -> None
 def test_p1_is_localised_in_a_box_and_p3_in_the_mask() -> None:
     corner = LabelledObject("a", box((9, 9), 0, 0, 1, 1), ((0, 0, 4, 4), (7, 7, 8, 8)))
     for peak, in_box, in_mask in (((0, 0), True, True), ((4, 4), True, False), ((5, 4), False, False)):
-        found = {"a": Prediction(corner.mask, peak)}
-        assert [compare_frame(p, "v", [corner], found, lifted=False)[0].localised for p in (P1, P3)] == [
+        predictions = {"a": Prediction(corner.mask, peak)}
+        assert [compare_frame(p, "v", [corner], predictions, lifted=False)[0].localised for p in (P1, P3)] == [
             in_box,
             in_mask,
         ]
@@ -101,7 +101,7 @@ def test_p1_is_localised_in_a_box_and_p3_in_the_mask() -> None:
 
 
 def plain_segment(relevance: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
-    """LangSplat's steps, a pixel at a time; borders mirror without repeating the edge, as OpenCV's filters do."""
+    """Apply LangSplat's steps pixel by pixel; borders mirror without repeating the edge, as OpenCV's filters do."""
     height, width = relevance.shape
 
     def mirrored(index: int, size: int) -> int:
@@ -131,49 +131,51 @@ def test_p1_segments_a_map_as_langsplat_does(height: int, width: int) -> None:
     relevance = np.kron(rng.random((3, 3)), np.ones((height // 3 + 1, width // 3 + 1)))[:height, :width]
     relevance = (relevance + 0.2 * rng.random(relevance.shape)).astype(np.float32)
     mask, peak = plain_segment(relevance)
-    found = segment(relevance)
-    assert (found.mask == mask).all() and 0 < mask.mean() < 1
-    assert found.peak == peak
+    prediction = segment(relevance)
+    assert (prediction.mask == mask).all() and 0 < mask.mean() < 1
+    assert prediction.peak == peak
     flat = segment(np.full((height, width), 0.5, np.float32))
     assert not flat.mask.any()
 
 
 def test_p1_compares_rendered_features(scene: Scene) -> None:
     texts = ["red apple", "book"]
-    found = RenderedFeatures(scene, texts, words(scene)).cosines("frame_00002")
+    cosines = RenderedFeatures(scene, texts, words(scene)).cosines("frame_00002")
     rendered = scene.raster.render(scene.cameras["frame_00002"], scene.lift.features.float(), scene.compositing)
     unit = torch.nn.functional.normalize(rendered, dim=-1)
     vectors = torch.as_tensor(words(scene).encode([*texts, "object", "things", "stuff", "texture"]))
-    torch.testing.assert_close(found, unit @ vectors.T, atol=1e-5, rtol=0)
+    torch.testing.assert_close(cosines, unit @ vectors.T, atol=1e-5, rtol=0)
 
 
 def test_p2_sees_the_selected_splats_alone(scene: Scene) -> None:
     texts, encoder = ["red apple", "unicorn"], words(scene)
     protocol = SelectedSplats(scene, texts, encoder, threshold=0.5)
-    chosen = ask(scene, Query.of(("red apple",), threshold=0.5), encoder).selected
+    selected = ask(scene, Query.of(("red apple",), threshold=0.5), encoder).selected
     splats = scene.splats
     few = replace(
         splats,
-        **{name: getattr(splats, name)[chosen] for name in ("means", "quats", "log_scales", "opacity_logits", "sh")},
+        **{
+            name: getattr(splats, name)[selected] for name in ("means", "quats", "log_scales", "opacity_logits", "sh")
+        },
         extras={},
     )
-    alone = CpuRaster(few).row_sums(scene.cameras["frame_00001"], scene.compositing)
-    found = protocol.predict_view("frame_00001")
-    assert (found["red apple"].mask == (alone > 0.7).numpy()).all() and found["red apple"].mask.any()
-    assert not found["unicorn"].mask.any() and found["unicorn"].peak is None
+    row_sums = CpuRaster(few).row_sums(scene.cameras["frame_00001"], scene.compositing)
+    predictions = protocol.predict_view("frame_00001")
+    assert (predictions["red apple"].mask == (row_sums > 0.7).numpy()).all() and predictions["red apple"].mask.any()
+    assert not predictions["unicorn"].mask.any() and predictions["unicorn"].peak is None
 
 
 @pytest.mark.parametrize("threshold", ["auto", 0.4])
 def test_p3_cuts_the_rendered_scores_of_a_query(scene: Scene, threshold: str | float) -> None:
     texts, encoder = ["book", "red apple"], words(scene)
-    found = RenderedScores(scene, texts, encoder, threshold).predict_view("frame_00002")
+    predictions = RenderedScores(scene, texts, encoder, threshold).predict_view("frame_00002")
     for text in texts:
-        seen = view_mask(scene, ask(scene, Query.of((text,), threshold=threshold), encoder), "frame_00002")
-        met = seen.row_sums >= 0.5
-        cut = find_threshold(seen.attention[met], threshold).value
-        assert (found[text].mask == (met & (seen.attention >= cut))).all() and found[text].mask.any()
-        x, y = found[text].peak or (0, 0)
-        assert seen.attention[y, x] == seen.attention.max()
+        view = view_mask(scene, ask(scene, Query.of((text,), threshold=threshold), encoder), "frame_00002")
+        hit = view.row_sums >= 0.5
+        cut = find_threshold(view.attention[hit], threshold).value
+        assert (predictions[text].mask == (hit & (view.attention >= cut))).all() and predictions[text].mask.any()
+        x, y = predictions[text].peak or (0, 0)
+        assert view.attention[y, x] == view.attention.max()
 
 
 def labels_of(folder: Path, document: object) -> Path:
@@ -197,13 +199,13 @@ def test_polygons_of_a_category_are_united_and_rescaled(tmp_path: Path) -> None:
     )
     scenes = lerf_scenes(labels_of(tmp_path, document))
     assert scenes.keys() == {"kitchen"} and scenes["kitchen"].views == ("frame_00001",)
-    found = {thing.category: thing for thing in scenes["kitchen"].objects("frame_00001", WIDTH, HEIGHT)}
-    assert found.keys() == {"cup", "dust", "dot"}
-    assert (found["cup"].mask == box((HEIGHT, WIDTH), 2, 3, 12, 8)).all()
-    assert found["cup"].boxes == ((2, 3, 9, 7), (8, 3, 11, 7))
-    assert not found["dust"].mask.any() and found["dot"].mask.sum() == 1
-    whole = scenes["kitchen"].objects("frame_00001", 2 * WIDTH, 2 * HEIGHT)[0]
-    assert whole.mask.sum() == (2 * 9 - 2 * 2 + 1) * (2 * 7 - 2 * 3 + 1) + 2 * 2 * (2 * 7 - 2 * 3 + 1)
+    objects = {label.category: label for label in scenes["kitchen"].objects("frame_00001", WIDTH, HEIGHT)}
+    assert objects.keys() == {"cup", "dust", "dot"}
+    assert (objects["cup"].mask == box((HEIGHT, WIDTH), 2, 3, 12, 8)).all()
+    assert objects["cup"].boxes == ((2, 3, 9, 7), (8, 3, 11, 7))
+    assert not objects["dust"].mask.any() and objects["dot"].mask.sum() == 1
+    enlarged = scenes["kitchen"].objects("frame_00001", 2 * WIDTH, 2 * HEIGHT)[0]
+    assert enlarged.mask.sum() == (2 * 9 - 2 * 2 + 1) * (2 * 7 - 2 * 3 + 1) + 2 * 2 * (2 * 7 - 2 * 3 + 1)
 
 
 GOOD = isat([("cup", rectangle(0, 0, 4, 4))])
@@ -241,17 +243,17 @@ def test_masks_of_classes_are_read_in_any_size_and_depth(tmp_path: Path) -> None
     for data in (tmp_path, tmp_path / "bed"):
         scenes = three_d_ovs_scenes(data)
         assert scenes.keys() == {"bed"} and scenes["bed"].classes == ("red bag", "cat", "sofa")
-    found = {thing.category: thing for thing in scenes["bed"].objects("03", 16, 12)}
-    assert (found["red bag"].mask == mask).all() and found["red bag"].boxes == ((4, 2, 11, 9),)
-    assert (found["cat"].mask == mask).mean() > 0.97
-    assert not found["sofa"].mask.any() and found["sofa"].boxes == ()
+    objects = {label.category: label for label in scenes["bed"].objects("03", 16, 12)}
+    assert (objects["red bag"].mask == mask).all() and objects["red bag"].boxes == ((4, 2, 11, 9),)
+    assert (objects["cat"].mask == mask).mean() > 0.97
+    assert not objects["sofa"].mask.any() and objects["sofa"].boxes == ()
 
 
 def test_labels_that_are_not_there_are_refused(tmp_path: Path) -> None:
-    for read in (lerf_scenes, three_d_ovs_scenes):
+    for read_scenes in (lerf_scenes, three_d_ovs_scenes):
         for data in (tmp_path, tmp_path / "none"):
             with pytest.raises(InvalidInput, match=r"^data:"):
-                read(data)
+                read_scenes(data)
     view = tmp_path / "bed" / "segmentations" / "03"
     view.mkdir(parents=True)
     classes = view.parent / "classes.txt"

@@ -1,4 +1,4 @@
-"""Speed against accuracy: what is compared with what, which run is taken, and what is left behind."""
+"""Trade-off of time and accuracy: candidates, the recommended run, its accuracies and the files of a report."""
 
 from __future__ import annotations
 
@@ -34,96 +34,105 @@ from tests.scenes import centred, observed, random_camera, random_splats, write_
 pytestmark = pytest.mark.slow
 
 
-def judged_by(cosines: Sequence[float] | np.ndarray) -> dict[str, Any]:
+def accuracies_of(cosines: Sequence[float] | np.ndarray) -> dict[str, Any]:
     return {"centred_cosine": list(cosines), "intersections": [], "unions": [], "phrase_iou": []}
 
 
 def run_of(name: str, seconds: float, cosines: Sequence[float] | np.ndarray, kind: str = "dial") -> dict[str, Any]:
-    """A run as `comparison._run` tells it."""
+    """Return a run as `comparison._run` reports it."""
     figures = dict.fromkeys(("cosine", "cosine_plain", "cosine_q05"), 0.9)
     times = dict.fromkeys((f"{part}{end}" for part in ("wall", "cpu") for end in ("_s", "_ratio")), seconds)
     times |= dict.fromkeys(("process_s", "wall_with_reading_s", "cpu_with_reading_s"), seconds)
     stages = {"timings": {"plan": 0.01, "geometry": seconds / 2, "solve": seconds / 4}}
-    told = {"peak_memory_bytes": 1 << 30, "views": 3, "lost_share": 0.0, "accuracies": judged_by(cosines)} | stages
-    return {"name": name, "kind": kind, "options": {"speed": name}, **figures, **times, **told}
+    measurements = {
+        "peak_memory_bytes": 1 << 30,
+        "views": 3,
+        "lost_share": 0.0,
+        "accuracies": accuracies_of(cosines),
+    } | stages
+    return {"name": name, "kind": kind, "options": {"speed": name}, **figures, **times, **measurements}
 
 
-def chosen(*runs: dict[str, Any]) -> dict[str, Any]:
-    judged = [run["accuracies"] for run in runs]
-    return choose([run | accuracy_of(one) for run, one in zip(runs, judged, strict=True)], judged)
+def choice_of(*runs: dict[str, Any]) -> dict[str, Any]:
+    accuracies = [run["accuracies"] for run in runs]
+    return choose([run | accuracy_of(accuracy) for run, accuracy in zip(runs, accuracies, strict=True)], accuracies)
 
 
-VIEWS = np.array([0.2, 0.9, 0.4, 0.7, 0.5, 0.6])  # how much a view shows varies more than runs do
+VIEWS = np.array([0.2, 0.9, 0.4, 0.7, 0.5, 0.6])  # views differ more than runs do
 NOISE = np.array([1, -1, 1, -1, 1, -1]) * 0.002
 RUNS = [
     run_of("exact", 10, VIEWS),
     run_of("equal", 5, VIEWS + NOISE - 0.0005),
-    run_of("told apart", 2, VIEWS - 0.005),
+    run_of("distinct", 2, VIEWS - 0.005),
     run_of("unclear", 1, VIEWS - [0.3, -0.1, 0.3, -0.1, 0.1, -0.1], "preset"),
 ]
 
 
 def test_the_cheapest_of_runs_as_good_as_the_best_is_taken():
-    found = chosen(*RUNS)
-    assert (found["recommended"], found["name"], found["ties"]) == (True, "equal", ["equal", "exact"])
-    assert "6 views do not tell" in found["why"] and "(exact, 0.5500)" in found["why"]
-    assert found["front"] == ["unclear", "told apart", "equal", "exact"]
-    # What few views do not tell apart, and lies far below, is not as good; neither is what is near and always below.
-    assert chosen(RUNS[0], RUNS[3])["ties"] == ["exact"] == chosen(RUNS[0], RUNS[2])["ties"]
-    interval = chosen(*[run_of(name, 1, VIEWS[:4]) for name in ("a", "b")])["intervals"]["a"]
+    choice = choice_of(*RUNS)
+    assert (choice["recommended"], choice["name"], choice["ties"]) == (True, "equal", ["equal", "exact"])
+    assert "6 views do not tell" in choice["why"] and "(exact, 0.5500)" in choice["why"]
+    assert choice["front"] == ["unclear", "distinct", "equal", "exact"]
+    # A run far below that few views do not distinguish is not as good; nor is one that is near and always below.
+    assert choice_of(RUNS[0], RUNS[3])["ties"] == ["exact"] == choice_of(RUNS[0], RUNS[2])["ties"]
+    interval = choice_of(*[run_of(name, 1, VIEWS[:4]) for name in ("a", "b")])["intervals"]["a"]
     every_draw = np.array(list(product(VIEWS[:4], repeat=4))).mean(axis=1)
     assert interval == pytest.approx(np.quantile(every_draw, [0.025, 0.975]), abs=0.03)
 
 
 def test_too_little_to_judge_by_recommends_nothing():
-    alone = chosen(RUNS[0])
-    assert (alone["recommended"], alone["name"]) == (False, "exact")
-    assert alone["why"].startswith("Nothing can be recommended: exact alone fitted the budget")
-    few = chosen(*[run_of(name, 1, VIEWS[:3]) for name in ("exact", "fast")])
+    single = choice_of(RUNS[0])
+    assert (single["recommended"], single["name"]) == (False, "exact")
+    assert single["why"].startswith("Nothing can be recommended: exact alone fitted the budget")
+    few = choice_of(*[run_of(name, 1, VIEWS[:3]) for name in ("exact", "fast")])
     assert not few["recommended"] and "4 at least, and there are 3 with features and 0 with masks" in few["why"]
-    none = chosen(*[run_of(name, 1, []) for name in ("exact", "fast")])
+    none = choice_of(*[run_of(name, 1, []) for name in ("exact", "fast")])
     assert not none["recommended"] and none["accuracy"] == "cosine"
 
 
 def test_mask_iou_over_views_is_that_of_all_their_pixels():
     rng = torch.Generator().manual_seed(0)
     labels, truth = (torch.randint(0, 3, (4, 50), generator=rng) for _ in range(2))
-    shared, joined = zip(*(shared_pixels(*view, 4) for view in zip(labels, truth, strict=True)), strict=True)
-    judged = {"intersections": torch.stack(shared).tolist(), "unions": torch.stack(joined).tolist()}
-    found = accuracy_of(judged_by([]) | judged | {"phrase_iou": [0.5, 1.0]})
-    assert found["mask_iou"] == pytest.approx(float(class_ious(labels, truth, 4).nanmean()))
-    assert (found["phrase_iou"], found["centred_cosine"]) == (0.75, None)
-    with_masks = [run | {"accuracies": run["accuracies"] | judged} for run in RUNS]
-    assert (chosen(*with_masks)["accuracy"], chosen(*with_masks)["name"]) == ("mask_iou", "unclear")
+    intersections, unions = zip(*(shared_pixels(*view, 4) for view in zip(labels, truth, strict=True)), strict=True)
+    pixel_counts = {"intersections": torch.stack(intersections).tolist(), "unions": torch.stack(unions).tolist()}
+    accuracy = accuracy_of(accuracies_of([]) | pixel_counts | {"phrase_iou": [0.5, 1.0]})
+    assert accuracy["mask_iou"] == pytest.approx(float(class_ious(labels, truth, 4).nanmean()))
+    assert (accuracy["phrase_iou"], accuracy["centred_cosine"]) == (0.75, None)
+    with_masks = [run | {"accuracies": run["accuracies"] | pixel_counts} for run in RUNS]
+    assert (choice_of(*with_masks)["accuracy"], choice_of(*with_masks)["name"]) == ("mask_iou", "unclear")
 
 
 @pytest.mark.parametrize("grids", [False, True])
 def test_centred_cosines_equal_the_dense_definition(grids):
-    splats, walk, X = random_splats(3, 50), CompositingParams(1.2), torch.randn(50, 6)
+    splats, params, X = random_splats(3, 50), CompositingParams(1.2), torch.randn(50, 6)
     cameras = [centred(random_camera(3 + k, 32, 24, name=f"v{k}")) for k in range(2)]  # fewer pixels than are sampled
     views = [observed(3, k, grids) for k in range(2)]
     readings = [reading_matrix(view, 32, 24) for view in views]
-    seen = [S @ view.codebook.double().numpy() for (S, _), view in zip(readings, views, strict=True)]
-    seen = [rows / np.linalg.norm(rows, axis=1, keepdims=True) for rows in seen]
-    mean, expected = np.concatenate(seen).mean(axis=0), []
-    for camera, view, (S, rays), B in zip(cameras, views, readings, seen, strict=True):
-        rendered = (dense_view(splats, camera, walk).A @ X.double().numpy())[rays]
+    targets = [S @ view.codebook.double().numpy() for (S, _), view in zip(readings, views, strict=True)]
+    targets = [rows / np.linalg.norm(rows, axis=1, keepdims=True) for rows in targets]
+    mean, expected = np.concatenate(targets).mean(axis=0), []
+    for camera, view, (S, rays), B in zip(cameras, views, readings, targets, strict=True):
+        rendered = (dense_view(splats, camera, params).A @ X.double().numpy())[rays]
         length = np.linalg.norm(rendered, axis=1)
-        moved, real = rendered / np.maximum(length, 1e-30)[:, None] - mean, B - mean
-        cosines = (moved * real).sum(axis=1) / np.linalg.norm(moved, axis=1) / np.linalg.norm(real, axis=1)
+        rendered_offset, target_offset = rendered / np.maximum(length, 1e-30)[:, None] - mean, B - mean
+        cosines = (
+            (rendered_offset * target_offset).sum(axis=1)
+            / np.linalg.norm(rendered_offset, axis=1)
+            / np.linalg.norm(target_offset, axis=1)
+        )
         cosines[length == 0] = 0
         groups = [S[:, m] > 0 for m in range(S.shape[1])]
         means = [cosines[rows].mean() for rows in groups if rows.sum() >= 5]
         expected.append(cosines.mean() if isinstance(view, FeatureGrid) else np.mean(means))
-    found = centred_cosines(CpuRaster(splats), list(zip(cameras, views, strict=True)), X, walk)
-    assert found == pytest.approx(expected, abs=1e-4)
+    actual = centred_cosines(CpuRaster(splats), list(zip(cameras, views, strict=True)), X, params)
+    assert actual == pytest.approx(expected, abs=1e-4)
 
 
-def test_the_dial_starts_from_the_preset_of_the_order():
-    usual, guided = candidates_of({}), candidates_of({"preset": "tikhonov"})
-    names = [[candidate.name for candidate in some] for some in (usual, guided)]
+def test_candidates_start_from_the_preset_of_the_order():
+    default, guided = candidates_of({}), candidates_of({"preset": "tikhonov"})
+    names = [[candidate.name for candidate in candidates] for candidates in (default, guided)]
     assert names[0][0] == names[1][0] == "exact"
-    assert "default" not in names[0] and "tikhonov" not in names[1]  # they are what exact is
+    assert "default" not in names[0] and "tikhonov" not in names[1]  # both equal exact
     assert {"aggregation", "tikhonov"} <= set(names[0]) and "default" in names[1]
     # A setting that stands on the robust step leaves out presets that have none.
     assert [candidate.name for candidate in candidates_of({"reliability": True}) if candidate.kind == "preset"] == [
@@ -135,12 +144,12 @@ def test_the_dial_starts_from_the_preset_of_the_order():
 
 def test_cosines_count_splats_that_the_exact_run_saw():
     exact = torch.tensor([[1.0, 0], [0, 1], [1, 0], [0, 0]])
-    found = cosine_figures(
+    figures = cosine_figures(
         torch.tensor([[2.0, 0], [0, 0], [0, 1], [1, 1]]), exact, torch.tensor([3.0, 0.5, 0.5, 9.0])
     )
-    assert found["cosine"] == pytest.approx(3 / 4)
-    assert found["cosine_plain"] == pytest.approx(1 / 3)
-    assert (found["cosine_q05"], found["lost_share"]) == (0, pytest.approx(1 / 3))
+    assert figures["cosine"] == pytest.approx(3 / 4)
+    assert figures["cosine_plain"] == pytest.approx(1 / 3)
+    assert (figures["cosine_q05"], figures["lost_share"]) == (0, pytest.approx(1 / 3))
 
 
 def order_of(folder: Path, **parts) -> RunSpec:
@@ -157,10 +166,10 @@ def test_a_run_is_judged_by_views_that_it_did_not_lift(tmp_path):
     assert -1 < exact["accuracies"]["centred_cosine"][0] < 1
     assert exact["peak_memory_bytes"] > 1 << 26
     assert exact["cpu_with_reading_s"] > exact["cpu_s"] > 0
-    other = measure_run(replace(order, settings={"speed": "draft"}, exact=False))
-    assert other["cosine"] < 1
-    again = measure_run(replace(order, lifted=("v0", "v1", "v2"), settings={}, exact=False))
-    assert again["accuracies"]["centred_cosine"] > exact["accuracies"]["centred_cosine"]  # the view was lifted
+    draft_run = measure_run(replace(order, settings={"speed": "draft"}, exact=False))
+    assert draft_run["cosine"] < 1
+    full_run = measure_run(replace(order, lifted=("v0", "v1", "v2"), settings={}, exact=False))
+    assert full_run["accuracies"]["centred_cosine"] > exact["accuracies"]["centred_cosine"]  # the view was lifted
 
 
 def test_masks_are_judged_by_the_words_of_their_classes(tmp_path):
@@ -172,9 +181,11 @@ def test_masks_are_judged_by_the_words_of_their_classes(tmp_path):
     figures = []
     for classes in (("cat", "dog"), ("dog", "cat")):
         order = order_of(tmp_path, classes=classes, **files)
-        judged = measure_run(replace(order, labelled=("v2",)))["accuracies"]
-        figures.append(accuracy_of(judged)["mask_iou"])
-        assert [0 <= iou <= 1 for iou in judged["phrase_iou"]] == [True]  # of the class that is shown, in its view
+        accuracies = measure_run(replace(order, labelled=("v2",)))["accuracies"]
+        figures.append(accuracy_of(accuracies)["mask_iou"])
+        assert [0 <= iou <= 1 for iou in accuracies["phrase_iou"]] == [
+            True
+        ]  # of the class that is shown, in its view
     # A mask of zeros: the share of its pixels called "cat" over all, then "dog"; the other class has an IoU of zero.
     assert figures[0] + figures[1] == pytest.approx(0.5, abs=0.01)
 
@@ -182,22 +193,26 @@ def test_masks_are_judged_by_the_words_of_their_classes(tmp_path):
 def test_a_short_budget_takes_fewer_views_and_runs_the_exact_one_alone(tmp_path, monkeypatch):
     calls = []
 
-    def told(order, candidate):
+    def record_call(order, candidate):
         calls.append((candidate.name, order.lifted))
         return run_of(candidate.name, 10, VIEWS)
 
-    monkeypatch.setattr(comparison, "_run", told)
+    monkeypatch.setattr(comparison, "_run", record_call)
     monkeypatch.setattr(comparison, "LEAST_VIEWS", 1)
     paths = write_scene(tmp_path, 2)
     scene = SceneFiles(paths[0], paths[1], (paths[2],))
-    found = comparison.compare(scene, 1.0, {}, 1, silent)
+    document = comparison.compare(scene, 1.0, {}, 1, silent)
     assert [name for name, _ in calls] == ["draft", "exact"]
-    assert [run["name"] for run in found["runs"]] == ["exact"]
-    assert found["skipped"] == [candidate.name for candidate in candidates_of({})[1:]]
-    assert (found["views"], calls[1][1]) == ({"lifted": 1, "of": 2, "held_out": 1}, ("v0",))
+    assert [run["name"] for run in document["runs"]] == ["exact"]
+    assert document["skipped"] == [candidate.name for candidate in candidates_of({})[1:]]
+    assert (document["views"], calls[1][1]) == ({"lifted": 1, "of": 2, "held_out": 1}, ("v0",))
     calls.clear()
-    found = comparison.compare(scene, 1e6, {}, 1, silent)
-    assert (len(found["runs"]), found["skipped"], found["views"]["lifted"]) == (len(candidates_of({})), [], 2)
+    document = comparison.compare(scene, 1e6, {}, 1, silent)
+    assert (len(document["runs"]), document["skipped"], document["views"]["lifted"]) == (
+        len(candidates_of({})),
+        [],
+        2,
+    )
 
 
 def test_chart_table_and_json_are_written(tmp_path):
@@ -205,7 +220,7 @@ def test_chart_table_and_json_are_written(tmp_path):
     runs = [{**run, **accuracy_of(run["accuracies"])} for run in lossy]
     document = {
         "title": "t", "scene": "s", "command": "c", "runs": runs, "skipped": ["mean"], "refused": ["argmax"],
-        "choice": chosen(*RUNS),
+        "choice": choice_of(*RUNS),
         "views": {"lifted": 2, "of": 4, "held_out": 6}, "labelled_views": 0, "budget_s": 1.0, "seconds": 2.0,
         "date": "2026-11-21", "hardware": {"cpu": "x"},
     }  # fmt: skip
@@ -219,16 +234,16 @@ def test_chart_table_and_json_are_written(tmp_path):
     assert bars["geometry"] == pytest.approx([2 * share for share in bars["solve"]]) and len(bars["solve"]) == 3
     page = paths[2].read_text()
     assert "**Take equal**" in page
-    assert "told apart leaves 12.5% of the splats without the feature that exact gives them." in page
+    assert "distinct leaves 12.5% of the splats without the feature that exact gives them." in page
     assert "every n-th of 4" in page
     assert "want of time: mean. Not compared, as your settings forbid it: argmax." in page
     assert "Not run for want of time: mean." in page
     assert [line.split(" | ")[0] for line in table_of(document)[2:]] == [
-        "| **unclear**", "| **told apart**", "| **equal**", "| **exact**",
+        "| **unclear**", "| **distinct**", "| **equal**", "| **exact**",
     ]  # fmt: skip
-    alone = document | {"runs": runs[:1], "choice": chosen(RUNS[0])}
-    report.save(alone, tmp_path / "alone")
-    assert "\nNothing can be recommended: exact alone fitted" in "\n".join(report.page_of(alone))
+    single = document | {"runs": runs[:1], "choice": choice_of(RUNS[0])}
+    report.save(single, tmp_path / "alone")
+    assert "\nNothing can be recommended: exact alone fitted" in "\n".join(report.page_of(single))
 
 
 def test_command_compares_in_processes_of_their_own(tmp_path, capsys):
@@ -241,9 +256,9 @@ def test_command_compares_in_processes_of_their_own(tmp_path, capsys):
     assert document["runs"][0]["cosine"] == pytest.approx(1.0)
     assert all(Path(file).is_file() for file in document["files"])
     assert np.isfinite(document["runs"][0]["wall_with_reading_ratio"])
-    again = vars(cli.build_parser().parse_args(shlex.split(document["command"])[1:]))
-    given = vars(cli.build_parser().parse_args([*command, "--set", "diagnostic_rays=0", "--threads", "1"]))
-    assert {key for key, value in given.items() if again[key] != value} == {"out", "json"}
+    repeated_options = vars(cli.build_parser().parse_args(shlex.split(document["command"])[1:]))
+    options = vars(cli.build_parser().parse_args([*command, "--set", "diagnostic_rays=0", "--threads", "1"]))
+    assert {key for key, value in options.items() if repeated_options[key] != value} == {"out", "json"}
 
 
 @pytest.mark.parametrize("wrong", [["--set", "speed=fast"], ["--set", "stride=0"], ["--labels", "nowhere"]])
@@ -274,8 +289,8 @@ def test_bad_masks_and_a_table_of_other_channels_are_refused_in_one_line(tmp_pat
         if masks is not None:
             (tmp_path / "m").write_bytes(masks)
         assert cli.main(command) == 2, name
-        told = capsys.readouterr().err
-        assert told.count("\n") == 1 and "labels" in told, name
+        stderr = capsys.readouterr().err
+        assert stderr.count("\n") == 1 and "labels" in stderr, name
     save_file({"embeddings": torch.eye(2, 5)}, tmp_path / "t", metadata={"words": '["cat", "dog"]'})
     save_file({"v2/mask": torch.zeros(7, 9, dtype=torch.int16)}, tmp_path / "m")
     assert cli.main(command) == 2
@@ -294,16 +309,16 @@ def test_a_scene_of_which_the_exact_run_sees_nothing_is_refused(tmp_path, monkey
 def test_every_nth_view_is_compared_when_the_settings_say_so(tmp_path, monkeypatch):
     orders = []
 
-    def told(order, candidate):
+    def record_order(order, candidate):
         orders.append(order)
         figures = run_of(candidate.name, 1e6, VIEWS)
-        del figures["options"]  # a run does not tell them
+        del figures["options"]  # a run does not report them
         return figures
 
-    monkeypatch.setattr(comparison, "_run", told)
+    monkeypatch.setattr(comparison, "_run", record_order)
     paths = write_scene(tmp_path, 2)
     scene = SceneFiles(paths[0], paths[1], (paths[2],))
-    found = comparison.compare(scene, 1e5, {"view_stride": 2}, 1, silent)
+    document = comparison.compare(scene, 1e5, {"view_stride": 2}, 1, silent)
     assert (orders[-1].lifted, orders[-1].held_out) == (("v0",), ("v2",))
     assert measure_run(replace(orders[-1], reference=tmp_path))["views"] == 1
-    assert found["runs"][0]["options"]["view_stride"] == 2
+    assert document["runs"][0]["options"]["view_stride"] == 2

@@ -38,7 +38,7 @@ def dense(W: RegionWeights, splats: int) -> np.ndarray:
 
 
 def codebook_of(books: Sequence[Tensor]) -> Codebook:
-    """Whose regions are rows."""
+    """Return a codebook in which each region is one row of its view's book [M, F]."""
     return Codebook([ViewCodebook(book) for book in books])
 
 

@@ -35,7 +35,7 @@ class ProcessKilled(Exception):
 
 @pytest.fixture
 def rasterized_views(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The views that were really walked."""
+    """Record the names of rasterized views, without the warm-up."""
     rasterized: list[str] = []
     rasterize = CpuRaster.region_weights
 
@@ -48,7 +48,7 @@ def rasterized_views(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(
         "liftcore.lifting.in_memory.contradictions", lambda *_: []
     )  # which may look at some views, coarsely
-    monkeypatch.setattr("liftcore.lifting.pipeline.choose_device", lambda _: CPU)  # on machines with a card too
+    monkeypatch.setattr("liftcore.lifting.pipeline.choose_device", lambda _: CPU)  # on machines with a GPU too
     return rasterized
 
 
@@ -218,7 +218,7 @@ def test_files_that_are_no_answers_stay_in_the_folder(tmp_path: Path) -> None:
 
 
 def _views(cameras: Path, seed: int, grids: bool) -> list[tuple[str, Regions | FeatureGrid]]:
-    """What `write_scene` put into its pack."""
+    """Return the views of the pack that `write_scene` writes."""
     return [(camera.name, observed(seed, k, grids=grids)) for k, camera in enumerate(read_cameras(cameras).values())]
 
 

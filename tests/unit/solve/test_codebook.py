@@ -33,8 +33,8 @@ def region_map(seed: int, levels: int, size: float = 1.0, kind: torch.dtype = to
 
 
 def stacked_weights(maps: list[Regions], by_rows: bool, power: int = 1) -> tuple[RegionWeights, Codebook]:
-    """W of the maps in one camera, and what its regions stand for."""
-    pairs = [as_regions(region_map_, by_rows) for region_map_ in maps]
+    """Return W of the maps seen by one camera, and the codebook of its regions."""
+    pairs = [as_regions(observation, by_rows) for observation in maps]
     weighting = Weighting(power)
     parts = [
         codebook.weights_by_row(RASTER.region_weights(CAMERA, regions, CompositingParams(), weighting))
@@ -61,10 +61,10 @@ def test_tuples_give_what_rows_give_with_fewer_entries(seed, levels, power, size
 
 
 def test_means_of_float16_rows_are_rounded_as_the_features_are():
-    region_map_ = region_map(3, 4, kind=torch.float16)
-    rows, _ = solved([region_map_], by_rows=True)
+    regions = region_map(3, 4, kind=torch.float16)
+    rows, _ = solved([regions], by_rows=True)
     for dtype, error in ((torch.float32, 1e-6), (torch.float16, 2e-3)):
-        tuples, _ = solved([region_map_], by_rows=False, dtype=dtype)
+        tuples, _ = solved([regions], by_rows=False, dtype=dtype)
         assert tuples.features.dtype == dtype
         np.testing.assert_allclose(tuples.features, rows.features, atol=error)
         np.testing.assert_allclose(tuples.agreement, rows.agreement, atol=error)
@@ -75,10 +75,10 @@ def test_a_map_is_left_as_it_is_where_tuples_save_nothing():
         torch.randint(0, 7, (2, 30, 30), generator=torch.manual_seed(0), dtype=torch.int32), torch.ones(7, 3)
     )
     none = Regions(torch.full((2, 4, 4), NO_LABEL, dtype=torch.int32), torch.ones(1, 3))
-    for region_map_ in (noise, none, region_map(0, 1), FeatureGrid(torch.ones(2, 2, 3))):
-        regions, codebook = as_regions(region_map_, by_rows=False)
+    for observation in (noise, none, region_map(0, 1), FeatureGrid(torch.ones(2, 2, 3))):
+        regions, codebook = as_regions(observation, by_rows=False)
         assert (
-            regions is region_map_ and codebook.tuples is None and codebook.regions == region_map_.codebook.shape[0]
+            regions is observation and codebook.tuples is None and codebook.regions == observation.codebook.shape[0]
         )
     assert as_regions(region_map(0, 3), by_rows=True)[1].tuples is None
 

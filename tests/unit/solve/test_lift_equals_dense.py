@@ -1,4 +1,4 @@
-"""The whole pipeline, from files to the lift file, against the dense definition of the paper; and its knobs."""
+"""The whole pipeline, from files to the lift file, against the dense definition of the paper; and its settings."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_agreement_is_the_norm_of_the_mean_of_unit_inputs(tmp_path, preset):
 
 
 def same_bits(first: LiftResult, second: LiftResult) -> bool:
-    """Whether all that two lifts found is equal to the bit."""
+    """Return True if all tensors and the diagnostics of two lifts are bitwise identical."""
     names = [name for name in (*TENSORS, *CLUSTER_TENSORS) if getattr(first, name) is not None]
     are_equal = all(torch.equal(getattr(first, name), getattr(second, name)) for name in names)
     return are_equal and first.metadata.diagnostics == second.metadata.diagnostics
@@ -260,7 +260,7 @@ def test_folders_before_the_names_of_views_change_no_bit(tmp_path):
     assert torch.allclose(torch.as_tensor(direction), expected, atol=1e-3)
 
 
-def test_the_warning_of_skipped_views_tells_how_a_rig_is_named(tmp_path):
+def test_the_warning_of_skipped_views_names_the_scheme_of_a_rig(tmp_path):
     splats, cameras, features = write_scene(tmp_path, 3)
     records = json.loads(cameras.read_text())
     for record, name in zip(records, ("camA/0", "camA/1", "camB/0"), strict=True):

@@ -22,7 +22,7 @@ from tests.scenes import write_scene
 
 
 def shape_warnings_of(tmp_path: Path, observation: ViewFeatures, size: tuple[int, int]) -> list[str]:
-    """What is said of a view of that width and height."""
+    """Return the warnings for a map in a view of this width and height, in pixels."""
     path = tmp_path / "pack.safetensors"
     write_pack(path, {"v": observation}, {"encoder": "e"})
     camera = Camera.pinhole("v", *size, 500.0, 500.0, 1.0, 1.0, viewmat=np.eye(4))

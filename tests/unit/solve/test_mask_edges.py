@@ -1,4 +1,4 @@
-"""Edges that masks know: counts of views, what they say, and things that colours cannot tell apart."""
+"""Edges weakened by masks: counts of views, their probabilities, and objects that colours do not distinguish."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.unit.solve.test_consensus import SPLATS, belonging, random_scene
 
 @pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize("seed", range(3))
-def test_edges_weaken_as_often_as_views_part_them(seed: int, threads: int) -> None:
+def test_edges_weaken_as_often_as_views_separate_them(seed: int, threads: int) -> None:
     W, levels = random_scene(seed)
     graph = SplatGraph.of(random_splats(seed, SPLATS))
     _, _, groups, B = belonging(W, levels)
@@ -64,11 +64,11 @@ OBJECTS = {
 
 
 @pytest.mark.parametrize("kind", OBJECTS)
-def test_thing_of_the_colour_of_its_cloth_stays_apart_from_it(kind: str) -> None:
+def test_object_of_the_colour_of_its_cloth_stays_separate(kind: str) -> None:
     labels, rng, count, views = OBJECTS[kind].astype(int), np.random.default_rng(1), SIDE**2, 6
     means = torch.from_numpy(np.column_stack([PLACES, np.zeros(count)])).float()
     splats = replace(random_splats(1, count), means=means, sh=torch.zeros(count, 1, 3))
-    merged = rng.permutation(views) < 2  # views whose mask of the cloth has the thing, too
+    merged = rng.permutation(views) < 2  # views whose mask of the cloth contains the object
     W = stacked([of_dense(np.eye(2)[0 * labels if is_merged else labels]) for is_merged in merged], count)
     graph = SplatGraph.of(splats)
     weakened, _ = weaken_edges(graph, W, np.zeros(2 * views, np.int8))
@@ -78,8 +78,8 @@ def test_thing_of_the_colour_of_its_cloth_stays_apart_from_it(kind: str) -> None
     def wrong(X: torch.Tensor) -> int:
         return int((X.argmax(dim=1).numpy() != labels)[OBJECTS[kind]].sum())
 
-    separated, same_region = (
-        smooth(noisy.clone(), graph_, ones, None, ones > 0, 4.0)[0] for graph_ in (weakened, graph)
+    from_weakened, from_graph = (
+        smooth(noisy.clone(), edges, ones, None, ones > 0, 4.0)[0] for edges in (weakened, graph)
     )
-    assert wrong(separated) == 0
-    assert wrong(same_region) > 0
+    assert wrong(from_weakened) == 0
+    assert wrong(from_graph) > 0

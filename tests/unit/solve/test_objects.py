@@ -1,4 +1,4 @@
-"""Objects without words: the chains against all pairs in float64, and what they promise on scenes of known things."""
+"""Objects without words: the chains against all pairs in float64, and promises on scenes of known objects."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_objects_are_those_of_the_definition(seed: int) -> None:
     np.testing.assert_array_equal(objects.labels < 0, labels < 0)
 
 
-def test_merged_and_split_masks_do_not_change_the_things() -> None:
+def test_merged_and_split_masks_do_not_change_the_objects() -> None:
     right = [0, 1, 2, 3]
     merged, split = [0, 0, 1, 2], [0, 1, 2, 2]
     objects = region_objects(

@@ -1,4 +1,4 @@
-"""The tree of regions on a scene of rooms, things and parts, whose masks have the mistakes that segmenters make."""
+"""The tree of regions on a scene of rooms, objects and parts, with mistakes of segmenters in their masks."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ BACKGROUND = np.zeros(SPLATS, int)
 def three_levels(
     seed: int, *, wrong: float = 0.3, backgrounds: bool = False, parts_in: float = 1.0
 ) -> tuple[RegionWeights, np.ndarray, Codebook]:
-    """Masks of parts and things, and of the whole where asked for, each with its own vector and a little noise.
+    """Return W, levels and codebooks of masks of parts, objects and, optionally, backgrounds, with noisy vectors.
 
     Args:
         wrong: share of the masks that are merged with a neighbour, or cut anywhere. parts_in: of views with parts.
@@ -68,7 +68,7 @@ def mean_iou(nodes: list[np.ndarray], owners: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_things_and_their_parts_are_nodes_though_a_third_of_the_masks_is_wrong(seed: int) -> None:
+def test_objects_and_their_parts_are_nodes_with_a_third_of_the_masks_wrong(seed: int) -> None:
     W, levels, _ = three_levels(seed)
     objects = region_objects(W, levels, np.ones(SPLATS))
     nodes, parents = members(objects), objects.tree.parents

@@ -1,4 +1,4 @@
-"""The robust step on W against its definition in plain float64, and what it promises."""
+"""The robust step on W against its definition in plain float64, and its promises."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def levels_apart(scene: Scene, levels: np.ndarray, steps: int) -> list[np.ndarra
 
 @on_both
 @pytest.mark.parametrize("steps", [1, 2])
-def test_levels_are_judged_apart(steps, on_card):
+def test_levels_are_compared_separately(steps, on_card):
     scene = random_scene(3, count=400, channels=20)
     levels = np.random.default_rng(4).integers(-1, 3, sum(len(book) for book in scene.books)).astype(np.int8)
     got = scene.after(steps, levels=levels, on_card=on_card)
@@ -174,7 +174,7 @@ def test_principal_directions_have_the_cosines_of_all_channels(channels: int) ->
 
 
 @pytest.mark.parametrize("table_bytes", [None, 1])
-def test_what_a_cluster_explains_is_its_mean_cosine_in_float64(monkeypatch, table_bytes):
+def test_consistency_of_a_cluster_is_its_mean_cosine_in_float64(monkeypatch, table_bytes):
     if table_bytes:
         monkeypatch.setattr("liftcore.solve.aggregate.TABLE_BYTES", table_bytes)
         monkeypatch.setattr("liftcore.solve.directions.TABLE_BYTES", table_bytes)
@@ -214,7 +214,7 @@ def test_steps_that_change_much_equal_their_definition_to_the_last_digits(views,
 
 
 @on_both
-def test_slices_of_channels_are_judged_together(monkeypatch, on_card):
+def test_slices_of_channels_are_compared_as_one_vector(monkeypatch, on_card):
     scene = random_scene(3, count=500)
     matrix = scene.after(2, on_card=on_card)
     for module in ("codebook", "directions"):

@@ -1,4 +1,4 @@
-"""Settings as JSON and as keyword arguments, and what is told of those that do not fit."""
+"""Settings as JSON and as keyword arguments, and errors of invalid ones."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_regions_are_kept_from_the_papers_tau_on() -> None:
 
 
 @pytest.mark.parametrize("preset", list(Preset))
-def test_a_preset_only_fills_what_is_not_said(preset: Preset) -> None:
+def test_a_preset_only_fills_settings_that_are_not_given(preset: Preset) -> None:
     preset_settings = LiftSettings.of(preset=preset)
     explicit = LiftSettings.of(preset=preset, power=1, weight_floor=0.25, selection="front-mass", mass=0.5)
     assert (explicit.power, explicit.weight_floor, explicit.selection, explicit.mass) == (1, 0.25, "front-mass", 0.5)
@@ -91,7 +91,7 @@ def test_a_preset_only_fills_what_is_not_said(preset: Preset) -> None:
 
 
 @pytest.mark.parametrize("speed", Speed)
-def test_a_lift_from_before_a_setting_does_not_tell_what_the_dial_sets_today(speed: Speed) -> None:
+def test_a_lift_from_before_a_setting_has_the_value_of_its_time(speed: Speed) -> None:
     settings = LiftSettings.of(speed=speed)
     value = LiftMetadata(version="1", settings=settings, views=("a",), diagnostics={}, timings={})
     document = value.model_dump(mode="json")

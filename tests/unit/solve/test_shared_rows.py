@@ -1,4 +1,4 @@
-"""Sums over groups of rows of W against plain float64 ones, and what groups promise."""
+"""Sums over groups of rows of W against plain float64 ones, and properties of the groups."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ widths = pytest.mark.parametrize("width", [1, 6, 32, 33, 70])
 
 
 def weights(seed: int) -> np.ndarray:
-    """Rows of W [n, M] f32: alike, of few regions, of none, of one view, and of more than LONG regions."""
+    """Return rows of W [n, M] f32: similar ones, of few regions, of none, of one view, of more than LONG regions."""
     rng = np.random.default_rng(seed)
     mask = rng.random((23, REGIONS)) < 0.02
     mask[4:8] = mask[4]
@@ -73,7 +73,7 @@ def compare(rows: np.ndarray, dense: np.ndarray, table: torch.Tensor) -> np.ndar
 
 
 @widths
-def test_what_other_views_say_on_a_level_equals_float64_and_each_row_alone_to_the_bit(width):
+def test_sums_of_other_views_on_a_level_equal_float64_and_each_row_alone_to_the_bit(width):
     dense, table, rows = weights(3), table_of(width), np.random.default_rng(1).permutation(23)
     result, e = compare(rows, dense, table), table.double().numpy()
     at, region = np.nonzero(dense)
@@ -89,7 +89,7 @@ def test_what_other_views_say_on_a_level_equals_float64_and_each_row_alone_to_th
     assert np.array_equal(single_rows, result)
 
 
-def test_a_table_is_followed_by_zeros_whoever_made_it():
+def test_every_table_is_followed_by_zeros():
     for table in (table_of(6), torch.full((3, 5), torch.nan), torch.full((40, 6), torch.nan)[:, 1:4]):
         flat = flat_table(table)
         assert np.array_equal(flat[: table.numel()], table.reshape(-1), equal_nan=True)
@@ -97,7 +97,7 @@ def test_a_table_is_followed_by_zeros_whoever_made_it():
         assert not flat[table.numel() :].any()
 
 
-def test_stored_directions_are_those_that_were_made_and_are_compared_where_they_lie(tmp_path):
+def test_stored_directions_equal_the_computed_ones_and_are_compared_in_place(tmp_path):
     books = [torch.randn(3, 5, generator=torch.manual_seed(view)) for view in range(3)]
     directions = RegionDirections(codebook_of(books), torch.ones(9, dtype=torch.float64), 9)
     directions.save(tmp_path)

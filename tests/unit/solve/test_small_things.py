@@ -1,4 +1,4 @@
-"""Aggregation beside thin and small things: a sword, a ring and a nut, in steel like the kettle beside them."""
+"""Aggregation near thin and small objects: a sword, a ring and a nut, of steel like the kettle near them."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ FEW = Mistakes(merged=0.1, split=0.05, misnamed=0.05, unlabelled=0.03, displacem
 
 
 class Observed:
-    """The scene, what views observe of it, and words: those of steel are alike."""
+    """The scene, its views and its words; vectors of steel objects are similar."""
 
     def __init__(self) -> None:
         self.still_life: StillLife = still_life(views=10, pieces=small_things())
         self.raster = CpuRaster(self.still_life.splats)
-        rows = np.random.default_rng(0).standard_normal((len(self.still_life.things) + 1, 64)).astype(np.float32)
+        rows = np.random.default_rng(0).standard_normal((len(self.still_life.objects) + 1, 64)).astype(np.float32)
         rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-        vectors = rows[1:] + [[0.7 * (label in SMALL)] for label in self.still_life.things] * rows[:1]
+        vectors = rows[1:] + [[0.7 * (label in SMALL)] for label in self.still_life.objects] * rows[:1]
         vectors = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
-        self.encoder = TableEncoder("words", list(self.still_life.things), vectors)
+        self.encoder = TableEncoder("words", list(self.still_life.objects), vectors)
         self.views = observe(self.still_life, self.raster, self.encoder, FEW, seed=1)
         self.truth = {
             view: torch.from_numpy(true_labels(self.still_life, self.raster, view)[0])
@@ -44,7 +44,7 @@ class Observed:
         }
 
     def ious(self, **settings: Any) -> dict[str, float]:
-        """IoU of each thing's mask in the held-out views, asked for by its word."""
+        """Return the mean IoU of each object's mask in the held-out views, queried by its word."""
         result = lc.lift(
             self.still_life.splats,
             self.still_life.cameras,
@@ -57,12 +57,12 @@ class Observed:
         scene.raster = self.raster
         return {
             label: float(np.mean([self._iou(scene, label, view) for view in self.truth]))
-            for label in self.still_life.things
+            for label in self.still_life.objects
         }
 
     def _iou(self, scene: Scene, label: str, view: str) -> float:
         mask = view_mask(scene, ask(scene, Query.of((label,), absent="keep"), self.encoder), view).mask
-        return mask_iou(mask, self.truth[view] == self.still_life.things.index(label))
+        return mask_iou(mask, self.truth[view] == self.still_life.objects.index(label))
 
 
 @pytest.fixture(scope="module")

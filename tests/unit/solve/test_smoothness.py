@@ -30,7 +30,7 @@ from tests.unit.command_line import run
 from tests.unit.scene.test_neighbours import dense
 
 SEEDS = st.integers(0, 2**16)
-CARD = Device("cuda", torch.device("cpu"))  # a card's arithmetic on the processor
+CARD = Device("cuda", torch.device("cpu"))  # the GPU's arithmetic on the CPU
 
 
 class Scene:
@@ -175,7 +175,7 @@ def choose(
     return choose_smoothness(W, codebook, graph, None, **options)
 
 
-def test_strength_is_large_for_noise_and_small_for_what_differs_from_splat_to_splat() -> None:
+def test_strength_is_large_for_noise_and_small_for_features_that_vary_by_splat() -> None:
     choice = choose(STRIPES, 2.0)
     assert choice.smoothness >= STRENGTHS[1]
     assert 0 < 1.2 * choice.information[0.0] < choice.information[choice.smoothness] < 2.1  # 2 bits name one of four
@@ -197,7 +197,7 @@ def test_strength_is_the_same_for_any_number_of_threads() -> None:
 
 
 @pytest.mark.parametrize("views", [1, 2])
-def test_strength_is_zero_where_halves_tell_nothing(views: int) -> None:
+def test_strength_is_zero_where_halves_share_no_information(views: int) -> None:
     noise = 0.0 if views == 2 else 1.0  # all that two views say is one vector
     assert choose(np.ones_like(STRIPES), noise, views) == SmoothnessChoice(0.0, {})
 
@@ -302,7 +302,7 @@ def test_lift_in_blocks_refuses_smoothness_and_is_refined(
 
 
 @pytest.mark.parametrize("smoothness", ["0", "auto"])
-def test_lift_of_few_views_tells_of_smoothness(
+def test_lift_of_few_views_recommends_smoothness(
     files: tuple[Path, Path, Path], smoothness: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "scene.lift.safetensors"

@@ -1,4 +1,4 @@
-"""Each step of a lift on blocks of splats gives the bits of a scene that lies in one place."""
+"""Each step of a lift on blocks of splats gives the same bits as on the whole scene."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ LEVELS = np.tile(np.repeat(np.array([0, 1], np.int8), REGIONS // 2), VIEWS)
 
 
 def random_view(rng: np.random.Generator) -> RegionWeights:
-    """Some splats, most with a region of each level, which their place gives, some with another one beside."""
+    """Return W of a random view: most splats have one region a level, by their position; some have a second one."""
     splats = np.flatnonzero(rng.random(SPLATS) < 0.6).astype(np.int32)
     labels = np.where(rng.random(splats.size) < 0.1, rng.integers(0, 6, splats.size), splats // (SPLATS // 4))
     coarse = np.where(rng.random(splats.size) < 0.1, rng.integers(0, REGIONS // 2, splats.size), labels)
@@ -126,12 +126,12 @@ def test_robust_steps_in_blocks_are_those_of_the_whole_scene(
 
 @dataclass(frozen=True)
 class ViewBlock:
-    """What a worker has of some views: their splats, and W of these, with the numbers that regions have in all."""
+    """Inputs of a worker for some views: their splats and W of these, with the region numbers of the whole scene."""
 
     base: int  # the first region
     splats: np.ndarray  # [n] i64
     W: RegionWeights
-    own_region: np.ndarray  # who belongs to what
+    own_region: np.ndarray  # [nnz] bool, entries of W whose splat belongs to their region
     tuples: SplatTuples  # of these views alone
 
 

@@ -1,4 +1,4 @@
-"""The one sparse type: views stacked by splat, what lies in files, and what is taken of it."""
+"""Region weights: views stacked by splat, files, and selections of rows."""
 
 from __future__ import annotations
 
