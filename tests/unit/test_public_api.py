@@ -211,8 +211,8 @@ def test_stages_are_reported_in_order_and_the_plan_after_the_first_views(tmp_pat
     calls = []
     plans = []
 
-    def on_progress(stage, done, total, unit):
-        calls.append((stage, done, total, unit))
+    def on_progress(stage, completed, total, unit):
+        calls.append((stage, completed, total, unit))
 
     def on_plan(plan):
         plans.append((plan, {stage: completed for stage, completed, *_ in calls}))

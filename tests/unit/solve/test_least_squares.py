@@ -210,8 +210,8 @@ def test_a_lift_takes_no_step_unless_asked(tmp_path):
     paths = write_scene(tmp_path, 8)
     stages = []
 
-    def progress(stage: str, done: int, total: int, unit: str) -> None:
-        stages.append((stage, done, total, unit))
+    def progress(stage: str, completed: int, total: int, unit: str) -> None:
+        stages.append((stage, completed, total, unit))
 
     baseline = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(), progress=progress)
     assert "refinement" not in baseline.metadata.diagnostics
