@@ -108,7 +108,7 @@ def test_workers_and_nodes_may_die(
     assert sorted(path.name for path in folder.rglob("*.died")) == [f"{step}-1.died" for step in steps]
     third = cluster.add_node(num_cpus=1, object_store_memory=80_000_000)
 
-    def remove(stage: str, done: int, total: int, unit: str) -> None:
+    def remove(stage: str, completed: int, total: int, unit: str) -> None:
         if stage == "geometry" and third in cluster.list_all_nodes():
             cluster.remove_node(third, allow_graceful=False)
 
