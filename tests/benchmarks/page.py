@@ -50,18 +50,18 @@ SCENE = """(async count => {
   const loaded = performance.now() - begun;
   const scores = Float32Array.from({ length: count }, Math.random);
   const bins = new Uint32Array(96).fill(1);
-  const question = { ...splatlift.ask.now, scores, low: 0, high: 1, cut: 0.5, bins, things: [] };
-  splatlift.ask.questions = [question];
+  const question = { ...splatlift.query.current, scores, low: 0, high: 1, cut: 0.5, bins, objects: [] };
+  splatlift.query.questions = [question];
   const laid = performance.now();
-  splatlift.ask.cut(0.5);
+  splatlift.query.setThreshold(0.5);
   const first = performance.now() - laid;
   const moves = [];
   for (let move = 0; move < MOVES; move += 1) {
     const from = performance.now();
-    splatlift.ask.cut(0.1 + 0.08 * move);
+    splatlift.query.setThreshold(0.1 + 0.08 * move);
     moves.push(performance.now() - from);
   }
-  clearTimeout(splatlift.ask.soon);
+  clearTimeout(splatlift.query.objectsTimer);
   return { loaded, first, moves, drawn: splatlift.viewer.count, of: splatlift.viewer.total };
 })""".replace("MOVES", str(MOVES))
 
@@ -129,7 +129,7 @@ def moves_of_the_cut(folder: Path) -> None:
             page.until(READY)
             page.write("#words", "lamp")
             page.press("#query button.main")
-            page.until("splatlift.ask.now?.answer")
+            page.until("splatlift.query.current?.answer")
             for size in SIZES:
                 costs = page.value(f"{SCENE}({size})")
                 print(

@@ -11,8 +11,8 @@ READY = (
     "(splatlift.viewer ? splatlift.viewer.settled : document.querySelector('#render').naturalWidth > 0)"
 )
 FIND_COLOUR = (
-    "!document.querySelector('#stage').classList.contains('asking') && splatlift.ask.questions.length && "
-    "splatlift.ask.questions.every(asked => asked.answer && (asked.things.length || !asked.count)) && "
+    "!document.querySelector('#stage').classList.contains('asking') && splatlift.query.questions.length && "
+    "splatlift.query.questions.every(asked => asked.answer && (asked.objects.length || !asked.count)) && "
     "(!splatlift.viewer || splatlift.viewer.settled)"
 )
 ERROR_SHOWN = "!document.querySelector('#toast').hidden && document.querySelector('#toast').classList.contains('bad')"
@@ -44,13 +44,13 @@ def text_of(browser: Browser, selector: str) -> str:
 
 def columns(browser: Browser, colour: str | None = None, near: float = 0.35, *, canvas: str = "#scene") -> list[int]:
     """Return the columns of the 3D picture, in hundredths of its width, with this colour; without one, with any."""
-    browser.until("splatlift.viewer.settled && (!splatlift.beside.link || splatlift.beside.left?.settled)")
+    browser.until("splatlift.viewer.settled && (!splatlift.comparison.link || splatlift.comparison.left?.settled)")
     return browser.value(f"{COLUMNS}({f'[{colour}]' if colour else 'null'}, {near}, '{canvas}')")
 
 
 def splat_at(browser: Browser, row: int) -> tuple[float, float]:
     """Return the position of a splat in the 3D picture, as shares of its width and height."""
-    place = f"splatlift.viewer.place([...splatlift.viewer.floats.slice(8 * {row}, 8 * {row} + 3)])"
+    place = f"splatlift.viewer.project([...splatlift.viewer.floats.slice(8 * {row}, 8 * {row} + 3)])"
     box = "splatlift.viewer.canvas.getBoundingClientRect()"
     x, y = browser.value(f"(({{x, y}}, box) => [x / box.width, y / box.height])({place}, {box})")
     return x, y

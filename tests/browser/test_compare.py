@@ -12,8 +12,8 @@ from .looking import AMBER, READY, ask, columns, text_of
 
 pytestmark = pytest.mark.slow
 COMPARE = "#panel-ask [data-compare]"
-BOTH_SETTLED = "splatlift.beside.scene && splatlift.beside.left.settled && splatlift.viewer.settled"
-PLACES = "[splatlift.viewer, splatlift.beside.left].map(side => side.place3d)"
+BOTH_SETTLED = "splatlift.comparison.scene && splatlift.comparison.left.settled && splatlift.viewer.settled"
+PLACES = "[splatlift.viewer, splatlift.comparison.left].map(side => side.place3d)"
 SAME_PLACE = "(([one, other]) => one.every((value, axis) => Math.abs(value - other[axis]) < 1e-6))"
 SHARED = f"{BOTH_SETTLED} && {SAME_PLACE}({PLACES})"
 
@@ -67,7 +67,7 @@ def test_link_opens_both_sides_and_back_leaves_one(page: Browser) -> None:
     address = page.value("location.href")
     page.open("about:blank#")
     page.open(address)
-    page.until(f"{READY} && {BOTH_SETTLED} && splatlift.ask.now.answer")
+    page.until(f"{READY} && {BOTH_SETTLED} && splatlift.query.current.answer")
     assert page.value(sides) == [left, right]
     page.press("#end-compare")
     page.until("!location.search.includes('beside')")
@@ -80,6 +80,8 @@ def test_other_lift_is_asked_the_same_beside_what_is_open(page: Browser, server:
     page.press("#tab-bring")
     page.until("document.querySelector('#lifts [aria-label^=Compare]')")
     page.press("#lifts [aria-label^=Compare]")
-    page.until(f"splatlift.lift?.id === '{other_lift}' && {SHARED} && splatlift.ask.now?.answer")
-    assert page.value("splatlift.beside.scene.id") == server.lift and page.value("splatlift.ask.now.text") == ["lamp"]
+    page.until(f"splatlift.lift?.id === '{other_lift}' && {SHARED} && splatlift.query.current?.answer")
+    assert page.value("splatlift.comparison.scene.id") == server.lift and page.value(
+        "splatlift.query.current.text"
+    ) == ["lamp"]
     assert min(columns(page, AMBER)) > 50 and min(columns(page, AMBER, canvas="#beside")) > 50

@@ -24,8 +24,8 @@ from .looking import AMBER, FIND_COLOUR, READY, ask, columns, splat_at, text_of
 
 pytestmark = pytest.mark.slow
 APPLE = 5  # a splat of it
-ZIP = "splatlift.take.everything(true).then(() => document.querySelector('#toast').textContent)"
-BOTH_SETTLED = "splatlift.beside.scene && splatlift.beside.left.settled && splatlift.viewer.settled"
+ZIP_FAILED = "splatlift.exporter.saveZip(true).then(() => document.querySelector('#toast').classList.contains('bad'))"
+BOTH_SETTLED = "splatlift.comparison.scene && splatlift.comparison.left.settled && splatlift.viewer.settled"
 
 
 @pytest.fixture
@@ -75,32 +75,34 @@ def test_ten_tasks_are_done_without_a_manual(
         assert len(columns(page, AMBER)) > 50
     save_picture("2-found")
     page.press("#by-hand")  # correct one
-    page.until(f"splatlift.hand.selection?.version && {FIND_COLOUR}")
+    page.until(f"splatlift.editor.selection?.version && {FIND_COLOUR}")
     save_picture("3-by-hand")
     x, y = splat_at(page, APPLE)
     page.drag("#scene", (x, y), (x, y + 0.02))
-    page.until(f"splatlift.hand.selection.step === 1 && !splatlift.hand.busy && {FIND_COLOUR}")
-    assert page.value("splatlift.ask.now.count") > 20
+    page.until(f"splatlift.editor.selection.step === 1 && !splatlift.editor.isBusy && {FIND_COLOUR}")
+    assert page.value("splatlift.query.current.count") > 20
     page.write("#hand .name", "lamp and a bit")  # rename it
     page.key("Enter")
-    page.until("splatlift.things.own[0]?.name === 'lamp and a bit'")
-    assert page.value(ZIP) == "The ZIP is here."  # export all with names
+    page.until("splatlift.objects.selections[0]?.name === 'lamp and a bit'")
+    assert page.value(ZIP_FAILED) is False  # export all with names
     page.press("#hand button[title='Ctrl+Z']")  # undo
-    page.until(f"splatlift.hand.selection.step === 0 && !splatlift.hand.busy && {FIND_COLOUR}")
-    assert page.value("splatlift.ask.now.count") == 20
-    object_id = page.value("splatlift.things.own[0].id")
+    page.until(f"splatlift.editor.selection.step === 0 && !splatlift.editor.isBusy && {FIND_COLOUR}")
+    assert page.value("splatlift.query.current.count") == 20
+    object_id = page.value("splatlift.objects.selections[0].id")
     page.press("#tab-bring")  # compare two lifts
     page.until("document.querySelector('#lifts [aria-label^=Compare]')")
     page.press("#lifts [aria-label^=Compare]")
     page.until(f"splatlift.lift?.id === '{other_lift}' && {BOTH_SETTLED}")
     ask(page, "apple")
-    assert page.value("splatlift.beside.scene.id") == server.lift
+    assert page.value("splatlift.comparison.scene.id") == server.lift
     save_picture("4-compared")
     link = page.value("location.href")  # share, and come back by the link
     page.open("about:blank#")
     page.open(link)
-    page.until(f"{READY} && {BOTH_SETTLED} && splatlift.ask.now?.answer")
-    assert page.value("splatlift.ask.now.text") == ["apple"] and "lamp and a bit" in text_of(page, "#beside-said")
+    page.until(f"{READY} && {BOTH_SETTLED} && splatlift.query.current?.answer")
+    assert page.value("splatlift.query.current.text") == ["apple"] and "lamp and a bit" in text_of(
+        page, "#beside-said"
+    )
     save_picture("5-link")
     page.press("#end-compare")
     (tmp_path / "again.ply").write_bytes(make_scene().splats)  # bring a scene

@@ -1,10 +1,10 @@
-// The views of a COLMAP model, binary or text, as its documentation has the files: world to camera, x right, y down.
-const PARAMETERS = [3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16]; // of each camera model, by its number
+// The views of a COLMAP model, binary or text, by COLMAP's documentation: world to camera, x right, y down.
+const PARAMETER_COUNTS = [3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16]; // parameters of each camera model, by its number
 const MODELS = ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"];
-const ONE_FOCAL = new Set([0, 2, 3, 8, 9]); // models whose first parameter is both focal lengths
-const POINT = 24; // bytes of a point in images.bin
+const SINGLE_FOCAL = new Set([0, 2, 3, 8, 9]); // models whose first parameter is both focal lengths
+const POINT_BYTES = 24; // bytes of a point in images.bin
 
-// files: contents by path. Of several models the first one that is whole.
+// The views of files, contents by path: those of the first complete model, by the order of paths.
 export function colmapViews(files) {
   for (const path of Object.keys(files).filter(name => /(^|\/)images\.(bin|txt)$/.test(name)).sort()) {
     const [folder, ending] = [path.slice(0, path.lastIndexOf("/") + 1), path.slice(-3)];
@@ -15,10 +15,10 @@ export function colmapViews(files) {
 }
 
 function camera(model, width, height, parameters) {
-  return { width, height, fx: parameters[0], fy: parameters[ONE_FOCAL.has(model) ? 0 : 1] };
+  return { width, height, fx: parameters[0], fy: parameters[SINGLE_FOCAL.has(model) ? 0 : 1] };
 }
 
-// Of a rotation as a quaternion of any length, real part first, and a translation.
+// The 4 x 4 matrix of a quaternion of any length, real part first, and a translation.
 function viewmat(quaternion, translation) {
   const length = Math.hypot(...quaternion);
   const [w, x, y, z] = quaternion.map(value => value / length);
@@ -31,48 +31,48 @@ function viewmat(quaternion, translation) {
 }
 
 function binary(images, cameras) {
-  const known = new Map();
-  let read = reader(cameras);
-  for (let left = read.u64(); left > 0; left -= 1) {
-    const [id, model, width, height] = [read.u32(), read.u32(), read.u64(), read.u64()];
-    known.set(id, camera(model, width, height, read.f64(PARAMETERS[model])));
+  const cameraOf = new Map();
+  let stream = reader(cameras);
+  for (let remaining = stream.u64(); remaining > 0; remaining -= 1) {
+    const [id, model, width, height] = [stream.u32(), stream.u32(), stream.u64(), stream.u64()];
+    cameraOf.set(id, camera(model, width, height, stream.f64(PARAMETER_COUNTS[model])));
   }
   const views = [];
-  read = reader(images);
-  for (let left = read.u64(); left > 0; left -= 1) {
-    read.u32();
-    const [rotation, translation, id, name] = [read.f64(4), read.f64(3), read.u32(), read.text()];
-    read.skip(POINT * read.u64());
-    views.push({ name, ...known.get(id), viewmat: viewmat(rotation, translation) });
+  stream = reader(images);
+  for (let remaining = stream.u64(); remaining > 0; remaining -= 1) {
+    stream.u32();
+    const [rotation, translation, id, name] = [stream.f64(4), stream.f64(3), stream.u32(), stream.text()];
+    stream.skip(POINT_BYTES * stream.u64());
+    views.push({ name, ...cameraOf.get(id), viewmat: viewmat(rotation, translation) });
   }
   return views;
 }
 
 function text(images, cameras) {
   const lines = content => new TextDecoder().decode(content).split("\n").filter(line => !line.startsWith("#"));
-  const known = new Map(lines(cameras).filter(line => line.trim()).map(line => {
+  const cameraOf = new Map(lines(cameras).filter(line => line.trim()).map(line => {
     const [id, model, width, height, ...parameters] = line.trim().split(/\s+/);
     return [id, camera(MODELS.indexOf(model), Number(width), Number(height), parameters.map(Number))];
   }));
-  return lines(images).filter((line, place) => place % 2 === 0 && line.trim()).map(line => { // the line after each has its points
+  return lines(images).filter((line, index) => index % 2 === 0 && line.trim()).map(line => { // every second line lists points
     const [, w, x, y, z, tx, ty, tz, id, ...name] = line.trim().split(/\s+/);
-    return { name: name.join(" "), ...known.get(id), viewmat: viewmat([w, x, y, z].map(Number), [tx, ty, tz].map(Number)) };
+    return { name: name.join(" "), ...cameraOf.get(id), viewmat: viewmat([w, x, y, z].map(Number), [tx, ty, tz].map(Number)) };
   });
 }
 
 function reader(content) {
   const view = new DataView(content.buffer, content.byteOffset, content.byteLength);
-  let place = 0;
-  const next = size => { place += size; return place - size; };
+  let offset = 0;
+  const next = size => { offset += size; return offset - size; };
   return {
     u32: () => view.getUint32(next(4), true),
     u64: () => Number(view.getBigUint64(next(8), true)),
     f64: number => Array.from({ length: number }, () => view.getFloat64(next(8), true)),
     skip: size => { next(size); },
     text: () => {
-      const end = content.indexOf(0, place);
-      const name = new TextDecoder().decode(content.subarray(place, end));
-      place = end + 1;
+      const end = content.indexOf(0, offset);
+      const name = new TextDecoder().decode(content.subarray(offset, end));
+      offset = end + 1;
       return name;
     },
   };

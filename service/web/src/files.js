@@ -1,102 +1,103 @@
-// What a file is, by its name and what is in it: nothing is sent before that is known.
+// The kind of a file by its name and content, which is known before anything is sent.
 import { unzip, Zip, ZipPassThrough } from "fflate";
 import { colmapViews } from "./colmap.js";
-import table from "./kinds.json"; // of liftcore.io.kinds: suffixes that are sent, and what others are
+import kindTable from "./kinds.json"; // of liftcore.io.kinds: suffixes that are sent, and descriptions of others
 
-const HEADER = 32 << 20; // bytes of a safetensors header that are read here
-const TAIL = 1 << 20; // of a zip: its list of names lies at its end
-const DEPTH = 5; // folders down
-const CAMERAS = new RegExp(table.cameras);
-const INRIA = /(^|\/)cameras\.json$/; // which the service reads alone, and of no zip
+const MAX_HEADER_BYTES = 32 << 20; // bytes of a safetensors header that are read here
+const ZIP_TAIL_BYTES = 1 << 20; // bytes at the end of a ZIP, where its list of names is
+const MAX_DEPTH = 5; // levels of folders
+const CAMERAS = new RegExp(kindTable.cameras);
+const INRIA = /(^|\/)cameras\.json$/; // which the service reads as a file, not in a ZIP
 const PACK = /\.safetensors$/i;
-const SOG = /(^|[^\w-])(lod-meta\.json|means_[lu]\.webp)/; // of an unbundled or a streamed one
-const READABLE = 512e6; // bytes of a zip whose cameras are read here
+const SOG = /(^|[^\w-])(lod-meta\.json|means_[lu]\.webp)/; // files of an unbundled or streamed SOG
+const MAX_ZIP_BYTES = 512e6; // bytes of a ZIP whose cameras are drawn
 const PHOTO = /\.(jpe?g|png)$/i;
 const suffix = name => /\.[^.]*$/.exec(name.toLowerCase())?.[0] ?? "";
-const isSplats = name => table.kinds[suffix(name)] === "splats";
-const either = names => `${names.slice(0, -1).join(", ")}${names.length > 1 ? " or " : ""}${names.at(-1)}`;
+const isSplats = name => kindTable.kinds[suffix(name)] === "splats";
+const joinNames = names => `${names.slice(0, -1).join(", ")}${names.length > 1 ? " or " : ""}${names.at(-1)}`;
 
-// The suffixes of a kind, to be read.
-export const suffixes = kind => either(Object.keys(table.kinds).filter(one => table.kinds[one] === kind));
+// The suffixes of a kind as text.
+export const suffixes = kind => joinNames(Object.keys(kindTable.kinds).filter(ending => kindTable.kinds[ending] === kind));
 
-// {kind} of a file, null for what is not sent, with a word on `why` where there is one; a lift file brings what it `needs`:
-// [{kind, id, name}]. The server looks at the content, and its answer names a file that is something else.
+// The {kind} of a file, null if it cannot be sent, then with a `reason` if one is known; for a lift file also the assets
+// that it `needs`: [{kind, id, name}]. The service checks the content again.
 export async function kindOf(file) {
-  const kind = table.kinds[suffix(file.name)] ?? null;
-  const other = kind ? null : table.others[suffix(file.name)];
-  if (other) return { kind: null, why: other.hint ? `it is ${other.got}: ${other.hint}` : `it is ${other.got}` };
+  const kind = kindTable.kinds[suffix(file.name)] ?? null;
+  const other = kind ? null : kindTable.others[suffix(file.name)];
+  if (other) return { kind: null, reason: other.hint ? `it is ${other.got}: ${other.hint}` : `it is ${other.got}` };
   if (suffix(file.name) === ".zip") return { kind: await zipKind(file) };
   return kind === "features" ? safetensors(file) : { kind };
 }
 
 async function zipKind(file) {
-  const names = new TextDecoder("latin1").decode(await file.slice(-TAIL).arrayBuffer());
-  const has = suffixes => new RegExp(`[^\\x00-\\x1f](${suffixes.map(one => `\\${one}`).join("|")})`, "i").test(names);
+  const names = new TextDecoder("latin1").decode(await file.slice(-ZIP_TAIL_BYTES).arrayBuffer());
+  const has = suffixes => new RegExp(`[^\\x00-\\x1f](${suffixes.map(ending => `\\${ending}`).join("|")})`, "i").test(names);
   if (/(cameras|images)\.(bin|txt)|transforms[^/]*\.json|cameras\.json/.test(names)) return "cameras";
   if (SOG.test(names)) return "splats";
-  if (has(Object.keys(table.kinds).filter(one => table.kinds[one] === "splats"))) return "splats";
-  return has(table.images) ? "photos" : "cameras";
+  if (has(Object.keys(kindTable.kinds).filter(ending => kindTable.kinds[ending] === "splats"))) return "splats";
+  return has(kindTable.images) ? "photos" : "cameras";
 }
 
 async function safetensors(file) {
   try {
     const length = Number(new DataView(await file.slice(0, 8).arrayBuffer()).getBigUint64(0, true));
-    const { __metadata__: more, ...tensors } = JSON.parse(await file.slice(8, 8 + Math.min(length, HEADER)).text());
-    const metadata = more?.splatlift;
+    const { __metadata__: entries, ...tensors } = JSON.parse(await file.slice(8, 8 + Math.min(length, MAX_HEADER_BYTES)).text());
+    const metadata = entries?.splatlift;
     if (!metadata) return { kind: Object.keys(tensors).join() === "embeddings" ? "table" : "features" };
     const { splats, cameras } = JSON.parse(metadata);
     const need = (kind, { sha256, path }) => ({ kind, id: `sha256:${sha256}`, name: path.split(/[\\/]/).at(-1) });
     return { kind: "lift", needs: [need("splats", splats), need("cameras", cameras)] };
   } catch {
-    return { kind: "features" }; // the check of the upload says what is wrong with it
+    return { kind: "features" }; // the check of the upload reports the error
   }
 }
 
-// What was dropped: files, and of folders the cameras as one zip or as their cameras.json, a SOG's folder as one zip or
-// else the newest splats, and the packs; or all files where there is neither. Photos of a folder stay: they may be gigabytes.
-export async function dropped({ items, files }) {
-  const entries = [...items].map(item => item.webkitGetAsEntry?.()).filter(Boolean); // while the event lasts
+// The files of a drop. Of a folder: its cameras as one ZIP or as its cameras.json, its SOG as one ZIP or else its newest
+// splats, and its feature packs; all files if it has neither cameras nor a SOG. Photos of a folder are left out, as they
+// may be gigabytes.
+export async function filesOfDrop({ items, files }) {
+  const entries = [...items].map(item => item.webkitGetAsEntry?.()).filter(Boolean); // the list is empty after the event
   if (!entries.some(entry => entry.isDirectory)) return [...files];
-  const found = await Promise.all(entries.map(async entry => {
-    const inner = await within(entry);
+  const lists = await Promise.all(entries.map(async entry => {
+    const inner = await listFiles(entry);
     const cameras = inner.filter(({ path }) => CAMERAS.test(path));
-    const sog = entry.isDirectory ? sogOf(inner.filter(one => !cameras.includes(one))) : [];
+    const sog = entry.isDirectory ? sogFiles(inner.filter(part => !cameras.includes(part))) : [];
     if (!entry.isDirectory || !(cameras.length || sog.length)) return inner.map(({ file }) => file);
-    const splats = inner.filter(({ path }) => isSplats(path)).sort((one, other) => other.file.lastModified - one.file.lastModified);
+    const splats = inner.filter(({ path }) => isSplats(path)).sort((part, b) => b.file.lastModified - part.file.lastModified);
     const packs = inner.filter(({ path }) => PACK.test(path)).map(({ file }) => file);
-    return [...(cameras.length ? [cameras.every(({ path }) => INRIA.test(path)) ? cameras.reduce(outer).file : await zipped(cameras, `${entry.name}.zip`)] : []),
-      ...(sog.length ? [await zipped(sog, `${entry.name}.sog`)] : splats.slice(0, 1).map(({ file }) => file)), ...packs];
+    return [...(cameras.length ? [cameras.every(({ path }) => INRIA.test(path)) ? cameras.reduce(shallower).file : await zipFiles(cameras, `${entry.name}.zip`)] : []),
+      ...(sog.length ? [await zipFiles(sog, `${entry.name}.sog`)] : splats.slice(0, 1).map(({ file }) => file)), ...packs];
   }));
-  return found.flat();
+  return lists.flat();
 }
 
-// Of two files that which lies higher.
+// The one of two files that is nearer to the root.
 const depth = ({ path }) => path.split("/").length;
-const outer = (one, other) => (depth(other) < depth(one) ? other : one);
+const shallower = (a, b) => (depth(b) < depth(a) ? b : a);
 
-// The files of a SOG among those of a folder, which may lie deeper in it: paths from where the SOG begins.
-function sogOf(parts) {
-  const own = parts.filter(({ path }) => SOG.test(path));
-  if (!own.length) return [];
-  const { path: first } = own.reduce(outer);
-  const folder = first.slice(0, first.lastIndexOf("/") + 1);
+// The files of a SOG among those of a folder, with paths from the folder of the SOG, which may be nested.
+function sogFiles(parts) {
+  const sogParts = parts.filter(({ path }) => SOG.test(path));
+  if (!sogParts.length) return [];
+  const { path: topPath } = sogParts.reduce(shallower);
+  const folder = topPath.slice(0, topPath.lastIndexOf("/") + 1);
   return parts.filter(({ path }) => path.startsWith(folder)).map(({ path, file }) => ({ path: path.slice(folder.length), file }));
 }
 
 // The files at or below an entry: [{path, file}].
-async function within(entry, depth = 0) {
-  if (entry.isFile) return [{ path: entry.fullPath.slice(1), file: await new Promise((done, failed) => { entry.file(done, failed); }) }];
-  if (depth === DEPTH || entry.name.startsWith(".")) return [];
+async function listFiles(entry, depth = 0) {
+  if (entry.isFile) return [{ path: entry.fullPath.slice(1), file: await new Promise((resolve, reject) => { entry.file(resolve, reject); }) }];
+  if (depth === MAX_DEPTH || entry.name.startsWith(".")) return [];
   const inner = [];
-  for (const reader = entry.createReader(); ;) { // a hundred at a time
-    const more = await new Promise((done, failed) => { reader.readEntries(done, failed); });
-    if (!more.length) break;
-    inner.push(...more);
+  for (const reader = entry.createReader(); ;) { // browsers give at most a hundred entries a call
+    const batch = await new Promise((resolve, reject) => { reader.readEntries(resolve, reject); });
+    if (!batch.length) break;
+    inner.push(...batch);
   }
-  return (await Promise.all(inner.map(one => within(one, depth + 1)))).flat();
+  return (await Promise.all(inner.map(child => listFiles(child, depth + 1)))).flat();
 }
 
-async function zipped(parts, name) {
+async function zipFiles(parts, name) {
   const content = [];
   const zip = new Zip((_, part) => content.push(part));
   for (const { path, file } of parts) {
@@ -108,29 +109,29 @@ async function zipped(parts, name) {
   return new File(content, name);
 }
 
-// Photos that were dropped one by one are sent as one zip, without packing them: they are packed already.
-export async function gathered(files) {
+// Put single photos into one ZIP, without compression, as they are compressed already.
+export async function zipPhotos(files) {
   const photos = files.filter(file => PHOTO.test(file.name));
   if (!photos.length) return files;
   const name = photos.length > 1 ? `${photos.length} photos.zip` : `${photos[0].name}.zip`;
-  return [...files.filter(file => !photos.includes(file)), await zipped(photos.map(file => ({ path: file.name, file })), name)];
+  return [...files.filter(file => !photos.includes(file)), await zipFiles(photos.map(file => ({ path: file.name, file })), name)];
 }
 
-// The cameras of a file, in the frame of the splats, to be drawn: those of Inria's cameras.json, of transforms.json and of
-// a COLMAP model, also in a zip. Others are read by the service alone.
+// The cameras of a file in the frame of the splats, for drawing: of Inria's cameras.json, transforms.json or a COLMAP
+// model, also in a ZIP; [] for other files, which the service alone can read.
 export async function camerasOf(file) {
   try {
-    if (/\.zip$/i.test(file.name)) return file.size > READABLE ? [] : await zippedCameras(file);
+    if (/\.zip$/i.test(file.name)) return file.size > MAX_ZIP_BYTES ? [] : await zippedCameras(file);
     return /\.json$/i.test(file.name) ? camerasOfDocument(JSON.parse(await file.text())) : [];
   } catch {
-    return []; // the check of the upload says what is wrong with it
+    return []; // the check of the upload reports the error
   }
 }
 
 async function zippedCameras(file) {
   const content = new Uint8Array(await file.arrayBuffer());
-  const parts = await new Promise((done, failed) => {
-    unzip(content, { filter: ({ name }) => CAMERAS.test(name) && !/dataparser_/.test(name) }, (problem, files) => (problem ? failed(problem) : done(files)));
+  const parts = await new Promise((resolve, reject) => {
+    unzip(content, { filter: ({ name }) => CAMERAS.test(name) && !/dataparser_/.test(name) }, (problem, files) => (problem ? reject(problem) : resolve(files)));
   });
   const documents = Object.keys(parts).filter(name => name.endsWith(".json"));
   const views = colmapViews(parts);
@@ -138,29 +139,29 @@ async function zippedCameras(file) {
 }
 
 function camerasOfDocument(cameras) {
-  if (Array.isArray(cameras)) return cameras.filter(one => one.rotation && one.position).map(one => view(one.rotation, one.position, one));
-  return (cameras.frames ?? []).map(one => {
-    const m = one.transform_matrix;
-    const { w, h, fl_x: fx, fl_y: fy } = { ...cameras, ...one };
-    return view(m.slice(0, 3).map(row => [row[0], -row[1], -row[2]]), m.slice(0, 3).map(row => row[3]), { width: w, height: h, fx, fy: fy ?? fx });
-  }).filter(one => one.fx > 0);
+  if (Array.isArray(cameras)) return cameras.filter(frame => frame.rotation && frame.position).map(frame => view(frame.rotation, frame.position, frame));
+  return (cameras.frames ?? []).map(frame => {
+    const matrix = frame.transform_matrix;
+    const { w, h, fl_x: fx, fl_y: fy } = { ...cameras, ...frame };
+    return view(matrix.slice(0, 3).map(row => [row[0], -row[1], -row[2]]), matrix.slice(0, 3).map(row => row[3]), { width: w, height: h, fx, fy: fy ?? fx });
+  }).filter(frame => frame.fx > 0);
 }
 
-// From a camera's axes in the world, as columns, and its place there.
-function view(axes, place, { width, height, fx, fy, img_name: name }) {
+// A view from a camera's axes in the world, as columns, and its position.
+function view(axes, position, { width, height, fx, fy, img_name: name }) {
   const rows = [0, 1, 2].map(column => axes.map(row => row[column]));
-  return { name, width, height, fx, fy, viewmat: [...rows.map(row => [...row, -row.reduce((sum, value, axis) => sum + value * place[axis], 0)]), [0, 0, 0, 1]] };
+  return { name, width, height, fx, fy, viewmat: [...rows.map(row => [...row, -row.reduce((sum, value, axis) => sum + value * position[axis], 0)]), [0, 0, 0, 1]] };
 }
 
-// Names of files, which the service does not keep: this browser does, the last ones.
-const NAMED = 300; // files and jobs whose names are kept
-const NAMES = "splatlift-names";
-const names = () => { try { return JSON.parse(localStorage.getItem(NAMES)) ?? {}; } catch { return {}; } };
-export const named = id => names()[id];
+// Names of files, which the service does not store: this browser stores the last ones.
+const MAX_NAMES = 300; // files and jobs whose names are kept
+const NAMES_KEY = "splatlift-names";
+const storedNames = () => { try { return JSON.parse(localStorage.getItem(NAMES_KEY)) ?? {}; } catch { return {}; } };
+export const nameOf = id => storedNames()[id];
 
-export function remember(id, name) {
+export function rememberName(id, name) {
   if (!name) return;
   try {
-    localStorage.setItem(NAMES, JSON.stringify(Object.fromEntries([...Object.entries(names()).filter(([known]) => known !== id), [id, name]].slice(-NAMED))));
-  } catch { /* a browser that keeps nothing */ }
+    localStorage.setItem(NAMES_KEY, JSON.stringify(Object.fromEntries([...Object.entries(storedNames()).filter(([key]) => key !== id), [id, name]].slice(-MAX_NAMES))));
+  } catch { /* this browser stores nothing */ }
 }

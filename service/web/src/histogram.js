@@ -1,9 +1,9 @@
-// How many splats have which score, as numbers and as bars.
+// The histogram of scores, as numbers and as bars.
 import { UNKNOWN, atLeast } from "./painter.js";
 
 const BINS = 96;
 
-// Scores counted between the least and the greatest of the splats that have one.
+// Count the scores from low to high in equal bins; splats without a feature are left out.
 export function histogram(scores, low, high) {
   const bins = new Uint32Array(BINS);
   const scale = high > low ? BINS / (high - low) : 0;
@@ -14,19 +14,19 @@ export function histogram(scores, low, high) {
 }
 
 export function countFrom(scores, cut) {
-  const least = atLeast(cut);
-  let found = 0;
-  for (const score of scores) if (score >= least && score > UNKNOWN) found += 1;
-  return found;
+  const minimum = atLeast(cut);
+  let total = 0;
+  for (const score of scores) if (score >= minimum && score > UNKNOWN) total += 1;
+  return total;
 }
 
-// Scores that pass a cut where splats are selected, and nowhere else: the automatic answer is more than its threshold.
+// Scores that pass the cut where splats are selected, and nowhere else: an automatic answer is more than a threshold.
 export function passing(scores, selected, cut) {
-  const least = atLeast(cut);
-  return scores.map((score, place) => selected[place] ? Math.max(score, least) : score < least ? score : UNKNOWN);
+  const minimum = atLeast(cut);
+  return scores.map((score, index) => selected[index] ? Math.max(score, minimum) : score < minimum ? score : UNKNOWN);
 }
 
-// The bars of a histogram with what is cut off pale, and a mark where the automatic cut is.
+// Draw a histogram: bars below the cut are pale, a dashed line marks the automatic cut.
 export function drawHistogram(canvas, { bins, low, high, cut, auto, colour }) {
   const ratio = devicePixelRatio || 1;
   const { clientWidth: width, clientHeight: height } = canvas;
@@ -34,18 +34,18 @@ export function drawHistogram(canvas, { bins, low, high, cut, auto, colour }) {
   canvas.height = Math.round(height * ratio);
   const context = canvas.getContext("2d");
   context.scale(ratio, ratio);
-  const most = Math.sqrt(Math.max(...bins, 1)); // roots: a hill of a small thing is seen beside a mountain
-  const wide = width / bins.length;
-  const quiet = getComputedStyle(canvas).getPropertyValue("--quiet");
-  bins.forEach((bin, place) => {
-    const tall = bin ? Math.max(1.5, Math.sqrt(bin) / most * (height - 4)) : 0;
-    context.fillStyle = low + (place + 0.5) / bins.length * (high - low) >= cut ? colour : quiet;
-    context.globalAlpha = low + (place + 0.5) / bins.length * (high - low) >= cut ? 1 : 0.4;
-    context.fillRect(place * wide + 0.5, height - tall, Math.max(1, wide - 1), tall);
+  const tallest = Math.sqrt(Math.max(...bins, 1)); // square roots keep small bins visible
+  const barWidth = width / bins.length;
+  const paleColour = getComputedStyle(canvas).getPropertyValue("--quiet");
+  bins.forEach((bin, index) => {
+    const barHeight = bin ? Math.max(1.5, Math.sqrt(bin) / tallest * (height - 4)) : 0;
+    context.fillStyle = low + (index + 0.5) / bins.length * (high - low) >= cut ? colour : paleColour;
+    context.globalAlpha = low + (index + 0.5) / bins.length * (high - low) >= cut ? 1 : 0.4;
+    context.fillRect(index * barWidth + 0.5, height - barHeight, Math.max(1, barWidth - 1), barHeight);
   });
   if (auto === null || high <= low) return;
   const x = (auto - low) / (high - low) * width;
   context.globalAlpha = 0.9;
-  context.fillStyle = quiet;
+  context.fillStyle = paleColour;
   for (let y = 0; y < height; y += 6) context.fillRect(x - 0.5, y, 1.5, 3);
 }

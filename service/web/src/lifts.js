@@ -1,40 +1,40 @@
-// The list of lifts: names that people give, what to open, what to delete.
-import { ago, at, count, el, notify, twice } from "./dom.js";
-import { named } from "./files.js";
-import { patch, remove, words } from "./service.js";
+// The list of lifts, with names and buttons to open, compare and delete them.
+import { ago, byId, formatCount, el, notify, confirmButton } from "./dom.js";
+import { nameOf } from "./files.js";
+import { patch, remove, problemText } from "./service.js";
 
-export const title = lift => lift.name || `${named(lift.id) ?? `${count(lift.count)} splats`}, ${ago(lift.created)}`;
+export const liftTitle = lift => lift.name || `${nameOf(lift.id) ?? `${formatCount(lift.count)} splats`}, ${ago(lift.created)}`;
 
-const SPACES = { none: "no words", prompts: "own words", "": "words of no known encoder" };
-export const space = ({ text_space: name }) => SPACES[name] || "asked in words";
+const SPACES = { none: "no text encoder", prompts: "prompts of the lift", "": "unknown text encoder" };
+export const textSpaceLabel = ({ text_space: name }) => SPACES[name] || "text queries";
 
-export class Lifts {
-  // opened: with the lift to show; beside: with one to see beside what is open; changed: after one was named or deleted.
-  constructor({ opened, beside, changed }) {
-    Object.assign(this, { opened, beside, changed });
+export class LiftList {
+  // onOpen(id): open a lift. onCompare(id): show it beside the open one. onChange(): a lift was named or deleted.
+  constructor({ onOpen, onCompare, onChange }) {
+    Object.assign(this, { onOpen, onCompare, onChange });
   }
 
-  show(lifts, open) {
-    const snapshot = JSON.stringify([lifts.map(({ id, name }) => [id, name]), open]);
-    if (snapshot === this.snapshot) return; // a name that is being written stays
+  render(lifts, openId) {
+    const snapshot = JSON.stringify([lifts.map(({ id, name }) => [id, name]), openId]);
+    if (snapshot === this.snapshot) return; // a name that is being typed stays
     this.snapshot = snapshot;
-    at("lifts-head").hidden = !lifts.length;
-    at("lifts").replaceChildren(...lifts.map(lift => el("li", { className: lift.id === open ? "now" : "" },
-      el("input", { type: "text", className: "name", value: lift.name || "", maxLength: 100, placeholder: "Give it a name", "aria-label": `Name of the lift of ${ago(lift.created)}`,
-        on: { change: event => this.name(lift, event.target.value.trim()) } }),
-      el("span", { className: "state" }, `${count(lift.count)} splats \u00b7 ${lift.view_count} views \u00b7 ${space(lift)} \u00b7 ${ago(lift.created)}`),
+    byId("lifts-head").hidden = !lifts.length;
+    byId("lifts").replaceChildren(...lifts.map(lift => el("li", { className: lift.id === openId ? "now" : "" },
+      el("input", { type: "text", className: "name", value: lift.name || "", maxLength: 100, placeholder: "Name", "aria-label": `Name of the lift of ${ago(lift.created)}`,
+        on: { change: event => this.renameLift(lift, event.target.value.trim()) } }),
+      el("span", { className: "state" }, `${formatCount(lift.count)} splats \u00b7 ${lift.view_count} views \u00b7 ${textSpaceLabel(lift)} \u00b7 ${ago(lift.created)}`),
       el("span", { className: "actions" },
-        lift.id === open ? el("span", { className: "quiet" }, "Open") : el("button", { type: "button", on: { click: () => this.opened(lift.id) } }, "Open"),
-        open && lift.id !== open ? el("button", { type: "button", className: "only-3d", "aria-label": `Compare with the lift of ${ago(lift.created)}`, on: { click: () => this.beside(lift.id) } }, "Compare") : null,
-        twice("Delete", () => remove(`/jobs/${lift.id}?with_lift=true`).then(() => this.changed()))))));
+        lift.id === openId ? el("span", { className: "quiet" }, "Open") : el("button", { type: "button", on: { click: () => this.onOpen(lift.id) } }, "Open"),
+        openId && lift.id !== openId ? el("button", { type: "button", className: "only-3d", "aria-label": `Compare with the lift of ${ago(lift.created)}`, on: { click: () => this.onCompare(lift.id) } }, "Compare") : null,
+        confirmButton("Delete", () => remove(`/jobs/${lift.id}?with_lift=true`).then(() => this.onChange()))))));
   }
 
-  async name(lift, name) {
+  async renameLift(lift, name) {
     try {
       Object.assign(lift, await patch(`/lifts/${lift.id}`, { name: name || null }));
-      this.changed();
+      this.onChange();
     } catch (problem) {
-      notify(words(problem), true);
+      notify(problemText(problem), true);
     }
   }
 }

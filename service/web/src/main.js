@@ -1,320 +1,351 @@
-// The page: a lift on the stage, what is asked of it, and a link that opens the same again.
-import { Ask, label, naming } from "./ask.js";
-import { Beside } from "./beside.js";
-import { Bring } from "./bring.js";
-import { at, count, el, fill, size, notify } from "./dom.js";
-import { Hand } from "./hand.js";
-import { Lifts, title } from "./lifts.js";
-import { Look, veiled } from "./look.js";
-import { Masks } from "./masks.js";
-import { Names } from "./names.js";
+// The page: the open lift, its viewer and panels, and the link that restores their state.
+import { QueryPanel, questionLabel, namesByTerm } from "./query.js";
+import { Comparison } from "./comparison.js";
+import { UploadPanel } from "./uploads.js";
+import { byId, formatCount, el, fillSelect, formatBytes, notify } from "./dom.js";
+import { SelectionEditor } from "./editor.js";
+import { LiftList, liftTitle } from "./lifts.js";
+import { LayerPanel, veilMask } from "./layers.js";
+import { MaskPicker } from "./masks.js";
+import { LabelPanel } from "./labels.js";
 import { COLOURS, rgb } from "./painter.js";
-import { bytes, json, keyOf, onHeard, onRefused, picture, useKey, words } from "./service.js";
-import { Share } from "./share.js";
-import { Take } from "./take.js";
-import { Things } from "./things.js";
-import { MOST, Viewer, webgl } from "./viewer.js";
+import { fetchBytes, fetchJson, storedKey, onAvailability, onUnauthorized, fetchPicture, useKey, problemText } from "./service.js";
+import { SharePanel } from "./share.js";
+import { ExportPanel } from "./exports.js";
+import { ObjectList } from "./objects.js";
+import { MAX_SPLATS, Viewer, webgl } from "./viewer.js";
 
-const PAGE = 100; // lifts to choose from
-const PREVIEWED = 800e6; // bytes of a file that is drawn before it is lifted
-const TURN = Math.PI / 24; // of an arrow key
-const TWICE = 260; // ms within which a second click makes a double one
-const POSTER_WAIT = 1000; // milliseconds that splats wait for that picture at most
-const POSTER = 960; // pixels of the service's picture that is shown until the splats are here
-const SLIDING = 600; // ms after the slider's last move, until that is an entry of the history
-const SHIFTED = 5; // pixels that the pointer may move in a click
+const PAGE_SIZE = 100; // lifts to choose from
+const MAX_PREVIEW_BYTES = 800e6; // bytes of a splat file that is drawn before it is uploaded
+const KEY_ANGLE = Math.PI / 24; // radians that an arrow key turns the camera
+const DOUBLE_CLICK_TIME = 260; // ms between the clicks of a double click
+const POSTER_WIDTH = 960; // pixels of the poster, a rendered picture that is shown until the splats are drawn
+const POSTER_WAIT = 1000; // ms that the splats wait for the poster
+const SLIDER_REST = 600; // ms from the slider's last move to an entry of the history
+const CLICK_DISTANCE = 5; // pixels that the pointer may move during a click
 
-let started = new URLSearchParams(location.search);
-const dark = matchMedia("(prefers-color-scheme: dark)");
+let startParameters = new URLSearchParams(location.search);
+const darkScheme = matchMedia("(prefers-color-scheme: dark)");
 let lift = null;
 let viewer = null;
-let turn = 0; // of opening lifts: what an older one loads is late and is dropped
-let busy = true; // until it is known what to open
+let openRequest = 0; // number of the last request to open a lift; replies to older ones are dropped
+let isOpening = true; // while a lift is opened
 
-const ask = new Ask({ changed, fly: box => viewer?.toBox(box) });
-const look = new Look({ changed: () => { repaint(); link(); }, fly: view => viewer?.to(view), pick: (term, less) => pointed(term, less), hit: (term, shift, alt) => hit(term, null, shift, alt), fallback: !webgl() });
-const names = new Names({ changed, centres: (values, most) => viewer?.mesh ? viewer.centres(values, most) : [], alone: () => ask.reset(true), more: term => { tab("ask"); ask.example(term, false); } });
-const masks = new Masks({ pick: (term, less) => { tab("ask"); ask.example(term, less); }, swap: (old, term) => ask.swap(old, term) });
-const things = new Things({ naming, held: () => ask.now?.sets || [], hold: sets => ask.hold(sets), fly: (box, view) => (look.mode === "view" ? look.go(view) : viewer?.toBox(box, look.views.find(({ name }) => name === view))) });
-const take = new Take({ ask, look, names, things, shot });
-const bring = new Bring({ opened: id => open(id, true), gone: () => refreshLifts(), open: () => lift?.id ?? null, raised: () => tab("bring"), preview });
-const beside = new Beside({ viewer: () => viewer, made: plain, now: () => String(linked()), changed: () => { beside.follow(ask.questions, lift); link(); } });
-const lifts = new Lifts({ opened: id => open(id, true), changed: () => refreshLifts(), beside: async id => { if (!beside.link) beside.hold(linked()); await open(id, true); } });
-const share = new Share();
-const hand = new Hand({ ask, label, look, things, viewer: () => (viewer?.mesh ? viewer : null) });
+const query = new QueryPanel({ onChange: onQueryChange, flyToBox: box => viewer?.toBox(box) });
+const layers = new LayerPanel({
+  onChange: () => { repaint(); link(); },
+  flyToView: view => viewer?.goToView(view),
+  onExample: (term, less) => useExample(term, less),
+  onPlace: (term, shift, alt) => clickExample(term, null, shift, alt),
+  fallback: !webgl(),
+});
+const labels = new LabelPanel({
+  onChange: onQueryChange,
+  centresOf: (values, maxValue) => viewer?.mesh ? viewer.centres(values, maxValue) : [],
+  onShow: () => query.reset(true),
+  findSimilar: term => { showTab("ask"); query.askExample(term, false); },
+});
+const masks = new MaskPicker({
+  onExample: (term, less) => { showTab("ask"); query.askExample(term, less); },
+  onReplace: (old, term) => query.replaceExample(old, term),
+});
+const objects = new ObjectList({
+  namesByTerm,
+  selectedSets: () => query.current?.sets || [],
+  selectSets: sets => query.askSets(sets),
+  flyToBox: (box, view) => (layers.mode === "view" ? layers.goToView(view) : viewer?.toBox(box, layers.views.find(({ name }) => name === view))),
+});
+const exporter = new ExportPanel({ query, layers, labels, objects, takePicture: screenPicture });
+const uploads = new UploadPanel({
+  onOpen: id => open(id, true), onDelete: () => refreshLifts(), openLiftId: () => lift?.id ?? null, onRaise: () => showTab("bring"), preview,
+});
+const comparison = new Comparison({
+  viewer: () => viewer,
+  createViewer: createPlainViewer,
+  currentLink: () => String(linkParameters()),
+  onChange: () => { comparison.describeRight(query.questions, lift); link(); },
+});
+const lifts = new LiftList({
+  onOpen: id => open(id, true),
+  onChange: () => refreshLifts(),
+  onCompare: async id => { if (!comparison.link) comparison.showLeft(linkParameters()); await open(id, true); },
+});
+const share = new SharePanel();
+const editor = new SelectionEditor({ query, questionLabel, layers, objects, viewer: () => (viewer?.mesh ? viewer : null) });
 
-look.asked = view => {
-  const question = ask.painted().length ? ask.now : null;
-  if (!question?.answer || !ask.painted().some(one => one.question === question)) return names.map(view);
-  return { path: `/query/mask?${ask.parameters(question, { view })}`, paint: mask => veiled(mask, rgb(question.colour)) };
+layers.maskSource = view => {
+  const question = query.paintedQuestions().length ? query.current : null;
+  if (!question?.answer || !query.paintedQuestions().some(painted => painted.question === question)) return labels.mapSource(view);
+  return { path: `/query/mask?${query.requestParameters(question, { view })}`, paint: mask => veilMask(mask, rgb(question.colour)) };
 };
-look.masks = masks;
-look.examples = () => ask.questions.flatMap(({ like, unlike }) => [...like.map(term => ({ term })), ...unlike.map(term => ({ term, unlike: true }))]);
+layers.masks = masks;
+layers.examples = () => query.questions.flatMap(({ like, unlike }) => [...like.map(term => ({ term })), ...unlike.map(term => ({ term, unlike: true }))]);
 
-let drawn = "";
+let viewTimer = 0;
+let paintedState = ""; // the query or labels of the photo view
 
-// After what is asked, or how it is shown, has changed.
-function changed() {
-  if (ask.questions.length) names.rest();
-  things.show();
-  hand.follow();
-  masks.list(look.examples());
+// Update the page after a change of the questions, or of their colours.
+function onQueryChange() {
+  if (query.questions.length) labels.hideLabels();
+  objects.render();
+  editor.followQuestion();
+  masks.listRegions(layers.examples());
   repaint();
-  if (!sliding) link();
-  take.show();
-  beside.follow(ask.questions, lift);
-  const question = ask.now?.answer ? `${ask.parameters(ask.now)}` : names.shown ? JSON.stringify([names.asked, ...names.only]) : "";
-  clearTimeout(changed.soon);
-  if (question !== drawn) changed.soon = setTimeout(() => { drawn = question; look.draw(); }, 150); // the slider moves often
+  if (!sliderTimer) link();
+  exporter.render();
+  comparison.describeRight(query.questions, lift);
+  const state = query.current?.answer ? `${query.requestParameters(query.current)}` : labels.isShown ? JSON.stringify([labels.vocabulary, ...labels.selectedValues]) : "";
+  clearTimeout(viewTimer);
+  if (state !== paintedState) viewTimer = setTimeout(() => { paintedState = state; layers.drawView(); }, 150); // the slider moves often
 }
 
 function repaint() {
   if (!viewer?.mesh) return;
-  const begun = performance.now();
-  const questions = ask.painted();
-  viewer.paint(questions, { heat: ask.heated(), layer: names.painted() || look.painted(), hide: at("hide").checked });
-  const boxes = at("show-boxes").checked ? [...ask.boxes(), ...names.boxes()] : [];
-  viewer.outline(boxes);
-  labels(boxes);
-  document.body.dataset.painted = (performance.now() - begun).toFixed(1);
+  const startTime = performance.now();
+  const questions = query.paintedQuestions();
+  viewer.paint(questions, { heat: query.heatScores(), layer: labels.paintedLayer() || layers.paintedLayer(), hide: byId("hide").checked });
+  const boxes = byId("show-boxes").checked ? [...query.boxes(), ...labels.boxes()] : [];
+  viewer.drawBoxes(boxes);
+  drawLabels(boxes);
+  document.body.dataset.painted = (performance.now() - startTime).toFixed(1);
 }
 
-// Names at the boxes; the chosen one is larger.
-function labels(boxes) {
-  at("labels").replaceChildren(...boxes.slice(0, 40).map(box => el("button", {
+// Draw names at the boxes; the selected one is larger.
+function drawLabels(boxes) {
+  byId("labels").replaceChildren(...boxes.slice(0, 40).map(box => el("button", {
     type: "button", className: box.strong ? "label strong" : "label", tabIndex: -1, style: { "--mine": box.colour },
     data: { at: JSON.stringify([(box.low[0] + box.high[0]) / 2, (box.low[1] + box.high[1]) / 2, (box.low[2] + box.high[2]) / 2]), box: JSON.stringify([box.low, box.high]) },
-    on: { click: () => (box.question ? ask.choose(box.question, box.thing) : box.named ? names.press(box.named) : viewer.toBox(box)) },
-  }, box.of > 1 ? `${box.name} ${box.thing + 1}` : box.name)));
+    on: { click: () => (box.question ? query.selectObject(box.question, box.objectIndex) : box.labelValue ? labels.toggleValue(box.labelValue) : viewer.toBox(box)) },
+  }, box.of > 1 ? `${box.name} ${box.objectIndex + 1}` : box.name)));
 }
 
-// After each frame: labels lie at the top of their boxes as these are seen, whole where a part of the box is.
-function placed(place) {
-  if ((viewer?.settled || viewer?.steered) && !at("stage").classList.contains("ready")) appear(turn);
-  const box = at("query").getBoundingClientRect(); // which labels stay clear of
-  const stage = at("labels").getBoundingClientRect();
-  const roof = x => (x > box.left - stage.left && x < box.right - stage.left ? Math.max(0, box.bottom - stage.top) : 0) + 26;
-  const taken = []; // boxes of labels that stand, the chosen ones first: none covers another
-  const whole = [...at("labels").children].sort((one, other) => other.classList.contains("strong") - one.classList.contains("strong"));
-  for (const shown of whole) {
-    const [low, high] = JSON.parse(shown.dataset.box);
-    const corners = [0, 1, 2, 3, 4, 5, 6, 7].map(which => place([0, 1, 2].map(axis => (which >> axis & 1 ? high : low)[axis])));
-    shown.hidden = corners.some(corner => !corner.before);
+// After each frame: place the labels at the top of their boxes in the picture, within the window.
+function placeLabels(project) {
+  if ((viewer?.settled || viewer?.isSteered) && !byId("stage").classList.contains("ready")) showSplats(openRequest);
+  const box = byId("query").getBoundingClientRect(); // labels must not cover it
+  const stage = byId("labels").getBoundingClientRect();
+  const topEdge = x => (x > box.left - stage.left && x < box.right - stage.left ? Math.max(0, box.bottom - stage.top) : 0) + 26;
+  const occupied = []; // by labels that are placed; selected ones come first, and none covers another
+  const allLabels = [...byId("labels").children].sort((a, b) => b.classList.contains("strong") - a.classList.contains("strong"));
+  for (const label of allLabels) {
+    const [low, high] = JSON.parse(label.dataset.box);
+    const corners = [0, 1, 2, 3, 4, 5, 6, 7].map(corner => project([0, 1, 2].map(axis => (corner >> axis & 1 ? high : low)[axis])));
+    label.hidden = corners.some(corner => !corner.before);
     const [left, right] = [Math.min(...corners.map(corner => corner.x)), Math.max(...corners.map(corner => corner.x))];
-    const { clientWidth: width } = at("labels");
-    const half = shown.offsetWidth / 2 + 4;
+    const { clientWidth: width } = byId("labels");
+    const half = label.offsetWidth / 2 + 4;
     const x = right < 0 || left > width ? (left + right) / 2 : Math.max(half, Math.min(width - half, (left + right) / 2));
-    const top = Math.max(roof(x), Math.min(...corners.map(corner => corner.y)) - 4);
-    const tall = shown.offsetHeight + 2;
-    const free = y => !taken.some(one => Math.abs(one.x - x) < one.half + half - 4 && Math.abs(one.y - y) < tall);
-    const y = [0, -1, 1, -2, 2, -3].map(step => top + step * tall).find(one => one >= roof(x) && free(one));
-    shown.style.visibility = y === undefined ? "hidden" : "";
-    if (!shown.hidden && y !== undefined) taken.push({ x, y, half });
-    shown.style.transform = `translate(-50%, -100%) translate(${x.toFixed(1)}px, ${(y ?? top).toFixed(1)}px)`;
+    const top = Math.max(topEdge(x), Math.min(...corners.map(corner => corner.y)) - 4);
+    const labelHeight = label.offsetHeight + 2;
+    const isFree = y => !occupied.some(other => Math.abs(other.x - x) < other.half + half - 4 && Math.abs(other.y - y) < labelHeight);
+    const y = [0, -1, 1, -2, 2, -3].map(step => top + step * labelHeight).find(candidate => candidate >= topEdge(x) && isFree(candidate));
+    label.style.visibility = y === undefined ? "hidden" : "";
+    if (!label.hidden && y !== undefined) occupied.push({ x, y, half });
+    label.style.transform = `translate(-50%, -100%) translate(${x.toFixed(1)}px, ${(y ?? top).toFixed(1)}px)`;
   }
 }
 
-let entry = null; // what is asked in the newest entry of the browser's history
-let going = false; // back or forth in it
-let sliding = 0;
+let historyState = null; // the questions of the newest entry of the browser's history
+let isNavigating = false; // during Back or Forward
+let sliderTimer = 0;
 
-// The slider rests: what it was moved through is one entry.
-function slid() {
-  clearTimeout(sliding);
-  sliding = 0;
+// The slider rests: its last position becomes one entry of the history.
+function sliderRested() {
+  clearTimeout(sliderTimer);
+  sliderTimer = 0;
   link();
 }
 
-// The address bar holds the link that opens the same question, camera and layer. What is asked anew is an entry of the
-// browser's history; a camera that moves is none.
+// Write the link of the questions, camera and layer to the address bar. A change of the questions makes an entry of the
+// browser's history, a move of the camera does not.
 function link() {
-  if (!lift || busy || going) return;
-  const parameters = linked();
+  if (!lift || isOpening || isNavigating) return;
+  const parameters = linkParameters();
   const fixed = ["view", "what", "show", "hide", "camera", "heat"];
-  const now = String([...parameters].filter(([name]) => !fixed.includes(name)));
-  const waits = ask.questions.some(question => !question.answer && !question.problem);
-  if (entry !== null && entry !== now && waits) return; // it is an entry once it is answered
-  history[entry !== null && entry !== now ? "pushState" : "replaceState"](null, "", `?${parameters}`);
-  entry = now;
+  const state = String([...parameters].filter(([name]) => !fixed.includes(name)));
+  const isPending = query.questions.some(question => !question.answer && !question.problem);
+  if (historyState !== null && historyState !== state && isPending) return; // the answer will make the entry
+  history[historyState !== null && historyState !== state ? "pushState" : "replaceState"](null, "", `?${parameters}`);
+  historyState = state;
 }
 
-function linked() {
+function linkParameters() {
   const parameters = new URLSearchParams({ lift: lift.id });
-  if (look.view) parameters.set("view", look.view.name);
-  ask.link(parameters);
-  hand.link(parameters);
-  names.link(parameters);
-  if (look.what !== "rgb") parameters.set("what", look.what);
-  if (look.mode !== "scene" && !look.fallback) parameters.set("show", look.mode);
-  if (at("hide").checked) parameters.set("hide", "1");
+  if (layers.view) parameters.set("view", layers.view.name);
+  query.link(parameters);
+  editor.link(parameters);
+  labels.link(parameters);
+  if (layers.layerName !== "rgb") parameters.set("what", layers.layerName);
+  if (layers.mode !== "scene" && !layers.fallback) parameters.set("show", layers.mode);
+  if (byId("hide").checked) parameters.set("hide", "1");
   if (viewer?.mesh) parameters.set("camera", viewer.place3d.map(value => Number(value.toPrecision(5))).join(","));
-  if (beside.link) parameters.set("beside", beside.link);
+  if (comparison.link) parameters.set("beside", comparison.link);
   return parameters;
 }
 
-// Back and forth: what was asked then is asked again.
+// Back and Forward: restore the questions of that entry.
 addEventListener("popstate", async () => {
   const parameters = new URLSearchParams(location.search);
-  if (parameters.get("lift") !== lift?.id) { started = parameters; entry = null; return parameters.has("lift") && open(parameters.get("lift")); }
-  going = true;
+  if (parameters.get("lift") !== lift?.id) { startParameters = parameters; historyState = null; return parameters.has("lift") && open(parameters.get("lift")); }
+  isNavigating = true;
   try {
-    at("hide").checked = parameters.has("hide");
-    ask.reset(false);
-    names.rest();
-    await restored(parameters);
-    if (!ask.questions.length) ask.reset(true);
+    byId("hide").checked = parameters.has("hide");
+    query.reset(false);
+    labels.hideLabels();
+    await restoreState(parameters);
+    if (!query.questions.length) query.reset(true);
   } finally {
-    going = false;
-    entry = null;
+    isNavigating = false;
+    historyState = null;
     link();
   }
   return undefined;
 });
 
-async function restored(parameters) {
-  const answered = ask.restore(parameters);
-  await hand.restore(parameters);
-  await answered;
-  if (!look.fallback) beside.restore(parameters);
-  if (parameters.has("named")) { tab("name"); names.restore(parameters); }
+async function restoreState(parameters) {
+  const answers = query.restore(parameters);
+  await editor.restore(parameters);
+  await answers;
+  if (!layers.fallback) comparison.restore(parameters);
+  if (parameters.has("named")) { showTab("name"); labels.restore(parameters); }
 }
 
-function tab(name) {
+function showTab(name) {
   for (const button of document.querySelectorAll("[role=tab]")) {
-    const chosen = button.id === `tab-${name}`;
-    button.setAttribute("aria-selected", String(chosen));
-    button.tabIndex = chosen ? 0 : -1;
-    at(`panel-${button.id.slice(4)}`).hidden = !chosen;
+    const isSelected = button.id === `tab-${name}`;
+    button.setAttribute("aria-selected", String(isSelected));
+    button.tabIndex = isSelected ? 0 : -1;
+    byId(`panel-${button.id.slice(4)}`).hidden = !isSelected;
   }
-  if (name === "bring") { bring.refresh(); refreshLifts().catch(problem => problem.status !== 401 && notify(words(problem), true)); }
-  if (name === "name") names.tables().catch(problem => notify(words(problem), true));
-  if (name === "take") take.show();
+  if (name === "bring") { uploads.refresh(); refreshLifts().catch(problem => problem.status !== 401 && notify(problemText(problem), true)); }
+  if (name === "name") labels.listTables().catch(problem => notify(problemText(problem), true));
+  if (name === "take") exporter.render();
   repaint();
 }
 
-function loading(text, share = null) {
-  at("loading").hidden = text === null;
+function showLoading(text, share = null) {
+  byId("loading").hidden = text === null;
   if (text === null) return;
-  at("loading-text").textContent = text;
-  const bar = at("loading-bar");
+  byId("loading-text").textContent = text;
+  const bar = byId("loading-bar");
   if (share === null) bar.removeAttribute("value"); else bar.value = share;
 }
 
-function trouble(text) {
-  at("trouble").hidden = !text;
-  at("trouble-text").textContent = text || "";
+function showProblem(text) {
+  byId("trouble").hidden = !text;
+  byId("trouble-text").textContent = text || "";
 }
 
 async function refreshLifts() {
-  const { lifts: known, next } = await json(`/lifts?limit=${PAGE}`);
-  const gone = lift && !known.some(({ id }) => id === lift.id);
-  at("lift-label").hidden = !known.length;
-  const choices = [...known, ...(gone && next ? [lift] : [])].map(one => [one.id, title(one)]);
-  fill(at("lift"), lift ? choices : [["", "Choose a scene"], ...choices], lift?.id ?? "");
-  lifts.show(known, lift?.id);
-  if (gone && !next) { // it was deleted
+  const { lifts: list, next } = await fetchJson(`/lifts?limit=${PAGE_SIZE}`);
+  const isUnlisted = lift && !list.some(({ id }) => id === lift.id);
+  byId("lift-label").hidden = !list.length;
+  const choices = [...list, ...(isUnlisted && next ? [lift] : [])].map(entry => [entry.id, liftTitle(entry)]);
+  fillSelect(byId("lift"), lift ? choices : [["", "Choose a scene"], ...choices], lift?.id ?? "");
+  lifts.render(list, lift?.id);
+  if (isUnlisted && !next) { // it was deleted
     lift = null;
-    beside.end();
+    comparison.end();
     viewer?.clear();
-    of(null);
-    notify("The scene that was open was deleted.");
+    setLift(null);
+    notify("The open scene was deleted.");
   }
-  if (!lift && !busy && known.length) open(known[0].id); // also the first one, when its job was followed here
-  at("empty").hidden = Boolean(known.length || viewer?.draft);
-  document.body.classList.toggle("no-lifts", !known.length);
-  return known;
+  if (!lift && !isOpening && list.length) open(list[0].id); // such as the first lift, once its job has ended
+  byId("empty").hidden = Boolean(list.length || viewer?.draft);
+  document.body.classList.toggle("no-lifts", !list.length);
+  return list;
 }
 
 async function open(id, fresh = false) {
-  const mine = ++turn;
-  busy = true;
-  let parameters = !fresh && [null, id].includes(started.get("lift")) ? started : new URLSearchParams();
-  trouble(null);
+  const request = ++openRequest;
+  isOpening = true;
+  let parameters = !fresh && [null, id].includes(startParameters.get("lift")) ? startParameters : new URLSearchParams();
+  showProblem(null);
   try {
-    loading("Opening the lift");
-    const found = await json(`/lifts/${id}`);
-    if (mine !== turn) return;
-    if (fresh && lift) parameters = beside.carried(found) ?? parameters;
-    lift = found;
-    at("empty").hidden = true;
+    showLoading("Opening the lift");
+    const newLift = await fetchJson(`/lifts/${id}`);
+    if (request !== openRequest) return;
+    if (fresh && lift) parameters = comparison.sharedParameters(newLift) ?? parameters;
+    lift = newLift;
+    byId("empty").hidden = true;
     document.body.classList.remove("no-lifts");
-    of(lift);
-    at("mask").hidden = at("outline").hidden = true;
-    refreshLifts().catch(problem => notify(words(problem), true));
-    share.of(lift).catch(problem => notify(words(problem), true));
-    if (fresh) tab("ask");
+    setLift(lift);
+    byId("mask").hidden = byId("outline").hidden = true;
+    refreshLifts().catch(problem => notify(problemText(problem), true));
+    share.setLift(lift).catch(problem => notify(problemText(problem), true));
+    if (fresh) showTab("ask");
     viewer?.clear();
-    at("stage").classList.remove("ready");
-    at("poster").hidden = true;
+    byId("stage").classList.remove("ready");
+    byId("poster").hidden = true;
     let poster = null;
     const [content] = await Promise.all([
-      look.fallback ? null : bytes(`/lifts/${id}/splats`, { progress: (got, total) => mine === turn && loading(`Loading ${size(got)}${total ? ` of ${size(total)}` : ""}`, total ? got / total : null) }),
-      look.of(lift, parameters.get("view")).then(() => { poster = mine === turn ? aim(parameters, mine) : null; }),
+      layers.fallback ? null : fetchBytes(`/lifts/${id}/splats`, { progress: (received, total) => request === openRequest && showLoading(`Loading ${formatBytes(received)}${total ? ` of ${formatBytes(total)}` : ""}`, total ? received / total : null) }),
+      layers.setLift(lift, parameters.get("view")).then(() => { poster = request === openRequest ? showPoster(parameters, request) : null; }),
     ]);
-    // The first drawing of the splats may hold this page for seconds: what is shown meanwhile has to be there before.
-    await Promise.race([poster, new Promise(late => setTimeout(late, POSTER_WAIT))]);
-    if (mine !== turn) return;
-    if (content) await show(content, parameters);
-    about();
-    warnings(lift);
-    if (parameters.has("what")) await look.choose(parameters.get("what"));
-    look.switch(parameters.get("show") || (look.fallback ? "view" : "scene"));
-    at("hide").checked = parameters.has("hide");
-    loading(null);
-    busy = false;
-    await restored(parameters);
+    // The first frame of the splats may block the page for seconds, so the poster has to be shown before.
+    await Promise.race([poster, new Promise(resolve => setTimeout(resolve, POSTER_WAIT))]);
+    if (request !== openRequest) return;
+    if (content) await loadSplats(content, parameters);
+    describeScene();
+    showWarnings(lift);
+    if (parameters.has("what")) await layers.setLayer(parameters.get("what"));
+    layers.setMode(parameters.get("show") || (layers.fallback ? "view" : "scene"));
+    byId("hide").checked = parameters.has("hide");
+    showLoading(null);
+    isOpening = false;
+    await restoreState(parameters);
     link();
   } catch (problem) {
-    if (mine !== turn) return;
-    busy = false;
-    loading(null);
-    trouble(words(problem));
+    if (request !== openRequest) return;
+    isOpening = false;
+    showLoading(null);
+    showProblem(problemText(problem));
   }
 }
 
-// What belongs to a lift.
-function of(known) {
-  ask.of(known);
-  for (const panel of [things, names, masks]) panel.of(known).catch(problem => notify(words(problem), true));
+// Open a lift in the panels; null closes it.
+function setLift(newLift) {
+  query.setLift(newLift);
+  for (const panel of [objects, labels, masks]) panel.setLift(newLift).catch(problem => notify(problemText(problem), true));
 }
 
-// The camera of the link or of the first view; the service's picture of it is there before the splats are drawn.
-async function aim(parameters, mine) {
-  viewer ||= look.fallback ? null : made();
+// Place the camera of the link or of the first view, and show a rendered picture until the splats are drawn.
+async function showPoster(parameters, request) {
+  viewer ||= layers.fallback ? null : createViewer();
   if (!viewer) return;
-  stand(parameters);
-  const own = viewer.own(POSTER);
-  if (!own.width || !look.views.length) return;
+  placeCamera(parameters);
+  const camera = viewer.cameraRequest(POSTER_WIDTH);
+  if (!camera.width || !layers.views.length) return;
   try {
-    const image = await picture("/render", { lift: lift.id, camera: own });
-    if (mine !== turn || at("stage").classList.contains("ready")) return URL.revokeObjectURL(image.src);
-    if (at("poster").src) URL.revokeObjectURL(at("poster").src);
-    at("poster").src = image.src;
-    at("poster").hidden = false;
-    await new Promise(painted => requestAnimationFrame(() => setTimeout(painted)));
-  } catch { /* the splats are on their way */ }
+    const image = await fetchPicture("/render", { lift: lift.id, camera });
+    if (request !== openRequest || byId("stage").classList.contains("ready")) return URL.revokeObjectURL(image.src);
+    if (byId("poster").src) URL.revokeObjectURL(byId("poster").src);
+    byId("poster").src = image.src;
+    byId("poster").hidden = false;
+    await new Promise(resolve => requestAnimationFrame(() => setTimeout(resolve)));
+  } catch { /* the splats follow without a poster */ }
 }
 
-async function show(content, parameters) {
+async function loadSplats(content, parameters) {
   if (!viewer) return;
-  loading("Unpacking the splats");
+  showLoading("Unpacking the splats");
   await viewer.load(content);
-  if (!viewer.focused) stand(parameters); // now that the scene's middle is known
+  if (!viewer.hasFocus) placeCamera(parameters); // now the centre of the scene is known
 }
 
-// The splats in place of the poster.
-async function appear(mine) {
-  await viewer.drawn();
-  if (mine !== turn) return;
-  at("stage").classList.add("ready");
-  setTimeout(() => { if (mine === turn) at("poster").hidden = true; }, 600); // it lies below while they fade in
+// Replace the poster by the splats.
+async function showSplats(request) {
+  await viewer.gpuDone();
+  if (request !== openRequest) return;
+  byId("stage").classList.add("ready");
+  setTimeout(() => { if (request === openRequest) byId("poster").hidden = true; }, 600); // the splats fade in above it
 }
 
-function stand(parameters) {
-  viewer.lead();
+function placeCamera(parameters) {
+  viewer.takeLead();
   viewer.origin = lift.origin;
-  viewer.settle(look.views);
-  if (look.view) viewer.to(look.view, true);
+  viewer.orient(layers.views);
+  if (layers.view) viewer.goToView(layers.view, true);
   const camera = (parameters.get("camera") || "").split(",").map(Number);
   if (camera.length === 6 && camera.every(Number.isFinite)) {
     viewer.camera.position.set(...camera.slice(0, 3));
@@ -323,14 +354,14 @@ function stand(parameters) {
   }
 }
 
-// The 3D view, or, where it does not start after all, the pictures of views.
-function made() {
+// The 3D viewer; null if WebGL fails, and the page shows photo views.
+function createViewer() {
   try {
-    const canvas = at("scene");
-    const built = plain(canvas, placed);
-    built.moved = link;
-    pointing(canvas, built);
-    return built;
+    const canvas = byId("scene");
+    const created = createPlainViewer(canvas, placeLabels);
+    created.onMove = link;
+    listenToPointer(canvas, created);
+    return created;
   } catch (problem) {
     fallBack();
     console.warn(problem);
@@ -338,218 +369,218 @@ function made() {
   }
 }
 
-function plain(canvas, seen = () => {}) {
-  const built = new Viewer(canvas, seen);
-  built.background(ground());
-  return built;
+function createPlainViewer(canvas, onFrame = () => {}) {
+  const created = new Viewer(canvas, onFrame);
+  created.background(stageColour());
+  return created;
 }
 
-const ground = () => getComputedStyle(document.documentElement).getPropertyValue("--ground").trim();
+const stageColour = () => getComputedStyle(document.documentElement).getPropertyValue("--ground").trim();
 
 function fallBack() {
-  look.fallback = true;
+  layers.fallback = true;
   document.body.classList.add("flat");
-  look.switch("view");
+  layers.setMode("view");
 }
 
-// Splats as they were dropped, where no scene is open.
+// Draw dropped splats if no scene is open.
 async function preview(file, cameras) {
-  if (lift || look.fallback || file.size > PREVIEWED) return;
+  if (lift || layers.fallback || file.size > MAX_PREVIEW_BYTES) return;
   try {
-    viewer ||= made();
-    await viewer?.preview(new Uint8Array(await file.arrayBuffer()), file.name, cameras);
+    viewer ||= createViewer();
+    await viewer?.showPreview(new Uint8Array(await file.arrayBuffer()), file.name, cameras);
     if (lift || !viewer) return;
-    at("empty").hidden = true;
-    at("stage").classList.add("ready");
+    byId("empty").hidden = true;
+    byId("stage").classList.add("ready");
   } catch (problem) {
-    console.warn(problem); // the service reads more kinds than this page draws
+    console.warn(problem); // the service reads more formats than this page draws
   }
 }
 
-// What a lift warns of, and what its plan did.
-async function warnings(known) {
-  const { plan } = await json(`/jobs/${known.id}`).catch(() => ({}));
-  if (known !== lift) return;
-  const warnings = [...new Set([...(plan?.warnings ?? []), ...(known.diagnostics?.warnings ?? [])])];
-  at("warnings").hidden = !warnings.length;
-  at("warnings").replaceChildren(...warnings.map(warning => el("li", {}, warning)));
+// Show the warnings of a lift and of its plan.
+async function showWarnings(target) {
+  const { plan } = await fetchJson(`/jobs/${target.id}`).catch(() => ({}));
+  if (target !== lift) return;
+  const warnings = [...new Set([...(plan?.warnings ?? []), ...(target.diagnostics?.warnings ?? [])])];
+  byId("warnings").hidden = !warnings.length;
+  byId("warnings").replaceChildren(...warnings.map(warning => el("li", {}, warning)));
 }
 
-// What is said of the scene below it.
-async function about() {
-  const said = [`${count(lift.count)} splats`, `${lift.channels} channels`, `${lift.views.length} views lifted`];
-  if (viewer?.mesh && viewer.count < lift.count) said[0] = `${count(viewer.count)} of ${count(lift.count)} splats shown (every ${Math.ceil(lift.count / MOST)}.)`;
-  at("about").textContent = said.join(" \u00b7 ");
+// Describe the scene in the panel of layers.
+async function describeScene() {
+  const facts = [`${formatCount(lift.count)} splats`, `${lift.channels} channels`, `${lift.views.length} views lifted`];
+  if (viewer?.mesh && viewer.count < lift.count) facts[0] = `${formatCount(viewer.count)} of ${formatCount(lift.count)} splats shown (1 in ${Math.ceil(lift.count / MAX_SPLATS)})`;
+  byId("about").textContent = facts.join(" \u00b7 ");
   try {
-    const { counts } = await json(`/assets/${lift.splats}`);
+    const { counts } = await fetchJson(`/assets/${lift.splats}`);
     const kernel = lift.settings.kernel && lift.settings.kernel !== "auto" ? lift.settings.kernel : counts.kernel;
-    const note = { "2dgs": "discs drawn as thin Gaussians", dbs: "beta kernels drawn as Gaussians of the nearest size" }[kernel];
-    if (note && !look.fallback) at("about").textContent = [...said, note].join(" \u00b7 ");
-  } catch { /* said without it */ }
+    const note = { "2dgs": "2D Gaussians are drawn as thin 3D Gaussians", dbs: "beta kernels are drawn as Gaussians of similar size" }[kernel];
+    if (note && !layers.fallback) byId("about").textContent = [...facts, note].join(" \u00b7 ");
+  } catch { /* the note is optional */ }
 }
 
-function pointing(canvas, built) {
+function listenToPointer(canvas, target) {
   let down = null;
-  let waiting = 0;
-  let last = -TWICE;
-  const at3d = event => {
+  let clickTimer = 0;
+  let lastClick = -DOUBLE_CLICK_TIME;
+  const pickAt = event => {
     const box = canvas.getBoundingClientRect();
-    return built.pick(event.clientX - box.left, event.clientY - box.top);
+    return target.pick(event.clientX - box.left, event.clientY - box.top);
   };
   canvas.addEventListener("pointerdown", event => { down = event.isPrimary ? [event.clientX, event.clientY] : null; });
   canvas.addEventListener("pointerup", event => {
-    if (!down || event.button !== 0 || Math.hypot(event.clientX - down[0], event.clientY - down[1]) > SHIFTED) return;
-    clearTimeout(waiting);
-    if (event.timeStamp - last < TWICE) {
-      last = -TWICE;
-      const hit = at3d(event);
-      if (hit) built.toPoint(hit.point);
+    if (!down || event.button !== 0 || Math.hypot(event.clientX - down[0], event.clientY - down[1]) > CLICK_DISTANCE) return;
+    clearTimeout(clickTimer);
+    if (event.timeStamp - lastClick < DOUBLE_CLICK_TIME) {
+      lastClick = -DOUBLE_CLICK_TIME;
+      const hit = pickAt(event);
+      if (hit) target.toPoint(hit.point);
       return;
     }
-    last = event.timeStamp;
+    lastClick = event.timeStamp;
     const { shiftKey, altKey } = event;
-    waiting = setTimeout(() => hit3d(at3d(event), shiftKey, altKey), TWICE);
+    clickTimer = setTimeout(() => clickSplat(pickAt(event), shiftKey, altKey), DOUBLE_CLICK_TIME);
   });
-  canvas.addEventListener("keydown", event => keyed(event, built));
+  canvas.addEventListener("keydown", event => handleKey(event, target));
 }
 
-const hit3d = (found, shift, alt) => (found ? hit(`splat:${found.splat}`, found.at, shift, alt) : notify("There is no splat there."));
+const clickSplat = (hit, shift, alt) => (hit ? clickExample(`splat:${hit.splat}`, hit.at, shift, alt) : notify("There is no splat at this point."));
 
-// A click takes the thing there, another one its part, down to the smallest; one more or Alt what is like the place.
-// Shift takes several things, or less of what is like a place.
-async function hit(term, point, shift, alt = false) {
-  const patch = alt || !at("panel-name").hidden || (shift && ask.now && !ask.now.sets.length);
-  if (!patch && await things.at(term, shift)) return undefined;
-  return pointed(term, shift && !ask.now?.sets.length, point);
+// A click selects the object there, the next one its part, down to the smallest; one more, or Alt, asks for similar
+// splats. Shift selects several objects, or adds a negative example.
+async function clickExample(term, point, shift, alt = false) {
+  const isExample = alt || !byId("panel-name").hidden || (shift && query.current && !query.current.sets.length);
+  if (!isExample && await objects.selectAt(term, shift)) return undefined;
+  return useExample(term, shift && !query.current?.sets.length, point);
 }
 
-// Somebody points at a thing: more of it, or with the panel of names what it is.
-function pointed(term, less, point = null) {
-  return at("panel-name").hidden ? ask.example(term, less) : names.what(term, point);
+// Use a place as an example; with the panel Label, find its words.
+function useExample(term, less, point = null) {
+  return byId("panel-name").hidden ? query.askExample(term, less) : labels.labelPlace(term, point);
 }
 
-function keyed(event, built) {
+function handleKey(event, target) {
   if (event.ctrlKey || event.metaKey || event.altKey) return;
-  const turns = { ArrowLeft: [-TURN, 0], ArrowRight: [TURN, 0], ArrowUp: [0, -TURN], ArrowDown: [0, TURN] };
-  if (turns[event.key]) built.turn(...turns[event.key]);
-  else if (event.key === "+" || event.key === "=") built.zoom(0.85);
-  else if (event.key === "-") built.zoom(1 / 0.85);
-  else if (event.key === "Enter") hit3d(built.pick(at("scene").clientWidth / 2, at("scene").clientHeight / 2), event.shiftKey);
+  const turns = { ArrowLeft: [-KEY_ANGLE, 0], ArrowRight: [KEY_ANGLE, 0], ArrowUp: [0, -KEY_ANGLE], ArrowDown: [0, KEY_ANGLE] };
+  if (turns[event.key]) target.turn(...turns[event.key]);
+  else if (event.key === "+" || event.key === "=") target.zoom(0.85);
+  else if (event.key === "-") target.zoom(1 / 0.85);
+  else if (event.key === "Enter") clickSplat(target.pick(byId("scene").clientWidth / 2, byId("scene").clientHeight / 2), event.shiftKey);
   else return;
   event.preventDefault();
 }
 
-// What is on the screen, with a legend below it: words by their colours, a layer by its name.
-async function shot() {
-  const parts = look.mode !== "view" && viewer ? [await viewer.is_complete()] : [at("render"), at("over"), at("mask"), at("outline")].filter(part => !part.hidden);
-  const [wide, high] = [parts[0].naturalWidth ?? parts[0].width, parts[0].naturalHeight ?? parts[0].height];
-  const legend = [...ask.painted().map(({ question }) => [label(question), question.colour]), ...names.entries(), ...(look.what === "rgb" ? [] : [[look.title, null]])];
+// A picture of the view with a legend below it: words with their colours, and the name of the layer.
+async function screenPicture() {
+  const pictures = layers.mode !== "view" && viewer ? [await viewer.completeCanvas()] : [byId("render"), byId("over"), byId("mask"), byId("outline")].filter(picture => !picture.hidden);
+  const [width, height] = [pictures[0].naturalWidth ?? pictures[0].width, pictures[0].naturalHeight ?? pictures[0].height];
+  const legend = [...query.paintedQuestions().map(({ question }) => [questionLabel(question), question.colour]), ...labels.legendEntries(), ...(layers.layerName === "rgb" ? [] : [[layers.layerTitle, null]])];
   const canvas = document.createElement("canvas");
   const context = canvas.getContext("2d");
-  const size = Math.max(14, Math.round(wide / 60));
+  const size = Math.max(14, Math.round(width / 60));
   const font = `${size}px Inter, sans-serif`;
   context.font = font;
-  const places = [];
-  let [x, y] = [size, high + size * 1.5];
+  const items = [];
+  let [x, y] = [size, height + size * 1.5];
   for (const [name, colour] of legend) {
-    const long = context.measureText(name).width + size * (colour ? 2.6 : 1.2);
-    if (x > size && x + long > wide) [x, y] = [size, y + size * 1.7];
-    places.push([name, colour, x, y]);
-    x += long;
+    const itemWidth = context.measureText(name).width + size * (colour ? 2.6 : 1.2);
+    if (x > size && x + itemWidth > width) [x, y] = [size, y + size * 1.7];
+    items.push([name, colour, x, y]);
+    x += itemWidth;
   }
-  Object.assign(canvas, { width: wide, height: legend.length ? Math.ceil(y + size) : high });
-  context.fillStyle = ground();
+  Object.assign(canvas, { width, height: legend.length ? Math.ceil(y + size) : height });
+  context.fillStyle = stageColour();
   context.fillRect(0, 0, canvas.width, canvas.height);
-  for (const part of parts) {
-    context.globalAlpha = part === parts[0] ? 1 : Number(part.style.opacity || 1);
-    context.drawImage(part, 0, 0, wide, high);
+  for (const picture of pictures) {
+    context.globalAlpha = picture === pictures[0] ? 1 : Number(picture.style.opacity || 1);
+    context.drawImage(picture, 0, 0, width, height);
   }
   Object.assign(context, { globalAlpha: 1, font, textBaseline: "middle" });
-  for (const [name, colour, left, middle] of places) {
+  for (const [name, colour, left, middle] of items) {
     context.fillStyle = colour ?? "#edf0f4";
     if (colour) context.fillRect(left, middle - size / 2, size, size);
     context.fillStyle = "#edf0f4";
     context.fillText(name, left + (colour ? size * 1.5 : 0), middle);
   }
-  return new Promise(done => canvas.toBlob(done, "image/png"));
+  return new Promise(resolve => canvas.toBlob(resolve, "image/png"));
 }
 
-// Undo and redo: of things that were joined or split, else of the selection that is corrected, else of what was asked.
+// Undo and redo joined or split objects, else edits of the selection, else questions.
 addEventListener("keydown", event => {
   const key = event.key.toLowerCase();
   if (!["z", "y"].includes(key) || !(event.ctrlKey || event.metaKey) || event.target.matches("input[type=text], textarea")) return;
   event.preventDefault();
   const by = key === "y" || event.shiftKey ? 1 : -1;
-  if (!things.go(by, hand.selection) && !hand.go(by)) history.go(by);
+  if (!objects.stepHistory(by, editor.selection) && !editor.step(by)) history.go(by);
 });
 
-// Keys that work wherever no text is typed.
+// Keys of the page, while no text is typed.
 addEventListener("keydown", event => {
   if (event.target.matches("input:not([type=radio]):not([type=checkbox]):not([type=range]), select, textarea") || event.ctrlKey || event.metaKey || event.altKey) {
     if (event.key === "Escape") event.target.blur();
     return;
   }
   const action = {
-    "/": () => at("words").focus(), "[": () => look.step(-1), "]": () => look.step(1), n: () => ask.step(1), p: () => ask.step(-1),
-    h: () => at("hide").click(), b: () => at("show-boxes").click(), m: () => at("heat").click(), r: () => look.view && viewer?.to(look.view),
-    "?": () => at("help").showModal(), Escape: () => { names.rest(); ask.reset(true); },
+    "/": () => byId("words").focus(), "[": () => layers.stepView(-1), "]": () => layers.stepView(1), n: () => query.stepObject(1), p: () => query.stepObject(-1),
+    h: () => byId("hide").click(), b: () => byId("show-boxes").click(), m: () => byId("heat").click(), r: () => layers.view && viewer?.goToView(layers.view),
+    "?": () => byId("help").showModal(), Escape: () => { labels.hideLabels(); query.reset(true); },
   }[event.key];
-  if (!action || at("help").open || at("door").open) return;
+  if (!action || byId("help").open || byId("door").open) return;
   event.preventDefault();
   action();
 });
 
 for (const button of document.querySelectorAll("[role=tab]")) {
-  button.addEventListener("click", () => tab(button.id.slice(4)));
+  button.addEventListener("click", () => showTab(button.id.slice(4)));
   button.addEventListener("keydown", event => {
     const tabs = [...document.querySelectorAll("[role=tab]")];
     const by = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
     if (!by) return;
     const next = tabs[(tabs.indexOf(button) + by + tabs.length) % tabs.length];
-    tab(next.id.slice(4));
+    showTab(next.id.slice(4));
     next.focus();
   });
 }
-at("lift").addEventListener("change", () => at("lift").value && open(at("lift").value, true));
-at("cut").addEventListener("input", () => { clearTimeout(sliding); sliding = setTimeout(slid, SLIDING); });
-at("cut").addEventListener("change", slid);
-for (const id of ["hide", "show-boxes"]) at(id).addEventListener("change", () => { repaint(); link(); });
-at("again").addEventListener("click", () => location.reload());
-at("reset-view").addEventListener("click", () => look.view && viewer?.to(look.view));
-at("show-help").addEventListener("click", () => at("help").showModal());
-at("show-key").addEventListener("click", () => at("door").showModal());
-at("empty-bring").addEventListener("click", () => { tab("bring"); at("files").click(); });
-at("key-form").addEventListener("submit", event => { event.preventDefault(); useKey(at("key").value.trim()); });
-at("forget").addEventListener("click", () => useKey(""));
+byId("lift").addEventListener("change", () => byId("lift").value && open(byId("lift").value, true));
+byId("cut").addEventListener("input", () => { clearTimeout(sliderTimer); sliderTimer = setTimeout(sliderRested, SLIDER_REST); });
+byId("cut").addEventListener("change", sliderRested);
+for (const id of ["hide", "show-boxes"]) byId(id).addEventListener("change", () => { repaint(); link(); });
+byId("again").addEventListener("click", () => location.reload());
+byId("reset-view").addEventListener("click", () => layers.view && viewer?.goToView(layers.view));
+byId("show-help").addEventListener("click", () => byId("help").showModal());
+byId("show-key").addEventListener("click", () => byId("door").showModal());
+byId("empty-bring").addEventListener("click", () => { showTab("bring"); byId("files").click(); });
+byId("key-form").addEventListener("submit", event => { event.preventDefault(); useKey(byId("key").value.trim()); });
+byId("forget").addEventListener("click", () => useKey(""));
 for (const button of document.querySelectorAll("[data-close]")) button.addEventListener("click", () => button.closest("dialog").close());
-let away = 0; // the timer that asks a service which does not answer
-onHeard(answers => {
-  at("offline").hidden = answers;
-  if (answers || away) return;
-  away = setInterval(() => json("/healthz").then(() => { clearInterval(away); away = 0; bring.refresh(); ask.resume(); if (!at("trouble").hidden) location.reload(); }).catch(() => {}), 3000);
+let retryTimer = 0; // of requests to a service that does not answer
+onAvailability(answers => {
+  byId("offline").hidden = answers;
+  if (answers || retryTimer) return;
+  retryTimer = setInterval(() => fetchJson("/healthz").then(() => { clearInterval(retryTimer); retryTimer = 0; uploads.refresh(); query.resume(); if (!byId("trouble").hidden) location.reload(); }).catch(() => {}), 3000);
 });
-at("open-example").addEventListener("click", () => bring.example());
-onRefused(() => { at("door-wrong").hidden = !keyOf(); if (!at("door").open) at("door").showModal(); });
-at("forget").hidden = !keyOf();
-dark.addEventListener("change", () => { viewer?.background(ground()); beside.left?.background(ground()); repaint(); ask.bars(); });
+byId("open-example").addEventListener("click", () => uploads.example());
+onUnauthorized(() => { byId("door-wrong").hidden = !storedKey(); if (!byId("door").open) byId("door").showModal(); });
+byId("forget").hidden = !storedKey();
+darkScheme.addEventListener("change", () => { viewer?.background(stageColour()); comparison.left?.background(stageColour()); repaint(); query.drawBars(); });
 
-// For tests, and for the curious in the console.
-Object.assign(globalThis, { splatlift: { ask, look, bring, take, things, names, masks, hand, beside, get viewer() { return viewer; }, get lift() { return lift; }, label, COLOURS } });
+// For tests and for the console of the browser.
+Object.assign(globalThis, { splatlift: { query, layers, uploads, exporter, objects, labels, masks, editor, comparison, get viewer() { return viewer; }, get lift() { return lift; }, label: questionLabel, COLOURS } });
 
 async function begin() {
-  if (look.fallback) fallBack();
-  look.showLayer("rgb");
-  tab("ask");
+  if (layers.fallback) fallBack();
+  layers.showLayer("rgb");
+  showTab("ask");
   try {
-    const { changes } = await share.begin();
-    const known = await refreshLifts();
-    const wanted = started.get("lift") || known[0]?.id;
-    if (wanted) return await open(wanted);
-    busy = false;
-    if (changes) tab("bring");
-    else at("example-state").textContent = "There is no scene that your key may see. Ask whoever gave it to you.";
+    const { canWrite } = await share.readKey();
+    const list = await refreshLifts();
+    const id = startParameters.get("lift") || list[0]?.id;
+    if (id) return await open(id);
+    isOpening = false;
+    if (canWrite) showTab("bring");
+    else byId("example-state").textContent = "Your key gives access to no scene. Ask the owner of the key.";
   } catch (problem) {
-    if (problem.status !== 401) trouble(words(problem));
+    if (problem.status !== 401) showProblem(problemText(problem));
   }
 }
 

@@ -1,20 +1,20 @@
-// Splats in the colours of what is asked: scores lie in a texture, a row a splat, and the shader compares them with the
-// cut. A slider writes one number, whatever the scene's size.
+// Colours of splats by their scores. Scores are in a texture, a texel a splat, and the shader compares them with the
+// threshold, so a slider writes one number whatever the size of the scene.
 import * as THREE from "three";
 import { dyno } from "@sparkjsdev/spark";
 
-export const COLOURS = ["#ffb000", "#38b6ff", "#ff5fa2", "#54d67f", "#b48cff", "#ff7a45"]; // of questions, in turn
+export const COLOURS = ["#ffb000", "#38b6ff", "#ff5fa2", "#54d67f", "#b48cff", "#ff7a45"]; // of questions, by their order
 export const UNKNOWN = -0.999999; // splats without a feature score -1
 const STOPS = [[34, 20, 66], [64, 48, 132], [42, 105, 140], [36, 152, 122], [120, 194, 72], [251, 233, 96]];
-const WIDE = 2048; // texels of a row: every GPU has so many
-const TINT = 0.52; // how much of what was found is in its question's colour
-const SHADE = 0.82; // how much of the rest is in a dark grey of its own brightness
-const HEAT = 0.93;
-const UNDER = 0.6; // of a layer, when something is asked over it
+const TEXTURE_WIDTH = 2048; // texels of a row, within the limit of every GPU
+const TINT = 0.52; // share of the question's colour in a selected splat
+const SHADE = 0.82; // share of dark grey in the other splats
+const HEAT = 0.93; // share of the heat colour
+const LAYER_UNDER_QUERY = 0.6; // opacity of a layer below a question
 
-export const rgb = colour => [1, 3, 5].map(place => parseInt(colour.slice(place, place + 2), 16));
+export const rgb = colour => [1, 3, 5].map(index => parseInt(colour.slice(index, index + 2), 16));
 
-// The least 32-bit number that is not below a 64-bit one: scores pass it as they pass that.
+// The smallest float32 that is not below a float64: float32 scores pass both alike.
 const least = new Float32Array(1);
 const bits = new Int32Array(least.buffer);
 export function atLeast(cut) {
@@ -24,112 +24,112 @@ export function atLeast(cut) {
 }
 
 export class Painter {
-  // count: of drawn splats; rows: of the lift, as they are drawn, or null.
+  // count: number of drawn splats. rows: row of the lift for each drawn splat, or null if they are the same.
   constructor(count, rows) {
-    Object.assign(this, { count, rows, high: Math.ceil(count / WIDE), kept: [], shown: null });
+    Object.assign(this, { count, rows, textureRows: Math.ceil(count / TEXTURE_WIDTH), uploadedScores: [], layerColours: null });
     const uniform = (type, value, length) => new dyno.DynoUniform({ key: "value", type, count: length, value });
     this.scores = uniform("sampler2DArray", texture(new Float32Array(1), 1, 1, 1));
     this.layer = uniform("sampler2DArray", texture(new Uint8Array(4), 1, 1, 1));
-    this.asked = uniform("vec4", COLOURS.map(() => new THREE.Vector4()), COLOURS.length); // r g b and the cut
-    this.most = uniform("float", COLOURS.map(() => 1), COLOURS.length); // the highest score
-    this.state = uniform("vec4", new THREE.Vector4(0, 0, 0, -1)); // questions, cover of the layer, hide the rest, whose heat
-    this.warm = uniform("vec2", new THREE.Vector2(0, 1)); // scores of the ends of the heat
-    this.size = uniform("float", 1); // times a splat's own
-    this.modifier = dyno.dynoBlock({ gsplat: dyno.Gsplat }, { gsplat: dyno.Gsplat }, ({ gsplat }) => this.block(gsplat));
+    this.queryColours = uniform("vec4", COLOURS.map(() => new THREE.Vector4()), COLOURS.length); // r, g, b, threshold
+    this.maxScores = uniform("float", COLOURS.map(() => 1), COLOURS.length); // the highest score of each question
+    this.drawState = uniform("vec4", new THREE.Vector4(0, 0, 0, -1)); // number of questions, opacity of the layer, 1 to hide other splats, question shown as heat or -1
+    this.heatRange = uniform("vec2", new THREE.Vector2(0, 1)); // scores of the first and last heat colour
+    this.splatScale = uniform("float", 1); // factor of the size of a splat
+    this.modifier = dyno.dynoBlock({ gsplat: dyno.Gsplat }, { gsplat: dyno.Gsplat }, ({ gsplat }) => this.shader(gsplat));
   }
 
-  block(gsplat) {
-    const { scores, layer, asked, most, state, warm, size } = this;
-    const made = new dyno.Dyno({
-      inTypes: { gsplat: dyno.Gsplat, index: "int", scores: "sampler2DArray", layer: "sampler2DArray", asked: "vec4", most: "float", state: "vec4", warm: "vec2", size: "float" },
+  shader(gsplat) {
+    const { scores, layer, queryColours, maxScores, drawState, heatRange, splatScale } = this;
+    const node = new dyno.Dyno({
+      inTypes: { gsplat: dyno.Gsplat, index: "int", scores: "sampler2DArray", layer: "sampler2DArray", queryColours: "vec4", maxScores: "float", drawState: "vec4", heatRange: "vec2", splatScale: "float" },
       outTypes: { gsplat: dyno.Gsplat },
-      inputs: { gsplat, index: dyno.splitGsplat(gsplat).outputs.index, scores, layer, asked, most, state, warm, size },
+      inputs: { gsplat, index: dyno.splitGsplat(gsplat).outputs.index, scores, layer, queryColours, maxScores, drawState, heatRange, splatScale },
       globals: () => [dyno.defineGsplat, HEAT_MAP],
-      statements: ({ inputs: at, outputs: { gsplat: out } }) => `
-        ${out} = ${at.gsplat};
-        ${out}.scales *= ${at.size};
+      statements: ({ inputs, outputs: { gsplat: out } }) => `
+        ${out} = ${inputs.gsplat};
+        ${out}.scales *= ${inputs.splatScale};
         {
-          ivec2 cell = ivec2(${at.index} % ${WIDE}, ${at.index} / ${WIDE});
-          vec3 own = ${out}.rgba.rgb;
-          vec3 shown = own;
-          bool found = false;
-          if (${at.state}.y > 0.0) {
-            shown = mix(own, texelFetch(${at.layer}, ivec3(cell, 0), 0).rgb, ${at.state}.y);
-          } else if (${at.state}.x > 0.5) {
-            shown = mix(own, vec3(dot(own, vec3(0.3, 0.59, 0.11)) * 0.42 + 0.016), ${SHADE.toFixed(3)});
+          ivec2 cell = ivec2(${inputs.index} % ${TEXTURE_WIDTH}, ${inputs.index} / ${TEXTURE_WIDTH});
+          vec3 base = ${out}.rgba.rgb;
+          vec3 colour = base;
+          bool selected = false;
+          if (${inputs.drawState}.y > 0.0) {
+            colour = mix(base, texelFetch(${inputs.layer}, ivec3(cell, 0), 0).rgb, ${inputs.drawState}.y);
+          } else if (${inputs.drawState}.x > 0.5) {
+            colour = mix(base, vec3(dot(base, vec3(0.3, 0.59, 0.11)) * 0.42 + 0.016), ${SHADE.toFixed(3)});
           }
           float best = -1.0;
           for (int q = 0; q < ${COLOURS.length}; q++) {
-            if (float(q) + 0.5 > ${at.state}.x) break;
-            float score = texelFetch(${at.scores}, ivec3(cell, q), 0).r;
-            float cut = ${at.asked}[q].w;
-            float over = (score - cut) / max(${at.most}[q] - cut, 1e-9);
+            if (float(q) + 0.5 > ${inputs.drawState}.x) break;
+            float score = texelFetch(${inputs.scores}, ivec3(cell, q), 0).r;
+            float cut = ${inputs.queryColours}[q].w;
+            float over = (score - cut) / max(${inputs.maxScores}[q] - cut, 1e-9);
             if (score < cut || score <= ${UNKNOWN.toFixed(6)} || over <= best) continue;
             best = over;
-            found = true;
-            shown = mix(own, ${at.asked}[q].rgb, ${TINT.toFixed(3)});
+            selected = true;
+            colour = mix(base, ${inputs.queryColours}[q].rgb, ${TINT.toFixed(3)});
           }
-          if (${at.state}.w > -0.5) {
-            float score = texelFetch(${at.scores}, ivec3(cell, int(${at.state}.w + 0.5)), 0).r;
-            shown = mix(own, heatOf((score - ${at.warm}.x) / max(${at.warm}.y - ${at.warm}.x, 1e-9)), ${HEAT.toFixed(3)});
+          if (${inputs.drawState}.w > -0.5) {
+            float score = texelFetch(${inputs.scores}, ivec3(cell, int(${inputs.drawState}.w + 0.5)), 0).r;
+            colour = mix(base, heatColour((score - ${inputs.heatRange}.x) / max(${inputs.heatRange}.y - ${inputs.heatRange}.x, 1e-9)), ${HEAT.toFixed(3)});
           }
-          ${out}.rgba.rgb = shown;
-          if (!found) ${out}.rgba.a *= 1.0 - ${at.state}.z;
+          ${out}.rgba.rgb = colour;
+          if (!selected) ${out}.rgba.a *= 1.0 - ${inputs.drawState}.z;
         }`.split("\n"),
     });
-    return { gsplat: made.outputs.gsplat };
+    return { gsplat: node.outputs.gsplat };
   }
 
-  // questions: [{scores, cut, high, rgb}] that light up; the one that a splat passes by most has it. heat: one of
-  // them, whose scores are shown instead, or null. layer: {colours: u8 [P, 3], cover: 0..1} beneath, or null.
+  // questions: [{scores, cut, high, rgb}]; a splat has the colour of the question whose threshold it exceeds most. heat:
+  // {scores, low, high} to show as heat instead, or null. layer: {colours: u8 [P, 3], cover: 0..1} below, or null.
   paint(questions, { heat = null, layer = null, hide = false } = {}) {
-    const heated = heat ? questions.findIndex(({ scores }) => scores === heat.scores) : -1;
-    const lying = heat && heated < 0 ? [...questions, heat] : questions; // what is not clear has its heat all the same
-    this.lay(lying.map(({ scores }) => scores));
-    questions.forEach(({ cut, high, rgb: [r, g, b] }, place) => {
-      this.asked.value[place].set(r / 255, g / 255, b / 255, atLeast(cut));
-      this.most.value[place] = high;
+    const heatIndex = heat ? questions.findIndex(({ scores }) => scores === heat.scores) : -1;
+    const textures = heat && heatIndex < 0 ? [...questions, heat] : questions; // heat is shown also without a selection
+    this.uploadScores(textures.map(({ scores }) => scores));
+    questions.forEach(({ cut, high: textureRows, rgb: [r, g, b] }, index) => {
+      this.queryColours.value[index].set(r / 255, g / 255, b / 255, atLeast(cut));
+      this.maxScores.value[index] = textureRows;
     });
-    if (layer && this.shown !== layer.colours) this.layColours(layer.colours);
-    const cover = layer ? layer.cover * (questions.length ? UNDER : 1) : 0;
-    this.state.value.set(questions.length, cover, hide && questions.length ? 1 : 0, heat ? (heated < 0 ? questions.length : heated) : -1);
-    if (heat) this.warm.value.set(heat.low, heat.high);
+    if (layer && this.layerColours !== layer.colours) this.uploadColours(layer.colours);
+    const cover = layer ? layer.cover * (questions.length ? LAYER_UNDER_QUERY : 1) : 0;
+    this.drawState.value.set(questions.length, cover, hide && questions.length ? 1 : 0, heat ? (heatIndex < 0 ? questions.length : heatIndex) : -1);
+    if (heat) this.heatRange.value.set(heat.low, heat.high);
   }
 
-  widen(size) {
-    this.size.value = size;
+  setScale(size) {
+    this.splatScale.value = size;
   }
 
-  // Scores go to the GPU once, when they are new.
-  lay(all) {
+  // Copy new scores to the GPU.
+  uploadScores(scoreLists) {
     const { image } = this.scores.value;
-    const size = WIDE * this.high;
-    if (all.length && (image.depth < all.length || image.width !== WIDE)) {
+    const size = TEXTURE_WIDTH * this.textureRows;
+    if (scoreLists.length && (image.depth < scoreLists.length || image.width !== TEXTURE_WIDTH)) {
       this.scores.value.dispose();
-      this.scores.value = texture(new Float32Array(size * all.length), WIDE, this.high, all.length);
-      this.kept = [];
+      this.scores.value = texture(new Float32Array(size * scoreLists.length), TEXTURE_WIDTH, this.textureRows, scoreLists.length);
+      this.uploadedScores = [];
     }
-    all.forEach((scores, place) => {
-      if (this.kept[place] === scores) return;
-      this.kept[place] = scores;
+    scoreLists.forEach((scores, index) => {
+      if (this.uploadedScores[index] === scores) return;
+      this.uploadedScores[index] = scores;
       const { data } = this.scores.value.image;
-      if (this.rows) for (let drawn = 0; drawn < this.count; drawn += 1) data[size * place + drawn] = scores[this.rows[drawn]]; else data.set(scores, size * place);
-      this.scores.value.addLayerUpdate(place);
+      if (this.rows) for (let position = 0; position < this.count; position += 1) data[size * index + position] = scores[this.rows[position]]; else data.set(scores, size * index);
+      this.scores.value.addLayerUpdate(index);
       this.scores.value.needsUpdate = true;
     });
   }
 
-  layColours(colours) {
-    this.shown = colours;
-    const data = new Uint8Array(4 * WIDE * this.high);
-    for (let place = 0; place < this.count; place += 1) {
-      const from = 3 * (this.rows ? this.rows[place] : place);
-      data[4 * place] = colours[from];
-      data[4 * place + 1] = colours[from + 1];
-      data[4 * place + 2] = colours[from + 2];
+  uploadColours(colours) {
+    this.layerColours = colours;
+    const data = new Uint8Array(4 * TEXTURE_WIDTH * this.textureRows);
+    for (let index = 0; index < this.count; index += 1) {
+      const source = 3 * (this.rows ? this.rows[index] : index);
+      data[4 * index] = colours[source];
+      data[4 * index + 1] = colours[source + 1];
+      data[4 * index + 2] = colours[source + 2];
     }
     this.layer.value.dispose();
-    this.layer.value = texture(data, WIDE, this.high, 1);
+    this.layer.value = texture(data, TEXTURE_WIDTH, this.textureRows, 1);
   }
 
   dispose() {
@@ -139,17 +139,17 @@ export class Painter {
 }
 
 const HEAT_MAP = `
-vec3 heatOf(float share) {
+vec3 heatColour(float share) {
   vec3 stops[${STOPS.length}] = vec3[](${STOPS.map(stop => `vec3(${stop.map(value => (value / 255).toFixed(4)).join(", ")})`).join(", ")});
   float at = clamp(share, 0.0, 1.0) * ${(STOPS.length - 1).toFixed(1)};
   int low = min(int(at), ${STOPS.length - 2});
   return mix(stops[low], stops[low + 1], at - float(low));
 }`;
 
-function texture(data, width, high, depth) {
-  const made = new THREE.DataArrayTexture(data, width, high, depth);
-  made.format = data instanceof Float32Array ? THREE.RedFormat : THREE.RGBAFormat;
-  made.type = data instanceof Float32Array ? THREE.FloatType : THREE.UnsignedByteType;
-  made.needsUpdate = true;
-  return made;
+function texture(data, width, textureRows, depth) {
+  const result = new THREE.DataArrayTexture(data, width, textureRows, depth);
+  result.format = data instanceof Float32Array ? THREE.RedFormat : THREE.RGBAFormat;
+  result.type = data instanceof Float32Array ? THREE.FloatType : THREE.UnsignedByteType;
+  result.needsUpdate = true;
+  return result;
 }

@@ -1,54 +1,54 @@
-// Whose key this is, what it may do, and links that let others look at a scene and ask it.
-import { at, copied, el, notify, twice } from "./dom.js";
-import { json, post, remove, words } from "./service.js";
+// The owner and scopes of the key, and links that give others read access to a scene.
+import { byId, copyText, el, notify, confirmButton } from "./dom.js";
+import { fetchJson, post, remove, problemText } from "./service.js";
 
 const day = seconds => new Date(seconds * 1000).toLocaleDateString(undefined, { day: "numeric", month: "long", year: "numeric" });
 
-export class Share {
+export class SharePanel {
   constructor() {
     this.lift = null;
-    at("share").addEventListener("submit", event => { event.preventDefault(); this.make().catch(problem => notify(words(problem), true)); });
-    at("copy-share").addEventListener("click", () => copied(at("share-link").value));
+    byId("share").addEventListener("submit", event => { event.preventDefault(); this.createLink().catch(problem => notify(problemText(problem), true)); });
+    byId("copy-share").addEventListener("click", () => copyText(byId("share-link").value));
   }
 
-  // What the key may not do is hidden by the page's style.
-  async begin() {
-    const { name, scopes, expires } = await json("/key");
-    const changes = scopes.includes("write") || scopes.includes("admin");
-    document.body.classList.toggle("reader", !changes);
-    this.may = changes && name !== null; // without keys there is nobody to keep out
-    at("whose").hidden = name === null;
-    at("whose").textContent = scopes.includes("shared") ? `Shared with ${name}${expires ? ` until ${day(expires)}` : ""}` : name ?? "";
-    return { changes, shared: scopes.includes("shared") };
+  // Read the key. The style of the page hides controls that it does not permit.
+  async readKey() {
+    const { name, scopes, expires } = await fetchJson("/key");
+    const canWrite = scopes.includes("write") || scopes.includes("admin");
+    document.body.classList.toggle("reader", !canWrite);
+    this.canShare = canWrite && name !== null; // without keys the service is open
+    byId("whose").hidden = name === null;
+    byId("whose").textContent = scopes.includes("shared") ? `Shared with ${name}${expires ? ` until ${day(expires)}` : ""}` : name ?? "";
+    return { canWrite };
   }
 
-  async of(lift) {
+  async setLift(lift) {
     this.lift = lift;
-    at("sharing").hidden = !(this.may && lift);
-    at("share-made").hidden = true;
-    this.show([]);
-    if (!at("sharing").hidden) await this.list();
+    byId("sharing").hidden = !(this.canShare && lift);
+    byId("share-made").hidden = true;
+    this.listLinks([]);
+    if (!byId("sharing").hidden) await this.loadLinks();
   }
 
-  async list() {
+  async loadLinks() {
     const { id } = this.lift;
-    const { shares } = await json(`/lifts/${id}/shares`);
-    if (this.lift?.id === id) this.show(shares);
+    const { shares } = await fetchJson(`/lifts/${id}/shares`);
+    if (this.lift?.id === id) this.listLinks(shares);
   }
 
-  show(shares) {
-    at("shares").hidden = !shares.length;
-    at("shares").replaceChildren(...shares.map(({ name, expires, links }) => el("li", {},
+  listLinks(shares) {
+    byId("shares").hidden = !shares.length;
+    byId("shares").replaceChildren(...shares.map(({ name, expires, links }) => el("li", {},
       el("span", {}, name, expires ? el("small", { className: "quiet" }, ` until ${day(expires)}`) : ""),
-      twice("End it", () => remove(links.self).then(() => this.list())))));
+      confirmButton("Revoke", () => remove(links.self).then(() => this.loadLinks())))));
   }
 
-  async make() {
-    const { links } = await post(`/lifts/${this.lift.id}/shares`, { name: at("share-name").value.trim() });
-    at("share-link").value = new URL(links.page.replace(/^\//, ""), document.baseURI).href;
-    at("share-made").hidden = false;
-    at("share-name").value = "";
-    at("share-link").select();
-    await this.list();
+  async createLink() {
+    const { links } = await post(`/lifts/${this.lift.id}/shares`, { name: byId("share-name").value.trim() });
+    byId("share-link").value = new URL(links.page.replace(/^\//, ""), document.baseURI).href;
+    byId("share-made").hidden = false;
+    byId("share-name").value = "";
+    byId("share-link").select();
+    await this.loadLinks();
   }
 }

@@ -2,21 +2,21 @@
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
-import { still } from "./dom.js";
+import { prefersStill } from "./dom.js";
 import { Painter } from "./painter.js";
 
-const ROW = 32; // bytes of a splat in a .splat file
-export const MOST = 2_000_000; // splats that are drawn; of larger scenes every n-th is
-const FLIGHT = 700; // ms
-const LOADING = 60_000; // ms that the unpacking of a scene may take before the page says so
-const SAMPLE = 200_000; // splats among which middles are looked for
-const OPAQUE = 40; // of 255: fainter splats are not what somebody points at
-const FEWEST = 10_000; // splats that are drawn while something moves, however slow the machine is
-const SMOOTH = 60; // ms that a frame may take while something moves
-const REST = 250; // ms after the last change, until all splats are drawn
-const FRAMES = 4; // of which the fastest tells how fast the machine is: one may have been held up
-const WIDEST = 2; // times a splat's size, where it stands for others
-const COARSE = 0.5; // pixels a CSS pixel, where fewer splats are drawn
+const ROW_BYTES = 32; // bytes of a splat in a .splat file
+export const MAX_SPLATS = 2_000_000; // drawn splats; of a larger scene every n-th splat is drawn
+const FLIGHT_TIME = 700; // ms of a camera flight
+const UNPACK_TIMEOUT = 60_000; // ms after which the unpacking of a scene is an error
+const SAMPLE_SIZE = 200_000; // splats in the medians of centres
+const MIN_PICK_OPACITY = 40; // of 255; fainter splats cannot be picked
+const MIN_SPLATS = 10_000; // drawn splats during a motion, on the slowest machine
+const FRAME_BUDGET = 60; // ms of a frame during a motion
+const REST_DELAY = 250; // ms from the last change to a frame of all splats
+const TIMED_FRAMES = 4; // frames in the estimate of the speed; the fastest counts, as others may have been delayed
+const MAX_WIDENING = 2; // largest factor of the size of splats that are drawn for others
+const COARSE_RATIO = 0.5; // device pixels per CSS pixel while fewer splats are drawn
 const SOFTWARE = /swiftshader|llvmpipe|software|basic render/i; // renderers without a GPU
 
 export function webgl() {
@@ -28,21 +28,21 @@ export function webgl() {
 }
 
 export class Viewer {
-  // canvas: to draw on. seen: called after each frame with a function from a point of the world to its place in CSS pixels.
-  constructor(canvas, seen) {
+  // onFrame(project): called after each frame. project(point): a point of the world in CSS pixels.
+  constructor(canvas, onFrame) {
     this.canvas = canvas;
-    this.seen = seen;
+    this.onFrame = onFrame;
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, preserveDrawingBuffer: true, powerPreference: "high-performance" });
-    this.renderer.setPixelRatio(fine());
+    this.renderer.setPixelRatio(pixelRatio());
     this.scene = new THREE.Scene();
     this.camera = new THREE.PerspectiveCamera(50, 1, 0.01, 1000);
-    this.moved = () => {};
-    this.control();
+    this.onMove = () => {};
+    this.createControls();
     this.boxes = new THREE.Group();
     this.scene.add(this.boxes);
-    this.middle = new THREE.Vector3();
+    this.centre = new THREE.Vector3();
     this.origin = [0, 0, 0];
-    this.reach = 1;
+    this.extent = 1;
     this.spark = new SparkRenderer({
       renderer: this.renderer, preBlurAmount: 0.3, blurAmount: 0, sortRadial: false, maxStdDev: 3, minAlpha: 1 / 255,
       onDirty: () => this.draw(false),
@@ -50,8 +50,8 @@ export class Viewer {
     this.scene.add(this.spark);
     this.frames = 0;
     const gl = this.renderer.getContext();
-    const named = gl.getExtension("WEBGL_debug_renderer_info");
-    this.speeds = SOFTWARE.test(gl.getParameter(named ? named.UNMASKED_RENDERER_WEBGL : gl.RENDERER)) ? [FEWEST] : [Infinity];
+    const debugInfo = gl.getExtension("WEBGL_debug_renderer_info");
+    this.splatsPerFrame = SOFTWARE.test(gl.getParameter(debugInfo ? debugInfo.UNMASKED_RENDERER_WEBGL : gl.RENDERER)) ? [MIN_SPLATS] : [Infinity];
     new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
     this.resize();
   }
@@ -61,45 +61,45 @@ export class Viewer {
     if (!width || !height) return;
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
-    this.frame();
+    this.updateLens();
     this.draw();
   }
 
-  // Controls turn about the up vector that the camera has when they are made: another one needs others.
-  control() {
+  // OrbitControls read the up vector of the camera once, so a new up vector needs new controls.
+  createControls() {
     const target = this.controls?.target;
     this.controls?.dispose();
     const controls = this.controls = new OrbitControls(this.camera, this.canvas);
     if (target) controls.target.copy(target);
-    controls.enableDamping = !still();
+    controls.enableDamping = !prefersStill();
     controls.dampingFactor = 0.12;
     controls.zoomToCursor = true;
     controls.addEventListener("change", () => this.draw());
-    controls.addEventListener("start", () => { this.flight = null; this.steered = true; this.lead(); });
-    controls.addEventListener("end", () => this.moved());
+    controls.addEventListener("start", () => { this.flight = null; this.isSteered = true; this.takeLead(); });
+    controls.addEventListener("end", () => this.onMove());
   }
 
   upright(up) {
     if (this.camera.up.equals(up)) return;
     this.camera.up.copy(up);
-    this.control();
+    this.createControls();
   }
 
-  // One camera for two viewers: the one that was moved last leads.
+  // Share one camera with another viewer: both follow the one that was moved last.
   pair(partner) {
     this.partner = partner;
     partner.partner = this;
-    this.lead();
+    this.takeLead();
     this.draw();
   }
 
-  lead() {
+  takeLead() {
     if (!this.partner) return;
-    this.leads = true;
-    this.partner.leads = false;
+    this.isLeading = true;
+    this.partner.isLeading = false;
   }
 
-  // Another viewer's camera, in this one's frame.
+  // Take over the camera of another viewer, in the frame of this one.
   follow({ camera, controls, lens, origin }) {
     const shift = new THREE.Vector3(...origin.map((value, axis) => value - this.origin[axis]));
     const [position, target] = [camera.position.clone().add(shift), controls.target.clone().add(shift)];
@@ -109,7 +109,7 @@ export class Viewer {
     this.camera.position.copy(position);
     this.controls.target.copy(target);
     this.lens = lens;
-    this.frame();
+    this.updateLens();
     this.draw();
   }
 
@@ -118,79 +118,80 @@ export class Viewer {
     this.draw();
   }
 
-  // changed: by somebody, not by a sort that ended. A slow machine draws some of the splats then, and all of them at rest.
-  draw(changed = true) {
-    if (changed && this.mesh) {
-      const some = Math.min(this.count, Math.max(FEWEST, Math.round(Math.max(...this.speeds))));
-      this.thin(some);
-      this.rest(some < this.count);
+  // Request a frame. isChange: false if only a sort has ended. After a change a slow machine draws some of the splats first,
+  // and all of them at rest.
+  draw(isChange = true) {
+    if (isChange && this.mesh) {
+      const number = Math.min(this.count, Math.max(MIN_SPLATS, Math.round(Math.max(...this.splatsPerFrame))));
+      this.drawFirst(number);
+      this.drawAllLater(number < this.count);
     }
-    if (this.asked) return;
-    this.asked = requestAnimationFrame(now => {
-      this.asked = 0;
-      this.fly(now);
+    if (this.frameRequest) return;
+    this.frameRequest = requestAnimationFrame(now => {
+      this.frameRequest = 0;
+      this.stepFlight(now);
       this.controls.update();
-      if (this.leads) this.partner.follow(this);
+      if (this.isLeading) this.partner.follow(this);
       this.render();
       if (this.flight) this.draw();
     });
   }
 
-  // All splats, a while after the last change is on the screen.
-  rest(some) {
-    clearTimeout(this.resting);
-    this.resting = some && setTimeout(() => {
-      if (this.asked || this.timing || this.spark.sorting || this.spark.sortDirty) return this.rest(true);
-      this.resting = 0;
-      this.thin(this.count);
+  // Draw all splats once the last change is on the screen and REST_DELAY has passed.
+  drawAllLater(isThinned) {
+    clearTimeout(this.restTimer);
+    this.restTimer = isThinned && setTimeout(() => {
+      if (this.frameRequest || this.isTiming || this.spark.sorting || this.spark.sortDirty) return this.drawAllLater(true);
+      this.restTimer = 0;
+      this.drawFirst(this.count);
       return this.draw(false);
-    }, REST);
+    }, REST_DELAY);
   }
 
-  // The first so many splats, in their order of drawing, wider as they stand for the others.
-  thin(number) {
+  // Draw the first splats alone, widened to fill the gaps of the others.
+  drawFirst(number) {
     const { packedSplats } = this.mesh;
     if (packedSplats.numSplats === number) return;
     packedSplats.numSplats = number;
-    this.painter.widen(Math.min(WIDEST, Math.sqrt(this.count / number)));
+    this.painter.setScale(Math.min(MAX_WIDENING, Math.sqrt(this.count / number)));
     this.mesh.updateVersion();
   }
 
-  // Until so many splats as are to be drawn are sorted, what is on the screen stays. Spark sorts the first ones right only
-  // in a frame of its own.
+  // Keep the frame on the screen until Spark has sorted as many splats as are to be drawn; its first sort needs a frame of
+  // its own.
   render() {
     const { spark, scene, camera, mesh } = this;
     if (mesh && spark.display.numSplats && spark.display.numSplats !== mesh.packedSplats.numSplats) {
       camera.updateMatrixWorld();
-      spark.dirty = false; // or it does not say when they are
+      spark.dirty = false; // else Spark does not call onDirty
       spark.updateInternal({ scene, camera, autoUpdate: true });
       return;
     }
-    const begun = performance.now();
-    const ratio = mesh && spark.display.numSplats < this.count ? COARSE : fine();
+    const start = performance.now();
+    const ratio = mesh && spark.display.numSplats < this.count ? COARSE_RATIO : pixelRatio();
     if (this.renderer.getPixelRatio() !== ratio) this.renderer.setPixelRatio(ratio);
     this.renderer.render(scene, camera);
     this.frames += 1;
-    this.seen(point => this.place(point));
-    if (mesh) this.time(spark.display.numSplats, begun);
+    this.onFrame(point => this.project(point));
+    if (mesh) this.timeFrame(spark.display.numSplats, start);
   }
 
-  // Splats that are drawn smoothly, by what those of a frame took.
-  async time(number, begun) {
-    if (this.timing) return;
-    this.timing = true;
-    await this.drawn().finally(() => { this.timing = false; });
-    this.speeds = [...this.speeds.slice(1 - FRAMES), number * SMOOTH / (performance.now() - begun)];
+  // Estimate the splats of a frame within FRAME_BUDGET by the time of the last frames.
+  async timeFrame(number, start) {
+    if (this.isTiming) return;
+    this.isTiming = true;
+    await this.gpuDone().finally(() => { this.isTiming = false; });
+    this.splatsPerFrame = [...this.splatsPerFrame.slice(1 - TIMED_FRAMES), number * FRAME_BUDGET / (performance.now() - start)];
   }
 
-  // Whether all that was asked for is on the screen.
+  // True if the screen shows the last change with all splats.
   get settled() {
     const { activeSplats, sorting, sortDirty, dirty } = this.spark;
-    return Boolean(this.mesh) && !this.asked && !this.flight && !this.resting && this.spark.display.numSplats === this.count && activeSplats > 0 && !sorting && !sortDirty && !dirty;
+    return Boolean(this.mesh) && !this.frameRequest && !this.flight && !this.restTimer && this.spark.display.numSplats === this.count && activeSplats > 0 && !sorting && !sortDirty && !dirty;
   }
 
-  // Once the GPU has drawn all commands.
-  async drawn() {
+  // Wait until the GPU has finished all commands.
+  async gpuDone() {
     const gl = this.renderer.getContext();
     const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     gl.flush();
@@ -198,61 +199,62 @@ export class Viewer {
     gl.deleteSync(fence);
   }
 
-  // A point of the lift's frame in that of the splats, which are about an origin, and back: cards compute in float32.
-  local(point) {
+  // Points of the lift's frame in that of the drawn splats, and back. Splats are drawn relative to an origin, as GPUs
+  // compute in float32.
+  toLocal(point) {
     return new THREE.Vector3(...point.map((value, axis) => value - this.origin[axis]));
   }
 
-  world(point) {
+  toWorld(point) {
     return point.map((value, axis) => value + this.origin[axis]);
   }
 
-  // A view of the lift's frame among the splats.
+  // The camera axes of a view in the frame of the drawn splats.
   pose({ viewmat }) {
-    return poseOf(viewmat.slice(0, 3).map(row => [...row.slice(0, 3), row[3] + along(row, this.origin)]));
+    return poseOf(viewmat.slice(0, 3).map(row => [...row.slice(0, 3), row[3] + dotRow(row, this.origin)]));
   }
 
-  place(point) {
-    const there = this.local(point).project(this.camera);
+  project(point) {
+    const projected = this.toLocal(point).project(this.camera);
     const { clientWidth: width, clientHeight: height } = this.canvas;
-    return { x: (there.x + 1) / 2 * width, y: (1 - there.y) / 2 * height, before: there.z < 1 };
+    return { x: (projected.x + 1) / 2 * width, y: (1 - projected.y) / 2 * height, before: projected.z < 1 };
   }
 
   // Show the rows of a .splat file.
   async load(content) {
     this.clear();
-    this.total = content.length / ROW;
-    const step = Math.ceil(this.total / MOST);
+    this.total = content.length / ROW_BYTES;
+    const step = Math.ceil(this.total / MAX_SPLATS);
     this.rows = null;
-    if (this.total > FEWEST) {
-      this.rows = spread(Math.floor(this.total / step), step);
-      const whole = content.byteOffset % 4 ? content.slice() : content;
-      const words = new Uint32Array(whole.buffer, whole.byteOffset, whole.length / 4);
-      const drawn = new Uint32Array(this.rows.length * ROW / 4);
-      for (let place = 0; place < drawn.length; place += 1) drawn[place] = words[place % 8 + 8 * this.rows[place >> 3]];
-      content = new Uint8Array(drawn.buffer);
+    if (this.total > MIN_SPLATS) {
+      this.rows = spreadRows(Math.floor(this.total / step), step);
+      const aligned = content.byteOffset % 4 ? content.slice() : content;
+      const words = new Uint32Array(aligned.buffer, aligned.byteOffset, aligned.length / 4);
+      const subset = new Uint32Array(this.rows.length * ROW_BYTES / 4);
+      for (let index = 0; index < subset.length; index += 1) subset[index] = words[index % 8 + 8 * this.rows[index >> 3]];
+      content = new Uint8Array(subset.buffer);
     }
-    this.count = content.length / ROW;
+    this.count = content.length / ROW_BYTES;
     if (content.byteOffset % 4) content = content.slice();
     this.bytes = content;
     this.floats = new Float32Array(content.buffer, content.byteOffset, content.length / 4);
     const mesh = new SplatMesh({ fileBytes: content.slice(), fileName: "scene.splat", lod: false });
     let timer;
     await Promise.race([mesh.initialized, new Promise((_, reject) => {
-      timer = setTimeout(() => reject({ title: "The splats are not shown in 3D", detail: "this browser takes too long to unpack them; the photo view needs none" }), LOADING);
+      timer = setTimeout(() => reject({ title: "The splats are not shown in 3D", detail: "this browser needs too long to unpack them; use the photo view" }), UNPACK_TIMEOUT);
     })]).finally(() => clearTimeout(timer));
     this.painter = new Painter(this.count, this.rows);
     mesh.objectModifiers = [this.painter.modifier];
     mesh.updateGenerator();
     this.mesh = mesh;
     this.scene.add(mesh);
-    this.measure();
-    this.steered = false;
+    this.measureExtent();
+    this.isSteered = false;
     this.paint([]);
   }
 
-  // Splats of a file as it was dropped, before they are lifted, with the cameras that came with them.
-  async preview(content, name, views) {
+  // Draw a splat file before it is uploaded, with its cameras if there are any.
+  async showPreview(content, name, views) {
     this.clear();
     const mesh = new SplatMesh({ fileBytes: content, fileName: name, lod: false });
     await mesh.initialized;
@@ -260,28 +262,28 @@ export class Viewer {
     mesh.forEachSplat((_, centre) => { centres.push(centre.x, centre.y, centre.z, 0, 0, 0, 0, 0); });
     Object.assign(this, { origin: [0, 0, 0], draft: mesh, floats: centres, count: centres.length / 8 });
     this.scene.add(mesh);
-    this.measure();
-    this.frusta(views);
+    this.measureExtent();
+    this.drawFrusta(views);
     if (views.length) {
-      this.settle(views);
-      this.to(views[0], true);
+      this.orient(views);
+      this.goToView(views[0], true);
     } else {
       this.upright(new THREE.Vector3(0, -1, 0));
-      this.camera.position.copy(this.middle).add(new THREE.Vector3(0, -0.6, -2.4).multiplyScalar(this.reach));
-      this.controls.target.copy(this.middle);
+      this.camera.position.copy(this.centre).add(new THREE.Vector3(0, -0.6, -2.4).multiplyScalar(this.extent));
+      this.controls.target.copy(this.centre);
     }
     this.draw();
   }
 
-  // The outlines of what cameras see, from where they stand.
-  frusta(views) {
+  // Draw the frusta of cameras.
+  drawFrusta(views) {
     const points = [];
     for (const view of views) {
       const { position, right, up, forward } = this.pose(view);
-      const far = this.reach / 6;
+      const far = this.extent / 6;
       const corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([x, y]) => position.clone().addScaledVector(forward, far)
         .addScaledVector(right, x * far * view.width / 2 / view.fx).addScaledVector(up, y * far * view.height / 2 / view.fy));
-      corners.forEach((corner, place) => points.push(position, corner, corner, corners[(place + 1) % 4]));
+      corners.forEach((corner, index) => points.push(position, corner, corner, corners[(index + 1) % 4]));
     }
     this.cones = new THREE.LineSegments(new THREE.BufferGeometry().setFromPoints(points), new THREE.LineBasicMaterial({ color: 0xffb84d, depthTest: false, transparent: true, opacity: 0.7 }));
     this.cones.renderOrder = 10;
@@ -295,141 +297,141 @@ export class Viewer {
       this.cones.geometry.dispose();
       this.draft = null;
     }
-    clearTimeout(this.resting);
-    this.resting = 0;
+    clearTimeout(this.restTimer);
+    this.restTimer = 0;
     if (this.mesh) {
       this.scene.remove(this.mesh);
       this.mesh.dispose();
       this.painter.dispose();
       this.mesh = null;
     }
-    this.outline([]);
+    this.drawBoxes([]);
   }
 
-  // The middle of the scene and its reach, by the middle half of a sample on each axis: floaters count for nothing.
-  measure() {
-    const every = Math.max(1, Math.floor(this.count / 5000));
+  // Measure the centre and extent of the scene by the interquartile range of each axis, which ignores floaters.
+  measureExtent() {
+    const stride = Math.max(1, Math.floor(this.count / 5000));
     const axes = [[], [], []];
-    for (let row = 0; row < this.count; row += every) for (let axis = 0; axis < 3; axis += 1) axes[axis].push(this.floats[row * 8 + axis]);
-    const ends = axes.map(values => values.sort((a, b) => a - b)).map(v => [v[Math.floor(v.length / 4)], v[Math.floor(v.length / 2)], v[Math.floor(3 * v.length / 4)]]);
-    this.middle = new THREE.Vector3(...ends.map(end => end[1]));
-    this.reach = Math.max(...ends.map(end => end[2] - end[0]), 1e-6);
-    this.camera.near = this.reach / 500;
-    this.camera.far = this.reach * 500;
+    for (let row = 0; row < this.count; row += stride) for (let axis = 0; axis < 3; axis += 1) axes[axis].push(this.floats[row * 8 + axis]);
+    const quartiles = axes.map(values => values.sort((a, b) => a - b)).map(v => [v[Math.floor(v.length / 4)], v[Math.floor(v.length / 2)], v[Math.floor(3 * v.length / 4)]]);
+    this.centre = new THREE.Vector3(...quartiles.map(end => end[1]));
+    this.extent = Math.max(...quartiles.map(end => end[2] - end[0]), 1e-6);
+    this.camera.near = this.extent / 500;
+    this.camera.far = this.extent * 500;
     this.camera.updateProjectionMatrix();
   }
 
-  // The row of the file that is drawn at a place.
-  row(place) {
-    return this.rows ? this.rows[place] : place;
+  // The row of the lift of a drawn splat.
+  rowOf(index) {
+    return this.rows ? this.rows[index] : index;
   }
 
-  // Colours of what is asked, as `Painter` has it.
-  paint(questions, how) {
-    this.painter.paint(questions, how);
+  // Paint questions and layers, see Painter.paint.
+  paint(questions, options) {
+    this.painter.paint(questions, options);
     this.mesh.updateVersion();
     this.draw();
   }
 
-  // Which way is up, and what all the views look at. Cameras are seldom rolled: up is the mean of their own, but for
-  // what of it lies along their horizontal axes. The focus is the point nearest to their lines of sight.
-  settle(views) {
+  // Estimate the up vector and the focus of the views. Cameras are seldom rolled, so up is the mean of their up vectors
+  // without its part along their horizontal axes. The focus is the point nearest to their lines of sight.
+  orient(views) {
     const poses = views.map(view => this.pose(view));
     const mean = poses.reduce((sum, pose) => sum.add(pose.up), new THREE.Vector3());
-    this.up = mean.applyMatrix3(outer(poses.map(pose => pose.right), 1, 0.002 * poses.length).invert()).normalize();
+    this.up = mean.applyMatrix3(outerSum(poses.map(pose => pose.right), 1, 0.002 * poses.length).invert()).normalize();
     if (this.up.lengthSq() < 0.5) this.up.set(0, 0, 1);
     this.upright(this.up);
-    const across = outer(poses.map(pose => pose.forward), -1, poses.length); // sum of I - d d^T
-    const side = poses.reduce((sum, { position, forward }) => sum.add(position).addScaledVector(forward, -position.dot(forward)), new THREE.Vector3());
-    const found = Math.abs(across.determinant()) > 1e-6 * poses.length ** 3 ? side.applyMatrix3(across.invert()) : null;
-    const inFront = found && poses.filter(pose => found.clone().sub(pose.position).dot(pose.forward) > 0).length > poses.length / 2;
-    this.focused = Boolean(inFront);
-    this.focus = inFront ? found : this.middle.clone();
+    const normal = outerSum(poses.map(pose => pose.forward), -1, poses.length); // sum of I - d d^T
+    const rightSide = poses.reduce((sum, { position, forward }) => sum.add(position).addScaledVector(forward, -position.dot(forward)), new THREE.Vector3());
+    const point = Math.abs(normal.determinant()) > 1e-6 * poses.length ** 3 ? rightSide.applyMatrix3(normal.invert()) : null;
+    const inFront = point && poses.filter(pose => point.clone().sub(pose.position).dot(pose.forward) > 0).length > poses.length / 2;
+    this.hasFocus = Boolean(inFront);
+    this.focus = inFront ? point : this.centre.clone();
   }
 
-  // Angles of view: a photo is shown whole, whatever the window's shape.
-  frame() {
+  // Fit the field of view to the window: the full photo is visible.
+  updateLens() {
     const { halfWidth, halfHeight } = this.lens || { halfWidth: 0.5, halfHeight: 0.5 };
     this.camera.fov = 2 * Math.atan(Math.max(halfHeight, halfWidth / this.camera.aspect)) * 180 / Math.PI;
     this.camera.updateProjectionMatrix();
   }
 
-  to(view, quick) {
+  goToView(view, quick) {
     const pose = this.pose(view);
     const depth = this.focus.clone().sub(pose.position).dot(pose.forward);
-    const target = pose.position.clone().addScaledVector(pose.forward, depth > 0 ? depth : this.reach);
+    const target = pose.position.clone().addScaledVector(pose.forward, depth > 0 ? depth : this.extent);
     this.lens = { halfWidth: view.width / 2 / view.fx, halfHeight: view.height / 2 / view.fy };
-    this.frame();
+    this.updateLens();
     this.go(pose.position, target, quick);
   }
 
-  // Look at a box or a point: from where one is, or from a view that shows it. That view itself shows a box which no
-  // picture nearer by would hold.
+  // Fly to a box, from the direction of the camera or of a view that shows it. If the whole box is visible only from
+  // farther away than the view, fly to the view itself.
   toBox({ low, high }, view = null) {
-    const box = new THREE.Box3(this.local(low), this.local(high));
+    const box = new THREE.Box3(this.toLocal(low), this.toLocal(high));
     const sphere = box.getBoundingSphere(new THREE.Sphere());
-    const away = view ? this.pose(view).position.sub(sphere.center) : this.camera.position.clone().sub(this.controls.target);
-    const angle = this.camera.fov * Math.PI / 360;
-    const far = 1.9 * Math.max(sphere.radius, this.reach / 100) / Math.sin(Math.min(angle, Math.atan(Math.tan(angle) * this.camera.aspect)));
-    if (view && far > away.length()) return this.to(view);
-    this.go(sphere.center.clone().addScaledVector(away.normalize(), far), sphere.center);
+    const offset = view ? this.pose(view).position.sub(sphere.center) : this.camera.position.clone().sub(this.controls.target);
+    const halfFov = this.camera.fov * Math.PI / 360;
+    const distance = 1.9 * Math.max(sphere.radius, this.extent / 100) / Math.sin(Math.min(halfFov, Math.atan(Math.tan(halfFov) * this.camera.aspect)));
+    if (view && distance > offset.length()) return this.goToView(view);
+    this.go(sphere.center.clone().addScaledVector(offset.normalize(), distance), sphere.center);
   }
 
   toPoint(point) {
-    const back = this.camera.position.clone().sub(this.controls.target);
-    const near = 0.6 * this.camera.position.distanceTo(point);
-    this.go(point.clone().addScaledVector(back.normalize(), near), point);
+    const offset = this.camera.position.clone().sub(this.controls.target);
+    const distance = 0.6 * this.camera.position.distanceTo(point);
+    this.go(point.clone().addScaledVector(offset.normalize(), distance), point);
   }
 
-  go(position, target, quick = still()) {
-    this.lead();
+  go(position, target, quick = prefersStill()) {
+    this.takeLead();
     if (quick) {
       this.flight = null;
       this.camera.position.copy(position);
       this.controls.target.copy(target);
-      this.moved();
+      this.onMove();
     } else {
-      const from = { position: this.camera.position.clone(), target: this.controls.target.clone() };
-      this.flight = { from, position: position.clone(), target: target.clone(), begun: 0 };
+      const start = { position: this.camera.position.clone(), target: this.controls.target.clone() };
+      this.flight = { from: start, position: position.clone(), target: target.clone(), startTime: 0 };
     }
     this.draw();
   }
 
-  fly(now) {
+  stepFlight(now) {
     const flight = this.flight;
     if (!flight) return;
-    flight.begun ||= now;
-    const share = Math.min(1, (now - flight.begun) / FLIGHT);
+    flight.startTime ||= now;
+    const share = Math.min(1, (now - flight.startTime) / FLIGHT_TIME);
     const eased = share * share * (3 - 2 * share);
     this.controls.target.lerpVectors(flight.from.target, flight.target, eased);
     this.camera.position.lerpVectors(flight.from.position, flight.position, eased);
     if (share === 1) {
       this.flight = null;
-      this.moved();
+      this.onMove();
     }
   }
 
-  // By keyboard: turn by angles in radians, zoom by a factor.
-  turn(around, over) {
-    this.steered = true;
-    this.lead();
+  // Turn the camera by angles in radians, for keys.
+  turn(azimuth, polar) {
+    this.isSteered = true;
+    this.takeLead();
     const offset = this.camera.position.clone().sub(this.controls.target);
-    const turned = new THREE.Quaternion().setFromUnitVectors(this.camera.up, new THREE.Vector3(0, 1, 0));
-    const place = new THREE.Spherical().setFromVector3(offset.applyQuaternion(turned));
-    place.theta += around;
-    place.phi += over;
-    place.makeSafe();
-    offset.setFromSpherical(place).applyQuaternion(turned.invert());
+    const toYUp = new THREE.Quaternion().setFromUnitVectors(this.camera.up, new THREE.Vector3(0, 1, 0));
+    const spherical = new THREE.Spherical().setFromVector3(offset.applyQuaternion(toYUp));
+    spherical.theta += azimuth;
+    spherical.phi += polar;
+    spherical.makeSafe();
+    offset.setFromSpherical(spherical).applyQuaternion(toYUp.invert());
     this.camera.position.copy(this.controls.target).add(offset);
-    this.moved();
+    this.onMove();
     this.draw();
   }
 
   zoom(factor) {
-    this.steered = true;
-    this.lead();
+    this.isSteered = true;
+    this.takeLead();
     this.camera.position.sub(this.controls.target).multiplyScalar(factor).add(this.controls.target);
-    this.moved();
+    this.onMove();
     this.draw();
   }
 
@@ -437,61 +439,61 @@ export class Viewer {
     return [...this.camera.position.toArray(), ...this.controls.target.toArray()];
   }
 
-  // What lies under a place of the canvas: the splat nearest to where the ray ends, and that point. null: nothing.
+  // Pick the splat nearest to where the ray of a canvas position hits the splats: {splat, point, at}, or null.
   pick(x, y) {
     if (!this.mesh) return null;
-    this.mesh.context.numSplats.value = this.count; // also where fewer are drawn
+    this.mesh.context.numSplats.value = this.count; // also while fewer are drawn
     const { clientWidth: width, clientHeight: height } = this.canvas;
     const ray = new THREE.Raycaster();
     ray.setFromCamera(new THREE.Vector2(2 * x / width - 1, 1 - 2 * y / height), this.camera);
     const hit = ray.intersectObject(this.mesh)[0];
     if (!hit) return null;
     const { x: px, y: py, z: pz } = hit.point;
-    let best = -1;
-    let least = Infinity;
-    for (let place = 0; place < this.count; place += 1) {
-      const dx = this.floats[8 * place] - px;
-      const dy = this.floats[8 * place + 1] - py;
-      const dz = this.floats[8 * place + 2] - pz;
-      const far = dx * dx + dy * dy + dz * dz;
-      if (far < least && this.bytes[ROW * place + 27] >= OPAQUE) {
-        least = far;
-        best = place;
+    let nearest = -1;
+    let closest = Infinity;
+    for (let index = 0; index < this.count; index += 1) {
+      const dx = this.floats[8 * index] - px;
+      const dy = this.floats[8 * index + 1] - py;
+      const dz = this.floats[8 * index + 2] - pz;
+      const distance = dx * dx + dy * dy + dz * dz;
+      if (distance < closest && this.bytes[ROW_BYTES * index + 27] >= MIN_PICK_OPACITY) {
+        closest = distance;
+        nearest = index;
       }
     }
-    return best < 0 ? null : { splat: this.row(best), point: hit.point, at: this.world(hit.point.toArray()) };
+    return nearest < 0 ? null : { splat: this.rowOf(nearest), point: hit.point, at: this.toWorld(hit.point.toArray()) };
   }
 
-  // The middle of the splats of each value, from a value a row of the file: medians, as strays count for nothing.
-  centres(values, most) {
-    const rows = Array.from({ length: most + 1 }, () => []);
-    const every = Math.max(1, Math.floor(this.count / SAMPLE));
-    for (let place = 0; place < this.count; place += every) rows[values[this.row(place)]].push(place);
-    return rows.map(places => (places.length ? this.world([0, 1, 2].map(axis => {
-      const sorted = places.map(place => this.floats[8 * place + axis]).sort((a, b) => a - b);
+  // The centres of the splats of each value: medians, which ignore outliers. values: one for each row of the lift.
+  centres(values, maxValue) {
+    const rows = Array.from({ length: maxValue + 1 }, () => []);
+    const stride = Math.max(1, Math.floor(this.count / SAMPLE_SIZE));
+    for (let index = 0; index < this.count; index += stride) rows[values[this.rowOf(index)]].push(index);
+    return rows.map(indices => (indices.length ? this.toWorld([0, 1, 2].map(axis => {
+      const sorted = indices.map(index => this.floats[8 * index + axis]).sort((a, b) => a - b);
       return sorted[sorted.length >> 1];
     })) : null));
   }
 
-  // This camera as the service draws it, in a picture so many pixels wide at most.
-  own(most) {
+  // This camera as the service takes it, for a picture of at most maxWidth pixels.
+  cameraRequest(maxWidth) {
     const { clientWidth, clientHeight } = this.canvas.parentElement;
-    const width = Math.min(clientWidth, most);
+    const width = Math.min(clientWidth, maxWidth);
     const height = Math.round(clientHeight * width / clientWidth);
-    this.camera.lookAt(this.controls.target); // the controls do it before the next frame
+    this.camera.lookAt(this.controls.target); // as the controls do before the next frame
     this.camera.updateMatrixWorld();
-    const m = this.camera.matrixWorldInverse.elements; // column by column, OpenGL's axes
+    const m = this.camera.matrixWorldInverse.elements; // columns, OpenGL axes
     const viewmat = [0, 1, 2, 3].map(row => [0, 1, 2, 3].map(column => (row === 1 || row === 2 ? -1 : 1) * m[4 * column + row]));
-    for (const row of viewmat.slice(0, 3)) row[3] -= along(row, this.origin);
+    for (const row of viewmat.slice(0, 3)) row[3] -= dotRow(row, this.origin);
     return { width, height, fx: height / 2 / Math.tan(this.camera.fov * Math.PI / 360), viewmat };
   }
 
-  // Boxes of things: [{low, high, colour, strong}].
-  outline(boxes) {
+  // Draw boxes of objects: [{low, high, colour, strong}].
+  drawBoxes(boxes) {
     for (const line of this.boxes.children) line.geometry.dispose();
     this.boxes.clear();
     for (const { low, high, colour, strong } of boxes) {
-      const box = new THREE.Box3(this.local(low), this.local(high));
+      const box = new THREE.Box3(this.toLocal(low), this.toLocal(high));
       const line = new THREE.Box3Helper(box, new THREE.Color(colour));
       Object.assign(line.material, { depthTest: false, transparent: true, opacity: strong ? 1 : 0.45 });
       line.renderOrder = 10;
@@ -500,43 +502,43 @@ export class Viewer {
     this.draw();
   }
 
-  // The canvas, once all splats are on it.
-  async whole() {
+  // Wait until all splats are drawn, and return the canvas.
+  async completeCanvas() {
     while (this.mesh && !this.settled) await new Promise(later => setTimeout(later, 50));
     this.renderer.render(this.scene, this.camera);
     return this.canvas;
   }
 }
 
-const fine = () => Math.min(devicePixelRatio, 1.5);
+const pixelRatio = () => Math.min(devicePixelRatio, 1.5);
 
-// Every so many rows, in an order whose first ones, however many, are spread evenly over all: steps of the golden ratio.
-function spread(count, step) {
-  const common = (one, other) => (other ? common(other, one % other) : one);
+// Every step-th of the rows, in steps of the golden ratio, so that the first n rows are spread evenly for every n.
+function spreadRows(count, step) {
+  const greatestDivisor = (a, b) => (b ? greatestDivisor(b, a % b) : a);
   let stride = Math.round(count * (Math.sqrt(5) - 1) / 2);
-  while (common(count, stride) > 1) stride += 1;
+  while (greatestDivisor(count, stride) > 1) stride += 1;
   const rows = new Uint32Array(count);
-  for (let place = 0; place < count; place += 1) rows[place] = place * stride % count * step;
+  for (let index = 0; index < count; index += 1) rows[index] = index * stride % count * step;
   return rows;
 }
 
-// OpenCV's axes: x right, y down, z forward.
+// Position and axes of a camera from its world-to-camera matrix, OpenCV axes: x right, y down, z forward.
 function poseOf(m) {
   const position = new THREE.Vector3(...[0, 1, 2].map(axis => -(m[0][axis] * m[0][3] + m[1][axis] * m[1][3] + m[2][axis] * m[2][3])));
   return { position, right: new THREE.Vector3(m[0][0], m[0][1], m[0][2]), forward: new THREE.Vector3(m[2][0], m[2][1], m[2][2]), up: new THREE.Vector3(-m[1][0], -m[1][1], -m[1][2]) };
 }
 
-// The first three numbers of a row times a point.
-function along(row, point) {
+// The dot product of the first three numbers of a row and a point.
+function dotRow(row, point) {
   return row[0] * point[0] + row[1] * point[1] + row[2] * point[2];
 }
 
-// sign * sum of v v^T + ridge * I, of vectors of the world.
-function outer(vectors, sign, ridge) {
+// The matrix sign * sum of v v^T + ridge * I of world vectors.
+function outerSum(vectors, sign, ridge) {
   const { elements } = new THREE.Matrix3().multiplyScalar(ridge);
   for (const vector of vectors) {
     const v = vector.toArray();
-    for (let place = 0; place < 9; place += 1) elements[place] += sign * v[Math.floor(place / 3)] * v[place % 3];
+    for (let index = 0; index < 9; index += 1) elements[index] += sign * v[Math.floor(index / 3)] * v[index % 3];
   }
   return new THREE.Matrix3().fromArray(elements);
 }
