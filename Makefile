@@ -89,7 +89,6 @@ lint: $(READY)
 format: $(READY)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
-	$(BIN)/python -m tests.wording --write
 
 serve: $(READY)
 	$(BIN)/splatlift serve

@@ -37,8 +37,8 @@ from service.state import AppState, Readiness, Stopping
 from service.store.store import Collector, Store
 from service.supervisor import JobLimits, Supervisor
 
-PLACES = 4  # requests that may begin at the same time
-TURN_SECONDS = 0.05  # many times longer than the event loop needs for one request
+SLOTS = 4  # requests that run at the same time in their first SLOT_SECONDS
+SLOT_SECONDS = 0.05  # then a request gives its slot to the next; many times what the event loop needs for one
 PROBES = frozenset({"/healthz", "/readyz"})
 PATH_CHARACTERS = 200  # of a path in the log
 # Headers that pages of other sites may send and read, beside those that CORS always allows
@@ -54,23 +54,23 @@ SAFE_HEADERS = {
 }
 
 
-def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, worker: QueryClient) -> FastAPI:
-    """Return the application. It starts and stops the runner and the worker; the caller closes the store."""
+def create_app(settings: ServiceSettings, store: Store, supervisor: Supervisor, query_client: QueryClient) -> FastAPI:
+    """Return the application. It starts and stops the supervisor and the query process, not the store."""
 
     threads = anyio.CapacityLimiter
     streams, build = EventStreams(settings.max_streams, settings.key_streams), versions(settings.commit)
-    stopping = Stopping(streams, runner, notice_seconds=settings.notice_seconds)
-    metrics = Metrics(store, worker, streams, build)
-    readiness = Readiness(store, runner, worker, stopping)
-    runner.on_attempt_finished(metrics.attempted)
-    worker.on_call_finished(metrics.queried)
+    stopping = Stopping(streams, supervisor, notice_seconds=settings.notice_seconds)
+    metrics = Metrics(store, query_client, streams, build)
+    readiness = Readiness(store, supervisor, query_client, stopping)
+    supervisor.on_attempt_finished(metrics.attempted)
+    query_client.on_call_finished(metrics.queried)
     collector = Collector(store, settings)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         app.state.deps = deps = AppState(
             settings=settings, version=build, store=store, caller=ANONYMOUS,
-            runner=runner, queries=worker,
+            supervisor=supervisor, query_client=query_client,
             streams=streams, photos=PhotoIndexes(), metrics=metrics, readiness=readiness,
             checks=threads(settings.parallel_checks),  # uploads validated at the same time
             planning=threads(1),  # plans, separate from uploads
@@ -79,16 +79,16 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
             ordering=threads(2),  # lift orders: each compares all names in its assets, which takes memory
             scrapes=threads(1),  # the metrics
         )  # fmt: skip
-        await anyio.to_thread.run_sync(revive)
-        await anyio.to_thread.run_sync(worker.start)
-        await anyio.to_thread.run_sync(runner.start)
+        await anyio.to_thread.run_sync(revive)  # starts the process from which upload checks are forked
+        await anyio.to_thread.run_sync(query_client.start)
+        await anyio.to_thread.run_sync(supervisor.start)
         collector.start()
         try:
             yield
         finally:
             deps.ending.set()
             streams.close()
-            for part in (collector, runner, worker):
+            for part in (collector, supervisor, query_client):
                 await anyio.to_thread.run_sync(part.stop)
 
     app = RecordedApp(
@@ -97,11 +97,11 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
         description="Lift 2D features onto trained splat scenes and query them in words.",
         lifespan=lifespan,
         responses=problems.RESPONSES,
-        openapi_url=None,  # `service.routes.operations` serves it, with keys, outside the event loop
+        openapi_url=None,  # `service.routes.operations` serves it, with keys, and builds it in a thread
         redirect_slashes=False,
         generate_unique_id_function=lambda route: route.name,  # clients name their functions by it
     )
-    app.state.readers = settings.cors_origins
+    app.state.cors_origins = settings.cors_origins
     app.state.stopping, app.state.metrics, app.state.documents = stopping, metrics, operations.Documents(app)
     app.add_middleware(AnswerHead)
     app.add_middleware(AuthMiddleware, keys=store.keys, settings=settings, stopping=lambda: stopping.has_begun)
@@ -114,7 +114,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
 
 
 def assemble(settings: ServiceSettings, store: Store) -> FastAPI:
-    """Return the application with the default runner and query worker."""
+    """Return the application with the default supervisor of jobs and query process."""
     return create_app(settings, store, Supervisor(store, job_limits(settings)), QueryClient(query_limits(settings)))
 
 
@@ -151,13 +151,13 @@ def job_limits(settings: ServiceSettings) -> JobLimits:
 class RecordedApp(FastAPI):
     """Record requests outside all other middleware, so that answers to unexpected errors are recorded too.
 
-    ``state.metrics`` and ``state.readers`` (origins of other sites) must be set before the first request.
+    ``state.metrics`` and ``state.cors_origins`` (origins of other sites) must be set before the first request.
     """
 
     def build_middleware_stack(self) -> ASGIApp:
         """Return the default stack within the recorder; CORS applies to refusals too."""
         stack: ASGIApp = super().build_middleware_stack()
-        if readers := self.state.readers:
+        if readers := self.state.cors_origins:
             stack = CrossOriginPages(
                 stack, readers, ("GET", "HEAD", "POST"), CORS_HEADERS,
                 allow_credentials=False, expose_headers=CORS_EXPOSED,
@@ -232,7 +232,7 @@ class Recorder:
         with working_for(request_id):
             try:
                 await self._app(scope, receive_counted, send_marked)
-            except asyncio.CancelledError:  # by the server, whose time for stopping is over
+            except asyncio.CancelledError:  # the server cancels open requests when its stop timeout ends
                 if status:
                     raise
                 error = ServiceUnavailable(
@@ -275,29 +275,29 @@ def _describe_caller(scope: Scope) -> dict[str, Any]:
 class ConcurrencyLimit:
     """Limit the requests that begin at the same time, so that the event loop stays responsive.
 
-    Probes bypass the limit. A request that takes longer than `TURN_SECONDS` waits for a query, a disk or its client:
+    Probes bypass the limit. A request that takes longer than `SLOT_SECONDS` waits for a query, a disk or its client:
     it gives its slot to the next one.
     """
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
-        self._places = anyio.Semaphore(PLACES)
+        self._slots = anyio.Semaphore(SLOTS)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on when a slot is free."""
         if scope["type"] != "http" or scope["path"] in PROBES:
             await self._app(scope, receive, send)
             return
-        await self._places.acquire()
+        await self._slots.acquire()
         is_holding = True
 
         def give_up() -> None:
             nonlocal is_holding
             if is_holding:
                 is_holding = False
-                self._places.release()
+                self._slots.release()
 
-        timer = asyncio.get_running_loop().call_later(TURN_SECONDS, give_up)
+        timer = asyncio.get_running_loop().call_later(SLOT_SECONDS, give_up)
         try:
             await self._app(scope, receive, send)
         finally:

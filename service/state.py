@@ -146,8 +146,8 @@ class AppState:
     version: Version
     store: Store
     caller: Caller
-    runner: Supervisor
-    queries: QueryClient
+    supervisor: Supervisor
+    query_client: QueryClient
     streams: EventStreams
     photos: PhotoIndexes
     metrics: Metrics

@@ -91,7 +91,7 @@ class LiftSteps(Protocol[Weights]):
         """Solve for X [P, F] in closed form; given clusters, prepare their features for `aggregate`."""
         ...
 
-    def refine(self, W: Weights, X: Tensor, visible: np.ndarray) -> tuple[Tensor, dict[str, Any]]:
+    def solve_least_squares(self, W: Weights, X: Tensor, visible: np.ndarray) -> tuple[Tensor, dict[str, Any]]:
         """Refine X of the ``visible`` [P] bool splats by the settings' least squares; return its facts too."""
         ...
 

@@ -176,7 +176,7 @@ class InMemory(LiftSteps[SceneWeights]):
             W.row_sums(), W.geometry.total_weight(), solution.agreement, confidence
         )
 
-    def refine(self, W: SceneWeights, X: Tensor, visible: np.ndarray) -> tuple[Tensor, dict[str, Any]]:
+    def solve_least_squares(self, W: SceneWeights, X: Tensor, visible: np.ndarray) -> tuple[Tensor, dict[str, Any]]:
         settings, progress, books, facts = self.settings, self.timings.progress, W.geometry.books, dict[str, Any]()
         views = W.views
 

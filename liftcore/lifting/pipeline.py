@@ -36,7 +36,8 @@ from liftcore.values.settings import LiftSettings, Preset
 
 log = logging.getLogger(__name__)
 
-MIN_LEVEL_VIEWS = 6  # for separate levels: 4 views lost a word of a small scene, 8 gained; 5 to 7 are untested
+# Least views to reweight levels separately: a small scene lost a word with 4 views, gained with 8; 5 to 7 untested.
+MIN_LEVEL_VIEWS = 6
 
 
 @default_modes()
@@ -140,7 +141,7 @@ def _run(
     facts = dict[str, Any]()
     if settings.cg_steps or settings.reference_channels:
         with timings.stage("rays"):
-            X, least_squares = steps.refine(W, X, support.sums > 0)
+            X, least_squares = steps.solve_least_squares(W, X, support.sums > 0)
         facts |= least_squares
     if settings.smoothness:
         with timings.stage("smooth"):
@@ -233,12 +234,12 @@ def diagnose(
     dtype: torch.dtype,
     support: SplatSupport,
     measures: ViewMeasures,
-    steps: Mapping[str, Mapping[str, Any]],
+    step_facts: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, Any]:
     """Return the diagnostics of the lift, ready for JSON.
 
     Args:
-        dtype: of X. steps: the facts of optional steps, by their names.
+        dtype: of X. step_facts: the facts of optional steps, by their names.
     """
     plan, settings = statistics.plan, inputs.settings
     facts: dict[str, Any] = {
@@ -249,9 +250,9 @@ def diagnose(
         "views_without_splats": list(statistics.blind),
     }
     warnings = lift_warnings(inputs.splats, inputs.views.lifted, support.sums, settings.dtype, dtype, facts)
-    warnings += [part["warning"] for part in steps.values() if "warning" in part]
+    warnings += [part["warning"] for part in step_facts.values() if "warning" in part]
     facts["warnings"] = [*warnings, *plan.input_warnings]
-    return compute_diagnostics(measures, support.sums, support.total_weight, settings) | dict(steps) | facts
+    return compute_diagnostics(measures, support.sums, support.total_weight, settings) | dict(step_facts) | facts
 
 
 @default_modes()
@@ -286,7 +287,7 @@ def plan(
 
 
 class WarningLog:
-    """A logger of each warning once, for lifts without ``on_plan``: few programs read the diagnostics."""
+    """Log each warning once. For lifts without ``on_plan``: few programs read the warnings in the diagnostics."""
 
     def __init__(self) -> None:
         self._previous = set[str]()

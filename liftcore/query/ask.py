@@ -23,10 +23,10 @@ from liftcore.query.presence import (
     any_present,
     best_splats,
     estimate_presence,
-    pack_of,
     products,
     references_of,
     references_of_space,
+    small_table_of,
 )
 from liftcore.query.question import (
     Answer,
@@ -80,9 +80,9 @@ class ResolvedQuery:
     query: Query
     rows: np.ndarray  # [n, F] f32, the unit direction of each term
     by_cosine: np.ndarray  # [n] bool, the terms that are compared by uncentred cosines: words
-    references: References | str  # of the words' space, or the reason why there are none
+    references: References | str  # of the text space; or a sentence why there are none, "" if no positive is a word
     asked_as: Mapping[int, Wording]  # of the texts, by their indices among the terms
-    pack: np.ndarray | None = None  # [n, F] f32, unit, all words of a table that has too few to be references
+    small_table: np.ndarray | None = None  # [n, F] f32, unit: all words of a table that has too few to be references
     candidates: tuple[Candidate, ...] = ()  # nodes that clicks among the terms may mean
     part: PartQuery | None = None  # of a phrase that names a part of an object
     unknown_part: PartPhrase | None = None  # a part for which there is no word, so that the object is selected
@@ -129,9 +129,10 @@ class VectorAnswer:
 def ask(scene: OpenedLift, query: Query | str, encoder: TextEncoder | None = None) -> Answer:
     """Score every splat for a query and select those that answer it.
 
-    A splat counts in the histogram by its total weight, as splats hit by few rays have noisy scores. It is still
-    selected by its score. With ``weight_by`` its confidence counts, too. The threshold `auto` is compared with other
-    words, and objects of the region graph may be selected as a whole (`liftcore.query.selection`). Any other
+    The threshold `auto` comes from a histogram of scores, in which each splat counts by its total weight, as splats
+    hit by few rays have noisy scores; ``weight_by="confidence"`` multiplies it by the confidence. The selection uses
+    the score alone. The threshold is compared with other words, and objects of the region graph may be selected
+    as a whole (`liftcore.query.selection`). Any other
     threshold selects by the score alone. Scores that are all equal or zero select nothing. Absent words
     (`liftcore.query.presence`) are left out of the scores, and without another positive nothing is selected, unless
     the query keeps absent words. The presence of negatives and examples is not estimated.
@@ -189,9 +190,9 @@ def query_vectors(
         reference_words = references_of(reader, scene.metadata.text_space)
     else:
         reference_words = references_of_space(rows, scene.metadata.text_space)
-    pack = None if reader is None else pack_of(reader)
+    small_table = None if reader is None else small_table_of(reader)
     answer = answers(
-        scene, [ResolvedQuery(query, rows, np.ones(len(rows), np.bool_), reference_words, asked_as, pack)]
+        scene, [ResolvedQuery(query, rows, np.ones(len(rows), np.bool_), reference_words, asked_as, small_table)]
     )[0]
     scores, selected = map(torch.from_numpy, (answer.scores, answer.selected))
     groups = objects(scene, answer) if grouped else None
@@ -241,7 +242,8 @@ def _resolve(
 ) -> ResolvedQuery:
     """Resolve a query as a whole, or for the part that a phrase names.
 
-    An encoder of any text encodes the phrase, which is more specific than the part's word alone.
+    A table has no vector for "the mug's handle", so the part's word is used. Any other encoder encodes the whole
+    phrase, which is more specific.
     """
     words = np.array([isinstance(term, str) for term in query.terms], np.bool_)
     asked_as = wordings(scene, query, encoder, names)
@@ -250,12 +252,12 @@ def _resolve(
     rows = directions(scene, query, encoder, names, asked_as)
     if phrase is not None:
         asked_as = asked_as | {0: Wording(query.text[0], str(phrase), "part")}
-    scene.splat_weights(query.weight_by)
+    scene.splat_weights(query.weight_by)  # raises InvalidQuery now if the lift has no confidence
     encoder = encoder or scene.table
     if encoder is None or not words[: len(query.positives)].any():
         return ResolvedQuery(query, rows, words, "", asked_as, candidates=candidates(scene, query))
     return ResolvedQuery(
-        query, rows, words, references_of(encoder, scene.metadata.text_space), asked_as, pack_of(encoder)
+        query, rows, words, references_of(encoder, scene.metadata.text_space), asked_as, small_table_of(encoder)
     )
 
 
@@ -368,9 +370,8 @@ def _answer(scene: OpenedLift, request: ResolvedQuery, similarities: np.ndarray)
     nodes = request.candidates
     if request.unknown_part is not None and selected.any():
         nodes = parts_of(scene, objects_within(scene, selected))
-        sentence = presence.reason.replace(
-            repr(query.text[0]), repr(request.unknown_part.object_phrase)
-        )  # the object is there, the part may not be
+        # The part has no word, so the reason names the object that was selected.
+        sentence = presence.reason.replace(repr(query.text[0]), repr(request.unknown_part.object_phrase))
         presence = presence.model_copy(
             update={"reason": f"{sentence} {_without_word(request.unknown_part, len(nodes))}"}
         )
@@ -435,7 +436,8 @@ def _select(
     """Return the threshold of a query and the selected splats, [P] bool.
 
     Args:
-        mask: [n] bool, the terms that count. scores: [P] f32. weights: [P] f32 of the splats.
+        mask: [n] bool, the terms that take part in the scores. scores: [P] f32. weights: [P] f32, total weight, or
+            that times confidence.
     """
     query, positives = request.query, len(request.query.positives)
     valid_scores = scores if scene.all_seen else scores[scene.seen]
@@ -463,7 +465,7 @@ def _select(
         )
         selected = scene.seen & (scores >= np.float32(value))
     threshold = threshold.model_copy(update={"clear": threshold.clear and comparison.first >= LEAST_FIRST})
-    if competitors[-1].nearer_limit == 0:
+    if competitors[-1].nearer_limit == 0:  # a small table: splats nearer to another of its words are not selected
         selected = nearest_to_query(scene, selected, competitors[-1])
     parts = part_nodes(scene, competitors[0])
     if parts:
@@ -479,14 +481,14 @@ def _select(
 
 
 def _competing_words(request: ResolvedQuery, directions: np.ndarray) -> list[CompetingWords]:
-    """Return the words that compete with the positives [p, F]: reference words, then the others of a pack."""
+    """Return the words that compete with the positives [p, F]: reference words, then the others of a small table."""
     if not len(directions):
         return []
     competitors = (
         [CompetingWords.among(request.references, directions)] if isinstance(request.references, References) else []
     )
-    if request.pack is not None:
-        competitors.append(CompetingWords.of_pack(request.pack, directions))
+    if request.small_table is not None:
+        competitors.append(CompetingWords.of_small_table(request.small_table, directions))
     return [words for words in competitors if len(words.vectors)]
 
 

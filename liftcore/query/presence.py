@@ -259,7 +259,7 @@ def references_of_space(vectors: np.ndarray, text_space: str) -> References | st
     return f"Whether it is there is not known: {space} has no reference words here; {remedy}."
 
 
-def pack_of(encoder: TextEncoder) -> np.ndarray | None:
+def small_table_of(encoder: TextEncoder) -> np.ndarray | None:
     """Return all words of a table that has too few to be references, [n, F] f32, unit; None for another encoder.
 
     They compete with each other: the table's author distinguishes these words and no others.

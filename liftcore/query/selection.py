@@ -64,8 +64,8 @@ class CompetingWords:
         return cls(directions, references.vectors[rows], max(limits))
 
     @classmethod
-    def of_pack(cls, vectors: np.ndarray, directions: np.ndarray) -> CompetingWords:
-        """Return the words [n, F] of a pack that are not the query's words [p, F] and differ from them in meaning."""
+    def of_small_table(cls, vectors: np.ndarray, directions: np.ndarray) -> CompetingWords:
+        """Return the words [n, F] of a small table that differ from the query's words [p, F] in meaning."""
         competitors = cls.among(References(("",) * len(vectors), vectors), directions)
         is_own = (competitors.vectors @ directions.T >= SAME_WORD).any(axis=1)
         return cls(directions, competitors.vectors[~is_own], 0)

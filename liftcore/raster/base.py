@@ -26,7 +26,7 @@ class RayRows:
     """Rows of A for single rays, sparse."""
 
     indptr: Tensor  # [n + 1] i64, CSR row pointers
-    splats: Tensor  # [nnz] i32, near to far
+    splats: Tensor  # [nnz] i32, near to far; in ascending order by the reference
     weights: Tensor  # [nnz] f32
 
 

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 CUT_BAND = 1e-4  # relative distance to a cut-off within which float32 may fall on its other side
 EDGE_BAND = 1e-4  # the same for selections: relative for weights, pixels for centres
-_HORIZON_BAND = 1e-6  # around a disc's horizon, in depth of the centre / depth of the crossing
+_HORIZON_BAND = 1e-6  # a ray is ambiguous if centre depth / crossing depth is this near to 0: parallel to the disc
 _SUPPORT_BAND = 1e-5  # of sigma = 1
 _STEEPEST = 16.0  # d alpha / d log(sigma) from which the rounding of sigma to float32 shows in the fifth digit
 
@@ -49,7 +49,7 @@ _STEEPEST = 16.0  # d alpha / d log(sigma) from which the rounding of sigma to f
 def camera_axes(splats: Splats, j: int, camera: Camera) -> np.ndarray:
     """Return the scaled axes [3, K] f64 of splat j in the camera's frame: K = 3, or 2 for 2DGS.
 
-    A scale of zero is the limit of small scales: a disc that degenerates to a line keeps its plane.
+    Log scales are limited from below, so a scale of zero is a tiny positive one: a disc that is a line has a normal.
     """
     scales = np.exp(splats.log_scales[j].double().numpy().clip(min=-MAX_LOG_SCALE))
     return camera.viewmat[:3, :3] @ rotation_matrices(splats.quats[j].numpy())[:, : len(scales)] * scales
@@ -70,8 +70,9 @@ def camera_depths(splats: Splats, camera: Camera) -> np.ndarray:
 def projected_gaussian(splats: Splats, j: int, camera: Camera) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the mean [2] in pixels, conic [2, 2] and opacity compensation of splat j.
 
-    EWA: cov = J W Sigma W^T J^T + 0.3 I. The determinant is a sum of squares over pairs of axes (Cauchy-Binet), as
-    products of long axes cancel. The compensation is ``sqrt(det(cov) / det(cov + 0.3 I))``.
+    EWA: cov = J R Sigma R^T J^T with R the rotation from world to camera; the conic is the inverse of cov + 0.3 I
+    (LOW_PASS). det(cov) is a sum of squares over pairs of axes (Cauchy-Binet), as products of long axes cancel. The
+    compensation is ``sqrt(det(cov) / det(cov + 0.3 I))``.
     """
     x, y, z = camera_mean(splats, j, camera)
     mean = np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
@@ -112,7 +113,10 @@ def alphas(
 
 
 def disc_exponents(splats: Splats, j: int, camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``g = min(s^2 + t^2, 2 |p - mu|^2)`` [R] of disc j, and the rays [R] bool near its horizon.
+    """Return ``g`` [R] of disc j, with alpha = opacity exp(-g / 2), and the rays [R] bool near its horizon.
+
+    ``g = min(s^2 + t^2, 2 |p - mu|^2)`` with p the pixel, mu the projected centre in pixels, and (s, t) the crossing
+    in the disc's axes. The second term is the low-pass of 2DGS, which keeps small discs visible.
 
     ``h_u = p_x w - u``, ``h_v = p_y w - v``, ``z = h_u x h_v``, ``s = z_x / z_z``, ``t = z_y / z_z``, with the rows
     u, v, w of the homography from (s, t, 1) to the image. A crossing must lie in front of the camera; a disc seen
@@ -141,19 +145,19 @@ def _above_the_floor(raw: np.ndarray, hard: np.ndarray) -> tuple[np.ndarray, np.
     return np.where(raw < ALPHA_FLOOR, 0.0, raw), hard | near
 
 
-def _beta_kernel(opacity: float, sigma: np.ndarray, beta: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``o (1 - sigma)^beta`` where sigma < 1, and the ambiguous rays: where it is steep or has a jump.
+def _beta_kernel(opacity: float, sigma: np.ndarray, falloff: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``o (1 - sigma)^falloff`` where sigma < 1, and the ambiguous rays: where alpha is steep or has a jump.
 
     Values below the smallest normal float32 are zero in every backend.
     """
     inside = sigma < 1
     within = np.where(inside, sigma, 0.0)
     logarithm = np.log1p(-within)
-    with np.errstate(invalid="ignore", over="ignore"):  # an infinite beta leaves the point sigma = 0
-        exponent = np.where(within > 0, -beta * logarithm / np.log(2.0), 0.0)
-        steep = opacity * beta * within * np.exp((beta - 1) * logarithm)
+    with np.errstate(invalid="ignore", over="ignore"):  # with an infinite exponent only sigma = 0 has an alpha
+        exponent = np.where(within > 0, -falloff * logarithm / np.log(2.0), 0.0)
+        steep = opacity * falloff * within * np.exp((falloff - 1) * logarithm)
     raw = np.where(inside & (exponent < LARGEST_EXPONENT), opacity * np.exp2(-exponent), 0.0)
-    jump = (beta < 1) & (np.abs(sigma - 1) < _SUPPORT_BAND)
+    jump = (falloff < 1) & (np.abs(sigma - 1) < _SUPPORT_BAND)
     return raw, (steep > _STEEPEST) | jump | (np.abs(exponent / LARGEST_EXPONENT - 1) < _SUPPORT_BAND)
 
 
@@ -356,7 +360,7 @@ class ReferenceRaster:
         """Do nothing: no view is cached."""
 
     def ray_rows(self, camera: Camera, pixels: Tensor, params: CompositingParams) -> RayRows:
-        """Return rows of the dense A (in row order, not in depth order)."""
+        """Return rows of the dense A. Unlike other backends, splats are in order of their rows, not near to far."""
         A = dense_view(self.splats, camera, params).A
         rows = A[(pixels[:, 1] * camera.width + pixels[:, 0]).numpy()]
         ray, splats = np.nonzero(rows)

@@ -4,9 +4,9 @@ On the CPU `liftcore.solve.shared_rows` computes the sums, on a device torch's `
 row in a fixed order, so the result is bitwise identical for any number of threads. A product with a sparse tensor
 would use cuSPARSE's default algorithm, and ``index_add_`` atomic sums: neither has a fixed order.
 
-Weights are divided by their sum before the product with the codebook: a mean cannot overflow if its inputs do not,
-and faint splats keep their precision. float32 adds LONG terms one by one; longer bags, of a splat with a million
-regions, are sums of partial sums: added one by one, ten million equal terms would be wrong in their first digit.
+Weights are divided by their sum before the product with the codebook. So a mean cannot overflow if its inputs do not,
+and faint splats keep their precision. At most LONG terms of a splat are added one by one in float32; more terms are
+added in pieces of LONG, as a plain float32 sum of ten million equal terms is wrong in its first digit.
 """
 
 from collections.abc import Callable
@@ -31,7 +31,9 @@ DEVICE_ROWS, DEVICE_ENTRIES = 1 << 16, 1 << 24  # of a block on a device; halved
 LEAST_ROWS = 256  # of a block that is not halved further
 CONCURRENT_BLOCKS = 4  # on a device: copying a block to X takes longer than its sums
 
-Sums = Callable[[Tensor], tuple[Tensor, Tensor]]  # of rows [n] i64: means of vectors and of unit ones, [n, C] f32
+BlockMeans = Callable[
+    [Tensor], tuple[Tensor, Tensor]
+]  # rows [n] i64 -> means of vectors, of unit vectors, [n, C] f32
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,8 @@ def solve(
     Args:
         W: of all views, with a row for every splat, on any device.
         dtype: of X; float16 becomes float32 if the codebooks are too large or too small for it.
-        means: [P, 3] of the splats: neighbours, which read the same rows, are solved together. None: in their order.
+        means: [P, 3] f32, centres of the splats: neighbours read the same codebook rows, so they are solved in one
+            block. None solves in the order of the rows.
         threads: of the CPU. None uses the cores that this process may use. The result is bitwise identical for any.
         device: of the sums; X is returned on the CPU.
         memory: bytes above which X is stored in a mapped file; None for no limit.
@@ -111,18 +114,18 @@ def solve_rows(
         units = None if codebook.unit or inverse is not None else codebook.unit_values(channels, device.place)
 
         if device.kind == "cpu":
-            sums_of = _sums_by_processor(W, scale, table, units, inverse)
+            means_of = _means_on_cpu(W, scale, table, units, inverse)
         else:
-            sums_of = _sums_by_device(W, scale, table, units, inverse)
+            means_of = _means_on_device(W, scale, table, units, inverse)
 
-        def solve_block(first: int, last: int, sums_of: Sums = sums_of, channels: slice = channels) -> None:
+        def solve_block(first: int, last: int, means_of: BlockMeans = means_of, channels: slice = channels) -> None:
             block_rows = rows[first:last]
-            sums, unit_sums = sums_of(block_rows)
+            block_means, unit_means = means_of(block_rows)
             block_rows = block_rows.cpu()
-            X[:, channels].index_copy_(0, block_rows, sums.to(X.dtype).cpu())
+            X[:, channels].index_copy_(0, block_rows, block_means.to(X.dtype).cpu())
             if unit is not None:
-                unit[:, channels].index_copy_(0, block_rows, unit_sums.cpu())
-            squares[block_rows] += torch.linalg.vector_norm(unit_sums, dim=1).double().square().cpu()
+                unit[:, channels].index_copy_(0, block_rows, unit_means.cpu())
+            squares[block_rows] += torch.linalg.vector_norm(unit_means, dim=1).double().square().cpu()
 
         if device.kind == "cpu":
             run_each(solve_block, blocks, threads)
@@ -135,54 +138,62 @@ def solve_rows(
     return squares
 
 
-def _sums_by_processor(
+def _means_on_cpu(
     W: RegionWeights, scale: Tensor, table: Tensor, units: Tensor | None, inverse: Tensor | None
-) -> Sums:
-    """Return a function that sums rows of W on the CPU."""
+) -> BlockMeans:
+    """Return a function for the means of rows of W, on the CPU.
+
+    Args:
+        scale: [P] f64, 1 / row sum. table: [M, C] f32. units: [M, C] f32, unit rows of the table. inverse: [M] f32,
+            inverse lengths of its rows. At most one of the two is given; neither if the rows have unit length.
+    """
     indptr, region, weight, scales = (part.cpu().numpy() for part in (W.indptr, W.region, W.weight, scale))
     flat, width, none = flat_table(table), table.shape[1], np.empty(0, np.float32)
     flat_units = None if units is None else flat_table(units)
-    lengths = none if inverse is None else inverse.numpy()
+    inverse_lengths = none if inverse is None else inverse.numpy()
 
-    def sum_table(rows: np.ndarray, table: np.ndarray, lengths: np.ndarray = none) -> Tensor:
+    def sum_table(rows: np.ndarray, table: np.ndarray, inverse_lengths: np.ndarray = none) -> Tensor:
         sums = np.empty((rows.size, width), np.float32)
-        sum_rows(*[rows, indptr, region, weight, scales, lengths, table, width, sums])
+        sum_rows(*[rows, indptr, region, weight, scales, inverse_lengths, table, width, sums])
         return torch.from_numpy(sums)
 
-    def sums_of(block_rows: Tensor) -> tuple[Tensor, Tensor]:
+    def means_of(block_rows: Tensor) -> tuple[Tensor, Tensor]:
         rows = block_rows.cpu().numpy()
-        sums = sum_table(rows, flat)
+        means = sum_table(rows, flat)
         if flat_units is not None:
-            return sums, sum_table(rows, flat_units)
-        return sums, sums if inverse is None else sum_table(rows, flat, lengths)
+            return means, sum_table(rows, flat_units)
+        return means, means if inverse is None else sum_table(rows, flat, inverse_lengths)
 
-    return sums_of
+    return means_of
 
 
-def _sums_by_device(
+def _means_on_device(
     W: RegionWeights, scale: Tensor, table: Tensor, units: Tensor | None, inverse: Tensor | None
-) -> Sums:
-    """Return a function that sums rows of W, on any device, on the device of the table."""
+) -> BlockMeans:
+    """Return a function for the means of rows of W on the device of the table; arguments as of `_means_on_cpu`.
+
+    W may be on any device.
+    """
     place = table.device
 
-    def sums_of(block_rows: Tensor) -> tuple[Tensor, Tensor]:
+    def means_of(block_rows: Tensor) -> tuple[Tensor, Tensor]:
         starts, entries = W.take(block_rows)
         scales = scale[block_rows].repeat_interleave(starts.diff(), output_size=entries.shape[0])
         shares = (W.weight.index_select(0, entries) * scales).float().to(place)
         region, starts = W.region.index_select(0, entries).to(place), starts.to(place)
         del entries, scales
-        sums = bag_sums(region, table, starts, shares)
+        means = bag_sums(region, table, starts, shares)
         if units is not None:
-            return sums, bag_sums(region, units, starts, shares)
+            return means, bag_sums(region, units, starts, shares)
         if inverse is not None:
-            return sums, bag_sums(region, table, starts, shares.mul_(inverse.index_select(0, region)))
-        return sums, sums
+            return means, bag_sums(region, table, starts, shares.mul_(inverse.index_select(0, region)))
+        return means, means
 
-    return sums_of
+    return means_of
 
 
 def bag_sums(index: Tensor, table: Tensor, starts: Tensor, shares: Tensor | None = None) -> Tensor:
-    """Return ``sum_k shares[k] table[index[k]]`` over bags, k in ``starts[b]..starts[b + 1]``: [B, C] f32.
+    """Return ``sum_k shares[k] table[index[k]]`` of each bag b, k in ``starts[b]..starts[b + 1]``: [B, C] f32.
 
     Args:
         index: [n] i32 or i64. table: [M, C] f32. starts: [B + 1] i64. shares: [n] f32; None for ones.

@@ -38,12 +38,15 @@ TIKHONOV_GAIN = 1.2  # lambda of the paper's Tikhonov Guidance (App. Tikhonov, l
 VISIBLE_WEIGHT = 0.05  # a splat that weighs less at its centre is hidden there, or hardly there at all
 NO_MASKS = "grids, or maps without a label"
 _MAX_TEXT = 80  # characters of a wrong value in an error
-DIRECTIONS = 256  # that lose nothing on masks; 128 cost .0025 of mask IoU where views are few (docs/results.md)
+DIRECTIONS = 256  # no loss with masks; 128 lower the mask IoU by .0025 with few views (docs/results.md)
 NEAREST = 3  # settings that are named where one is unknown
 
 
 class Preset(StrEnum):
-    """Choice of weights: the default, which trusts no single mask, or a published one, on the same rasterization."""
+    """Named groups of settings: `default` is this project's method, which tolerates wrong masks.
+
+    The others are published methods, which differ in the weights of a ray that count.
+    """
 
     DEFAULT = "default"  # row-sum, reweighted by mask consensus, by region reliability and by view consistency
     ROW_SUM = "row-sum"  # x_j = sum w b / sum w, Eq. 6
@@ -100,7 +103,8 @@ _SPEEDS: dict[Speed, dict[str, Any]] = {
 }
 
 
-MOST_DIAGNOSTIC_RAYS = 1_000_000  # of a new lift: ten millions of one view took 8 GB
+# Limit of a new lift: 10 million rays of one view took 8 GB. The field allows more, as older lift files have it.
+MOST_DIAGNOSTIC_RAYS = 1_000_000
 
 
 GROUPS = {  # of the settings, for people who read all of them
@@ -240,22 +244,27 @@ class LiftSettings(PlainModel):
     )
     aggregation_guard: bool = Field(
         False,
-        description="with a robust step: a splat takes its cluster's feature only where that explains what views "
-        "say of it as well as its own",
+        description="with a robust step: a splat takes its cluster's feature only if this agrees with the splat's "
+        "views at least as well as the splat's own feature",
     )
     aggregation_iou: float = Field(
         0.75,
         gt=0,
         le=1,
-        description="from which IoU with the silhouette of its cluster a region is kept; rays with a row sum "
-        "below a half are in no silhouette",
+        description="a region is kept if its IoU with the silhouette of its cluster is at least this; rays with a "
+        "row sum below a half are in no silhouette",
     )
-    aggregation_cluster_size: int = Field(500, ge=2, le=10_000_000, description="splats at least in a cluster")
+    aggregation_cluster_size: int = Field(
+        500, ge=2, le=10_000_000, description="the least number of splats in a cluster"
+    )
     aggregation_neighbours: int = Field(
         10, ge=1, le=1_000, description="neighbours that the density at a splat depends on (HDBSCAN's `min_samples`)"
     )
     aggregation_sample: int = Field(
-        10_000, ge=2, le=50_000, description="splats that HDBSCAN sees; the others join the nearest cluster"
+        10_000,
+        ge=2,
+        le=50_000,
+        description="number of sampled splats that HDBSCAN clusters; every other splat joins the nearest cluster",
     )
     aggregation_resolve: bool = Field(
         False,
@@ -278,11 +287,11 @@ class LiftSettings(PlainModel):
     )
     smoothness: Annotated[float, Field(ge=0, le=1e6)] | Literal["auto"] = Field(
         0.0,
-        description="lambda of the term that draws the features of splats near in place and colour together: 0 is "
-        "off; `auto` takes the strength that halves of the views ask for, off among them. A strength "
-        "of your own loses on maps that vary within objects. Edges between objects of masks are weakened. "
-        "`splatlift refine` does it to a lift that is there, with a number and without its masks. On a GPU it "
-        "runs on the CPU. Refused with an `engine`, and with `aggregation_resolve`",
+        description="strength of the smoothing over splats that are near in place and in colour: 0 is off; `auto` "
+        "compares lifts of even and odd views and takes the best strength, or none. A large number loses accuracy "
+        "where features vary within an object. Edges between regions of masks are smoothed less. `splatlift refine` "
+        "smooths a finished lift, with a number and without masks. It runs on the CPU, also with `device=cuda`. "
+        "Refused with an `engine`, and with `aggregation_resolve`",
     )
     cg_steps: int = Field(
         0,
@@ -308,8 +317,8 @@ class LiftSettings(PlainModel):
         0,
         ge=0,
         le=1_024,
-        description="let the diagnostics search for that optimum, in this many random projections of the channels: "
-        "up to 100 such steps for every 32",
+        description="compare the lift with the least-squares optimum in the diagnostics, in this many random "
+        "projections of the channels: up to 100 conjugate gradient steps for every 32",
     )
     kernel: Literal["auto", "3dgs", "2dgs", "dbs"] = Field(
         "auto",
@@ -331,17 +340,15 @@ class LiftSettings(PlainModel):
         preset, speed = values.get("preset", Preset.DEFAULT), values.get("speed", Speed.EXACT)
         weights = _PRESETS[Preset(preset)] if isinstance(preset, str) and preset in set(Preset) else {}
         effort = _SPEEDS[Speed(speed)] if isinstance(speed, str) and speed in set(Speed) else {}
-        if values.get("robust_steps") in (
-            0,
-            "0",
-        ):  # settings that need a step are off without it, unless they are set
+        if values.get("robust_steps") in (0, "0"):  # drop the preset's settings that need a step; a caller's own stay
             weights = {name: value for name, value in weights.items() if name not in _REWEIGHTED}
         settings = handler({**weights, **effort, **values})
         settings.model_fields_set.intersection_update(values)  # set by the caller; they stay when the preset changes
         return settings
 
     @model_validator(mode="after")
-    def _resolves_whole_regions(self) -> Self:
+    def _check_combinations(self) -> Self:
+        """Refuse combinations of settings that contradict each other."""
         if self.aggregation_resolve and self.levels == "composite":
             requirement = (
                 "other levels than composite, which cut to pieces the regions that aggregation_resolve drops"
@@ -362,7 +369,7 @@ class LiftSettings(PlainModel):
             requirement = (
                 "robust_steps of 1 or more beside reliability, consensus and aggregation_guard, which need a step"
             )
-            raise PydanticCustomError("whole_regions", "{expected}", {"expected": requirement})
+            raise PydanticCustomError("needs_robust_step", "{expected}", {"expected": requirement})
         return self
 
     def __repr__(self) -> str:
@@ -420,7 +427,7 @@ class LiftSettings(PlainModel):
 
     @property
     def weighs_rows(self) -> bool:
-        """True if each row of a codebook needs weights of its own: what reads them counts no tuples of rows."""
+        """True if W needs a column for each region; else levels may share one for each distinct tuple of labels."""
         by_settings = self.robust_steps or self.loss == "huber" or self.aggregation_resolve or self.objects is True
         return bool(by_settings or self.clusters_by_masks)
 
@@ -459,6 +466,7 @@ class LiftSettings(PlainModel):
         """
         requested = [name for name in ("cg_steps", "reference_channels", "smoothness") if getattr(self, name)]
         if self.aggregation and not self.clusters_by_masks:
+            # aggregation_clusters is never empty: without clusters by masks HDBSCAN makes them, which no engine does
             requested += [name for name in ("aggregation_clusters", "aggregation_resolve") if getattr(self, name)]
         unsupported = [f"{name}={getattr(self, name)}" for name in requested]
         if self.aggregation and self.clusters_by_masks and not masks:
@@ -478,7 +486,7 @@ class LiftSettings(PlainModel):
             )
 
     def _compositing(self, opacity_logit_scale: float) -> CompositingParams:
-        antialiased = self.antialiased is True  # before `for_splats`, auto is that of splats without metadata
+        antialiased = self.antialiased is True  # `for_splats` replaces "auto" by the file's mode; before, it is False
         return CompositingParams(opacity_logit_scale, self.alpha_cap, self.transmittance_stop, antialiased)
 
     @staticmethod
@@ -539,9 +547,8 @@ class LiftSettings(PlainModel):
             InvalidSettings: an unknown name, or a value of another type or out of range.
         """
         normalised = {name: int(value) if _is_whole(value) else value for name, value in values.items()}
-        text = json.dumps(normalised, ensure_ascii=False).encode(
-            "utf-8", "replace"
-        )  # half a surrogate pair is no setting
+        # A lone surrogate cannot be encoded: it becomes "?", which is refused as an unknown value.
+        text = json.dumps(normalised, ensure_ascii=False).encode("utf-8", "replace")
         return cls._build_checked(lambda: cls.model_validate_json(text, strict=True))
 
     @classmethod

@@ -107,7 +107,7 @@ def _planned(order: models.LiftRequest, deps: AppState) -> models.Plan:
     settings = LiftSettings.of_json(order.settings).model_dump(mode="json")
     job_order = JobOrder(order.splats, order.cameras, tuple(order.features), settings)
     _require_fit(job_order, deps)
-    deps.queries.require_device(job_order.settings.get("device", "auto"))
+    deps.query_client.require_device(job_order.settings.get("device", "auto"))
     splats, cameras, *packs = [deps.store.assets.get(deps.owner, *asset) for asset in job_order.assets()]
     document = {
         "splats": str(splats.path), "cameras": str(cameras.path), "features": [str(pack.path) for pack in packs],
@@ -160,9 +160,9 @@ def _take(
     job, new = deps.store.jobs.find_repeated(deps.owner, job_order), False
     if job is None:
         _require_fit(job_order, deps)
-        deps.queries.require_device(job_order.settings.get("device", "auto"))
+        deps.query_client.require_device(job_order.settings.get("device", "auto"))
         job, new = deps.store.jobs.submit(deps.owner, job_order, max_queued=deps.settings.max_queued)
-        deps.runner.wake()
+        deps.supervisor.wake()
     return _reply(deps.store.jobs.get(deps.owner, job), 202 if new else 200)
 
 

@@ -42,13 +42,14 @@ from service.state import AppState, Deps
 from service.store.assets import kernel_of
 from service.store.lifts import LiftRecord
 
-# Requests to the query process: requests with the files of a lift and an encoder, and answers with a tag
+# Build requests for the query process, and turn its answers into HTTP responses with an entity tag
 
+# Upper estimates, to check the free disk before the query process writes
 EXPORT_BYTES = 16  # of a splat's labels
 ROW_BYTES, SCORE_BYTES = 32, 4  # of a splat in the .splat format, and in an array
-NUMBER_BYTES = 24  # of a number in JSON, at most
+NUMBER_BYTES = 24  # of a number in JSON
 NO_ENCODER: dict[str, Any] = {"encoder": None, "encoder_version": None}  # of a question without words
-REGION, SELECTION = "region:", "selection:"  # prefixes of terms that need the lift's packs, or a selection of it
+REGION, SELECTION = "region:", "selection:"  # prefixes of examples that need the lift's packs, or a stored selection
 NPY_TYPE, PNG_TYPE, JSON_TYPE = "application/x-npy", "image/png", "application/json"
 MEDIA_TYPES = {
     **dict.fromkeys(("scores", "selection", "layer", "word_labels"), NPY_TYPE),
@@ -59,19 +60,19 @@ MEDIA_TYPES = {
 }
 
 
-# The body is read before this listens, as both listen to the client.
+# FastAPI reads the body before this dependency runs. Both call request.receive(): else the body would be lost.
 async def query_process(request: Request, deps: Deps) -> AsyncIterator[Callable[[dict[str, Any]], Frame]]:
-    """Yield a function that calls the query process; if the client disconnects, a waiting query is dropped."""
+    """Yield a function that sends a request to the query process; if the client disconnects, a waiting one ends."""
     waiter = Waiter(deps.caller.key or "")
 
     async def listen() -> None:
         while (await request.receive())["type"] != "http.disconnect":
             pass
-        deps.queries.cancel(waiter)
+        deps.query_client.cancel(waiter)
 
     listening = asyncio.create_task(listen())
     try:
-        yield lambda worker_request: deps.queries.call(worker_request, waiter)
+        yield lambda worker_request: deps.query_client.call(worker_request, waiter)
     finally:
         listening.cancel()
 
@@ -101,10 +102,7 @@ def tagged_answer(
 def binary_response(
     deps: AppState, worker_request: dict[str, Any], lift: LiftRecord, ask: Ask, headers: dict[str, str]
 ) -> Response:
-    """Run a request in the query process and return its bytes.
-
-    Large answers are streamed from a file, so that slow clients keep none in memory.
-    """
+    """Return the answer. The query process writes a large one to a draft, so that a slow client keeps no memory."""
     files, name, size = deps.store.files, None, 0
     match worker_request["operation"]:
         case "splats":
@@ -181,7 +179,7 @@ def _selects(example: object) -> bool:
 
 
 def bits_of(bits: bytes) -> str:
-    """Return the splats of a selection for the query process."""
+    """Return the packed booleans of a selection as base64 text."""
     return base64.b64encode(bits).decode()
 
 
@@ -219,10 +217,10 @@ def _with_packs_here(request: dict[str, Any], lift: LiftRecord, deps: AppState) 
 def with_encoder(
     request: dict[str, Any], parameters: models.LiftQuestion | models.NodesRequest, lift: LiftRecord, deps: AppState
 ) -> dict[str, Any]:
-    """Add the encoder of its words to a request: an uploaded table, the lift's, or one of the operator.
+    """Return the request with the encoder of its words: an uploaded table, the lift's, or one of the operator.
 
     Raises:
-        InvalidRequest: there is none of the lift's space, or of two names.
+        InvalidRequest: no encoder of the lift's text space is set up, or both a table and an encoder are named.
         NotFound: there is no such table.
     """
     names, table_id = dict(request["names"]), parameters.table
@@ -323,7 +321,7 @@ def query_attention(parameters: Question, request: Request, deps: Deps, ask: Ask
     return _entity("attention", parameters, request, deps, ask, seen_from(parameters))
 
 
-SPLATS_OF = "the splats that were found and no others, or all splats in the colours of their scores"
+SPLATS_OF = "`object`: the selected splats, of all objects; `scores`: all splats in the colours of their scores"
 SplatsOf = Annotated[Literal["object", "scores"], Parameter(description=SPLATS_OF)]
 
 
@@ -335,12 +333,12 @@ def query_splats(parameters: Question, request: Request, deps: Deps, ask: Ask, w
 
 @get_and_post(router, "/render", PICTURE, responses=PNG, response_class=Response)
 def render(parameters: RenderRequest, request: Request, deps: Deps, ask: Ask) -> Response:
-    """Render a view: colours of splats, of their features or of clusters, or depth, as a PNG.
+    """Render the splats from a view, in their colours or those of their features or clusters, or their depth: a PNG.
 
-    Depths are those of the splats' centres along the camera's axis, weighted as the colours are. They are grey, near
-    bright. The PNG's texts `depth-near` and `depth-far` have the depths of its levels 255 and 1 (1st and 99th
-    percentile), in scene units, with even steps between; what lies beyond has these levels too. 0 is where no splat
-    is. In a body a camera of your own may stand in place of the view.
+    Depths are those of the splats' centres along the camera's axis, weighted as the colours are, and grey: near is
+    bright. The PNG's texts `depth-near` and `depth-far` are the depths of its levels 255 and 1 (1st and 99th
+    percentile), in scene units, with even steps between; nearer and farther splats have these levels too. 0 means no
+    splat. A body may have a camera in place of the view.
     """
     lift = find_lift(parameters.lift, deps)
     worker_request = scene_request("render", lift, deps) | seen_from(parameters) | {"channel": parameters.channel}
@@ -363,7 +361,7 @@ def _entity(
 def _answer_links(parameters: Question, lift: LiftRecord, view: str | None, *, has_objects: bool) -> dict[str, str]:
     """Return the URLs of other answers to the same query; vectors do not fit in a URL, so POST them again.
 
-    Where nothing was ``has_objects`` there are no objects.
+    Without ``has_objects`` the links to objects are left out, as the answer selected no splats.
     """
     links = {"lift": f"/lifts/{lift.id}", "scores": _link("/query/scores", parameters, lift=lift.id)}
     if has_objects:
@@ -405,14 +403,14 @@ def segment(parameters: SegmentRequest, deps: Deps, ask: Ask) -> Response:
 
 @router.post("/query/segment/labels", responses=NPY, response_class=Response)
 def segment_labels(parameters: SegmentRequest, deps: Deps, ask: Ask) -> Response:
-    """Return the value of every splat's word, 0 for none: .npy, int32 [P]."""
+    """Return the number of each splat's word among those of `/query/segment`, from 1, or 0: .npy, int32 [P]."""
     lift = find_lift(parameters.lift, deps)
     return binary_response(deps, _word_request("word_labels", parameters, lift, deps), lift, ask, {})
 
 
 @router.post("/query/segment/map", responses=PNG, response_class=Response)
 def segment_map(parameters: SegmentRequest, deps: Deps, ask: Ask) -> Response:
-    """Return the word values of a view's pixels: a PNG with a palette, whose text `legend` has the words by value."""
+    """Draw the numbers of words for a view's pixels: a PNG with a palette, and words by number as text `legend`."""
     lift = find_lift(parameters.lift, deps)
     return binary_response(
         deps, _word_request("word_map", parameters, lift, deps) | seen_from(parameters), lift, ask, {}
@@ -421,7 +419,7 @@ def segment_map(parameters: SegmentRequest, deps: Deps, ask: Ask) -> Response:
 
 @router.post("/query/segment/picture", responses=PNG, response_class=Response)
 def segment_picture(parameters: SegmentRequest, deps: Deps, ask: Ask) -> Response:
-    """Render a view tinted with the colours of its words, with a legend: a PNG."""
+    """Draw a view tinted with the colours of its words, beside a legend: a PNG."""
     lift = find_lift(parameters.lift, deps)
     return binary_response(
         deps, _word_request("word_picture", parameters, lift, deps) | seen_from(parameters), lift, ask, {}
@@ -430,7 +428,7 @@ def segment_picture(parameters: SegmentRequest, deps: Deps, ask: Ask) -> Respons
 
 @router.post("/query/export", responses=bytes_of("application/zip"), response_class=Response)
 def export(parameters: ExportRequest, deps: Deps, ask: Ask) -> Response:
-    """Return one ZIP: splats with labels, names, colours, boxes and counts, and masks of the views.
+    """Export objects, words or queries as one ZIP: splats with labels, names, colours, boxes, counts, masks of views.
 
     It holds `labels.ply`, `labels.json`, `instances.csv`, `legend.png`, `masks/VIEW.png`, `masks.json` (COCO) and
     `truth.safetensors` (masks for a trade-off).

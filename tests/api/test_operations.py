@@ -105,7 +105,7 @@ def test_readyz_names_what_fails_until_it_works_again(start: Start, tmp_path: Pa
             other.execute("ROLLBACK")
         until(lambda: client.get("/readyz").status_code == 200)
         for restarts, ends in enumerate((signal.SIGKILL, signal.SIGSTOP), 1):
-            process = parts_of(client).queries._process
+            process = parts_of(client).query_client._process
             assert process is not None
             process.send_signal(ends)
             fails(client, "queries")
@@ -115,7 +115,7 @@ def test_readyz_names_what_fails_until_it_works_again(start: Start, tmp_path: Pa
             fails(client, "uploads")
             until(lambda: client.get("/readyz").status_code == 200)
             assert client.put("/assets/cameras", content=b"{}").status_code == 422
-        parts_of(client).runner.stop()
+        parts_of(client).supervisor.stop()
         fails(client, "supervisor")
 
 

@@ -286,7 +286,7 @@ def test_large_array_is_sent_from_a_file(
         Path(request["draft"]).write_bytes(content)
         return Frame({})
 
-    monkeypatch.setattr(parts_of(client).queries, "call", call)
+    monkeypatch.setattr(parts_of(client).query_client, "call", call)
     for reply in (
         client.get("/query/scores", params=LAMP | {"lift": lift["id"]}),
         client.post("/query/scores", json={"text": ["lamp"], "lift": lift["id"]}),

@@ -313,7 +313,7 @@ def test_large_answer_is_a_file_and_the_same_bytes(
 
 @pytest.mark.skipif(sys.platform != "linux", reason="/proc tells the environment of a process")
 def test_libraries_of_the_query_process_compute_in_one_thread(client: TestClient) -> None:
-    assert parts_of(client).queries.alive()
+    assert parts_of(client).query_client.alive()
     processes = [Path("/proc", str(child)) for child in children_of(os.getpid())]
     workers = [process for process in processes if b"query_worker" in (process / "cmdline").read_bytes()]
     assert workers
@@ -397,7 +397,7 @@ def test_calls_of_a_worker_that_dies_are_answered_by_the_next(
 ) -> None:
     # a process that is seen stopped is replaced before it is asked
     monkeypatch.setattr("service.query_client.is_stopped", lambda pid: False)
-    worker = parts_of(client).queries
+    worker = parts_of(client).query_client
     process = worker._process
     assert process is not None
     os.kill(process.pid, signal.SIGSTOP)  # so that all calls are in the line, and the first asked, when it dies

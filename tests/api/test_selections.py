@@ -123,7 +123,7 @@ def test_edit_of_an_older_version_is_refused(client: TestClient, route: str) -> 
 def test_edit_that_another_one_overtakes_is_refused(
     client: TestClient, route: str, monkeypatch: pytest.MonkeyPatch, match: dict[str, str], status: int
 ) -> None:
-    selection, queries = begin_selection(client, route, **LAMP), parts_of(client).queries
+    selection, queries = begin_selection(client, route, **LAMP), parts_of(client).query_client
     edits, call = selection["links"]["edits"], queries.call
 
     def overtaken(*arguments: Any) -> Any:

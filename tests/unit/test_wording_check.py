@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.wording import Report, counts_below, excess, report_on_code
+from tests.wording import Report, excess, report_on_code
 
 CLEAN = '''
 class Answer:
@@ -49,16 +49,9 @@ def test_docstrings_with_a_question_word_and_the_word_told_are_listed_with_their
     assert (report.docstrings, report.functions, report.functions_with_participle) == (2, 1, 0)
 
 
-def test_a_count_above_its_bound_fails_and_one_within_it_does_not() -> None:
-    reports = {"a.py": report_on_code("found = given = 1"), "b.py": Report()}
-    assert list(excess(reports, {"a.py": {"names": 2}})) == []
-    lines = list(excess(reports, {"a.py": {"names": 1}}))
-    assert len(lines) == 3 and "a.py:1 found" in lines[1]
-    assert len(list(excess(reports, {}))) == 3
-
-
-def test_bounds_are_lowered_to_what_a_file_has_and_never_raised() -> None:
-    report = report_on_code("found = given = 1")
-    assert counts_below(report, {"names": 5, "told": 1}) == {"names": 2}
-    assert counts_below(report, {"names": 1}) == {"names": 1}
-    assert counts_below(None, {"names": 1}) == {}
+def test_a_share_above_its_bar_fails_with_every_place_and_one_within_it_does_not() -> None:
+    functions = "\n".join(f"def read_{number}(): ..." for number in range(200))
+    few = {"a.py": report_on_code(f"found = given = 1\n{functions}"), "b.py": Report()}
+    assert list(excess(few)) == []
+    lines = list(excess(few | {"b.py": report_on_code("seen = 1")}))
+    assert lines == ["3 names, at most 2 may stay:", "  a.py:1 found", "  a.py:1 given", "  b.py:1 seen"]

@@ -334,7 +334,7 @@ class InBlocks(LiftSteps[Job]):
         support = SplatSupport(sums, torch.from_numpy(total_weight), torch.from_numpy(agreement), confidence)
         return _mapped(job, job.solved_file), support
 
-    def refine(self, W: Job, X: Tensor, visible: np.ndarray) -> NoReturn:
+    def solve_least_squares(self, W: Job, X: Tensor, visible: np.ndarray) -> NoReturn:
         """See the protocol; `LiftSettings.check_blocks` rejects settings that need it."""
         raise AssertionError("least squares need all rays in one place")
 
