@@ -61,8 +61,11 @@ Level = Annotated[int, Query(ge=0, le=10**9, description="as in GET /lifts/{lift
 ObjectId = Annotated[int, Path(alias="object", ge=0, le=10**9, description="the id of an object of the lift")]
 ShareId = Annotated[str, Path(pattern=r"^[0-9a-f]{12}$", description="the id of a share of the lift")]
 Layer = Annotated[
-    Literal["pca", "cluster", "evidence", "agreement", "confidence"],
-    Query(description="principal components of features, clusters, or one of the others through a colour map"),
+    Literal["pca", "cluster", "total_weight", "evidence", "agreement", "confidence"],
+    Query(
+        description="principal components of features, clusters, or one of the others through a colour map; "
+        "evidence is the old name of total_weight"
+    ),
 ]
 
 FILE_OR_ORDER: dict[str, Any] = {

@@ -157,7 +157,7 @@ def test_words_and_things_have_the_same_answers(faces: Faces, table: Path, tmp_p
 
 
 @settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(asked=questions())
+@given(fields=questions())
 def test_every_face_gives_the_same_answer(faces: Faces, fields: dict[str, Any]) -> None:
     expected = faces.python(fields)
     assert faces.http("GET", fields) == expected
