@@ -27,7 +27,7 @@ KINDS = ("names", "docstrings", "told")
 CODE = ("liftcore/**/*.py", "service/**/*.py", "tests/**/*.py", "examples/**/*.py")
 TEXTS = ("*.md", "Makefile", "docs/*.md", "docs/*.rst", "docs/*.ipynb", "docker/*", "service/web/src/**/*.[chj]*")
 # History stays as it was written; the others must name the words.
-UNBOUND = ("CHANGELOG.md", "tests/wording.py", "tests/unit/test_wording_check.py")
+UNBOUND = ("CHANGELOG.md", "CONTRIBUTING.md", "tests/wording.py", "tests/unit/test_wording_check.py")
 # Kind -> the most places: a share of functions or of docstrings, or a number
 BARS = {"names": 0.01, "docstrings": 0.02, "told": 5}
 

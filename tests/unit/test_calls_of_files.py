@@ -90,11 +90,11 @@ CHOICES: list[tuple[str, Call]] = [
     (r"folders: expected one of phrases, views", lambda: pack("prompts", folders="view")),
     (r"text_space: expected None for prompts", lambda: pack("prompts", text_space="x")),
     (r"normalised: expected True, False or None, got 'maybe'", lambda: pack("npy", normalised="maybe")),
-    (r"text_space: expected a text", lambda: pack("npy", text_space=3)),
+    (r"text_space: expected a non-empty text, got 3", lambda: pack("npy", text_space=3)),
     (r"^encoder: expected", lambda: pack("masks", photos="photos")),
     (r"^photos: expected", lambda: pack("masks", encoder="open_clip:a/b")),
     (
-        r"^normalised: expected unit",
+        r"^normalised: expected True or None.*got False",
         lambda: pack("masks", encoder="open_clip:a/b", photos="photos", normalised=False),
     ),
     (r"^names: expected a file of names", lambda: pack("prompts", names="nowhere.txt")),
