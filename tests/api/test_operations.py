@@ -424,11 +424,11 @@ def test_upload_to_a_stalled_disk_keeps_nobody_else_waiting(
                 upload.join()
 
 
-@pytest.mark.parametrize(("seconds", "at_once"), [(1000.0, layers.PLACES), (0.001, 2 * layers.PLACES)])
+@pytest.mark.parametrize(("seconds", "at_once"), [(1000.0, layers.SLOTS), (0.001, 2 * layers.SLOTS)])
 def test_few_requests_begin_at_a_time_and_none_waits_for_slow_ones(
     monkeypatch: pytest.MonkeyPatch, seconds: float, at_once: int
 ) -> None:
-    monkeypatch.setattr(layers, "TURN_SECONDS", seconds)
+    monkeypatch.setattr(layers, "SLOT_SECONDS", seconds)
     started_names: list[str] = []
 
     async def ask_all() -> None:
@@ -441,13 +441,13 @@ def test_few_requests_begin_at_a_time_and_none_waits_for_slow_ones(
 
         turns: Any = layers.ConcurrencyLimit(app)
         async with anyio.create_task_group() as parameters:
-            for path in ["/slow"] * 2 * layers.PLACES + ["/healthz"]:
+            for path in ["/slow"] * 2 * layers.SLOTS + ["/healthz"]:
                 parameters.start_soon(turns, {"type": "http", "path": path}, None, None)
             while "/healthz" not in started_names or started_names.count("/slow") < at_once:
                 await anyio.sleep(0.001)
             assert started_names.count("/slow") == at_once
             go_on.set()
-        assert started_names.count("/slow") == 2 * layers.PLACES
+        assert started_names.count("/slow") == 2 * layers.SLOTS
 
     anyio.run(ask_all)
 
