@@ -101,7 +101,7 @@ CALLS: list[tuple[str, Call]] = [
     (r"words: .* 3 words and 2 vectors", lambda s: s.result.segment(list("abc"), np.eye(2, 6), s.splats)),
     (r"words: expected a list of texts", lambda s: s.result.objects(s.splats, "cat", np.eye(3, 6))),
     (
-        r"its splats, got one of values in memory; give the splats that",
+        r"its splats, got values in memory; give the splats that",
         lambda s: s.result.segment(["a", "b"], np.eye(2, 6)),
     ),
     (r"port: expected a whole number in 0\.\.65535", lambda s: s.result.show(s.splats, s.cameras, port=70_000)),
