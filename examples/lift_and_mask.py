@@ -22,9 +22,8 @@ def main(splats_path: str, cameras_path: str, features_path: str, word: str, out
     print(answer.explanation)
 
     masks = Path(out, "masks")
-    shares = lc.render(
-        splats, cameras, answer.splats, normalise=True
-    )  # share of each ray's weight on selected splats
+    # Share of each ray's weight on selected splats.
+    shares = lc.render(splats, cameras, answer.splats, normalise=True)
     for view, share in shares.items():
         picture = np.asarray(share > 0.5, dtype=np.uint8) * 255
         path = masks / f"{view}.png"

@@ -240,9 +240,8 @@ class Recorder:
                 )
                 await answer_to(error, CLOSE)(scope, receive_counted, send_marked)
             except Exception:
-                if (
-                    not complete
-                ):  # else `service.problems` has answered and logged it, and the framework raises it again
+                # If complete, `service.problems` has answered and logged it, and the framework raises it again.
+                if not complete:
                     raise
             finally:
                 seconds, route = time.monotonic() - start, getattr(scope.get("route"), "path", None)

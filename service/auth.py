@@ -172,9 +172,8 @@ def required_scope(method: str, path: str) -> Scope | None:
         return None
     if path == "/metrics":
         return Scope.METRICS
-    asks = method == "POST" and (
-        path in ("/query", "/render") or path.startswith("/query/")
-    )  # a question may have a body
+    # A question may have a body.
+    asks = method == "POST" and (path in ("/query", "/render") or path.startswith("/query/"))
     return Scope.READ if method in SAFE or asks else Scope.WRITE
 
 

@@ -222,7 +222,7 @@ class LiftInputs(Body):
     ] = Field(description=f"feature packs, each counts once; at most {PACKS}")
     settings: Annotated[dict[str, Scalar], Bounded, Published(LiftSettings)] = Field(
         default_factory=dict,
-        description="preset and knobs of the lift; those left out take the values of the preset and the speed",
+        description="settings of the lift; others take the values of the preset and the speed",
         examples=[{"preset": "default", "speed": "balanced"}],
     )
 
@@ -251,13 +251,15 @@ class TradeoffRequest(LiftInputs):
 
     settings: Annotated[dict[str, Scalar], Bounded, Published(LiftSettings, without=(TRADEOFF_SETTING,))] = Field(
         default_factory=dict,
-        description="of all runs: knobs of the lift beside speed, which is compared; the dial starts from a preset",
+        description="settings of all runs, without speed, which is compared; the levels of speed begin with a preset",
         examples=[{"robust_steps": 1}],
     )
     budget_s: Annotated[float, Field(ge=10, le=86_400), NoBoolean] = Field(
-        600, description="seconds to plan with; the exact run is made whatever it takes"
+        600, description="seconds for all runs; the exact run is made in any case"
     )
-    labels: Labels | None = Field(None, description="masks to judge by; without them held-out views are judged by")
+    labels: Labels | None = Field(
+        None, description="masks with the true labels; without them, runs are compared on held-out views"
+    )
 
 
 class Progress(BaseModel):
@@ -267,7 +269,7 @@ class Progress(BaseModel):
     completed: int = Field(validation_alias=AliasChoices("completed", "done"))  # stored jobs may have the old name
     total: int
     unit: str
-    eta_s: float | None = Field(description="seconds until the end of this stage, at its pace so far")
+    eta_s: float | None = Field(description="seconds until the end of this stage, from its speed so far")
 
     @computed_field(description="`completed`, by its old name", json_schema_extra={"deprecated": True})
     @property
@@ -282,7 +284,7 @@ class Plan(BaseModel):
     model_config = ConfigDict(extra="allow")  # the numbers of the diagnostics
 
     summary: list[str] = Field(description="the plan for people, a few lines")
-    warnings: list[str] = Field(description="of what is lifted, and of what the machine has for it today")
+    warnings: list[str] = Field(description="about the inputs, and about the memory and disk of the machine")
 
 
 class Job(BaseModel):
@@ -340,8 +342,10 @@ class LiftResult(BaseModel):
 
     id: JobId
     name: str | None = Field(description="set by a user")
-    bytes: int = Field(description="of its file, as it was made")
-    sha256: str = Field(description="likewise; after a change of `world` the download has another, in its ETag")
+    bytes: int = Field(description="size of the file, as it was made")
+    sha256: str = Field(
+        description="of the file, as it was made; after a change of `world` the download has another one, in its ETag"
+    )
     splats: AssetId
     cameras: AssetId
     features: list[AssetId]
@@ -359,7 +363,7 @@ class LiftResult(BaseModel):
         [0.0, 0.0, 0.0],
         min_length=3,
         max_length=3,
-        description="of the positions of its `.splat` and `.spz`; zeros but in map coordinates",
+        description="of the positions of its `.splat` and `.spz`; zeros except for scenes in map coordinates",
     )
     world: WorldFrame = Field(description="up axis and length of a scene unit, as far as they are known")
     diagnostics: dict[str, Any] = Field(description="measures of the lift's quality, and its warnings")
@@ -445,14 +449,14 @@ class Tradeoff(BaseModel):
     splats: AssetId
     cameras: AssetId
     features: list[AssetId]
-    labels: Labels | None = Field(description="the masks that it was judged by")
-    runs: list[dict[str, Any]] = Field(description="one for each preset or place of the dial: seconds and accuracy")
-    skipped: list[str] = Field(description="what did not fit the budget")
-    refused: list[str] = Field(default=[], description="what the order's settings forbid")
-    choice: dict[str, Any] = Field(description="which run to take, and why")
-    views: dict[str, int] = Field(description="how many were lifted, of how many, and held out")
+    labels: Labels | None = Field(description="the masks with the true labels")
+    runs: list[dict[str, Any]] = Field(description="one for each preset and speed: seconds and accuracy")
+    skipped: list[str] = Field(description="runs that did not fit the budget")
+    refused: list[str] = Field(default=[], description="runs that the settings do not allow")
+    choice: dict[str, Any] = Field(description="the recommended runs, with reasons")
+    views: dict[str, int] = Field(description="number of lifted, all and held-out views")
     budget_s: float
-    seconds: float = Field(description="that it took")
+    seconds: float = Field(description="duration")
     created: Seconds
     created_at = iso_of("created")
     links: dict[str, str]
@@ -479,7 +483,7 @@ class Version(BaseModel):
     database: int = Field(description="of the database's schema")
     commit: str | None = Field(description="the git commit of the build, if the operator set it")
     python: str
-    packages: dict[str, str] = Field(description="versions of what matters most")
+    packages: dict[str, str] = Field(description="versions of the main dependencies")
 
 
 # Queries: the models of liftcore, with the lift, the encoder, and limits of HTTP
@@ -541,7 +545,7 @@ class Words(LiftQuestion, Body):
     """Many words at once."""
 
     words: Annotated[list[Text], Field(max_length=WORDS, fail_fast=True)] | None = Field(
-        None, description="what may be there, each word once; all words of a table if left out"
+        None, description="words to find, each once; all words of a table if left out"
     )
 
 
@@ -558,7 +562,7 @@ class NamedQuestion(Question):
     """A question to a lift, and what files call its answer."""
 
     model_config = BODY_CONFIG
-    name: SelectionName | None = Field(None, description="else its words")
+    name: SelectionName | None = Field(None, description="name of the label; by default the words of the question")
 
 
 class ExportRequest(Words):
@@ -570,7 +574,7 @@ class ExportRequest(Words):
         BeforeValidator(lambda of: "objects" if of == "things" else of),  # the old name
     ] = Field("objects", description="the labels of the content")
     questions: Annotated[list[NamedQuestion], Field(max_length=QUESTIONS, fail_fast=True)] = Field(
-        [], description="of `questions`: each is a class of the labels"
+        [], description="for content `questions`: each is a class of the labels"
     )
     view: str | None = Field(
         None, min_length=1, max_length=VIEW_CHARACTERS, description="the view of the masks; else all views"
@@ -648,7 +652,7 @@ class EditRequest(Edit):
 
     model_config = BODY_CONFIG
     error_type: ClassVar = None
-    query: Question | None = Field(None, description="a question: the splats that answer it")  # pyright: ignore[reportIncompatibleVariableOverride]
+    query: Question | None = Field(None, description="a query: the splats that it selects")  # pyright: ignore[reportIncompatibleVariableOverride]
 
 
 class NewSelection(Body):
@@ -673,7 +677,7 @@ class ObjectLabelChange(Body):
     """Changes of an object's label; fields that are left out stay."""
 
     model_config = BODY_CONFIG
-    name: SelectionName | None = Field(None, description="of your own; null for the nearest word again")
+    name: SelectionName | None = Field(None, description="your own name; null for the nearest word")
     hidden: bool = Field(False, description="true if lists leave it out")
 
 
@@ -681,7 +685,7 @@ class ObjectLabel(BaseModel):
     """The name that a user gave an object of a lift, and whether it is hidden."""
 
     id: int
-    name: str | None = Field(description="null where it has none of its own")
+    name: str | None = Field(description="your own name; null if there is none")
     hidden: bool
 
 
@@ -691,7 +695,7 @@ class ListedSelection(OfLift):
     id: str
     name: str
     count: int = Field(description="splats")
-    box: Box | None = Field(description="of its large groups of splats that touch; null of none")
+    box: Box | None = Field(description="box of its large groups of touching splats; null if there are none")
     step: int = Field(description="its current step in the history")
     first: int = Field(description="the steps that it can go to, by PATCH")
     last: int
@@ -740,7 +744,7 @@ class OwnKey(BaseModel):
 
     name: str | None = Field(description="its owner or purpose; null where no key is needed")
     scopes: list[str]
-    lifts: list[JobId] = Field(description="of the scope `shared`: those that it was given")
+    lifts: list[JobId] = Field(description="for the scope `shared`: the shared lifts")
     expires: Seconds | None = Field(description="null for never")
     expires_at = iso_of("expires", optional=True)
 
@@ -749,7 +753,7 @@ class ShareRequest(Body):
     """Request for a new key."""
 
     model_config = BODY_CONFIG
-    name: SelectionName = Field(description="for whom it is")
+    name: SelectionName = Field(description="its recipient")
     expires_s: Annotated[float, Field(ge=60, le=31_622_400), NoBoolean] = Field(
         2_592_000, description="seconds until it ends; 30 days if left out, a year at most"
     )
@@ -782,11 +786,11 @@ class Shares(BaseModel):
 class NodesRequest(BaseModel):
     """Nodes of a lift's tree to list, and words to name them."""
 
-    table: AssetId | None = Field(None, description="an uploaded text table: they are named by its words")
+    table: AssetId | None = Field(None, description="an uploaded text table: its words name the objects")
     encoder: str | None = Field(
         None,
         max_length=200,
-        description="a text space that the operator set up as a table, the lift's own, or default: likewise",
+        description="a text space that the operator set up as a table, the lift's own, or default: to name objects",
     )
     limit: int = Field(100, ge=1, le=1000, description="number of items to list")
     cursor: int = Field(0, ge=0, le=10**9, description="the `next` of the page before")
@@ -811,8 +815,8 @@ class TreeRequest(NodesRequest):
 class SceneObjectsRequest(NodesRequest):
     """Objects to list, and words to name them."""
 
-    features: Annotated[bool, Field(description="with the mean feature of each")] = False
-    splat: int | None = Field(None, ge=0, le=10**9, description="the one of this splat alone, by its row")
+    features: Annotated[bool, Field(description="true: with the mean feature of each")] = False
+    splat: int | None = Field(None, ge=0, le=10**9, description="only the object of this splat, by its row")
 
 
 class LiftTree(SceneTree, OfLift):

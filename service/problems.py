@@ -28,9 +28,8 @@ METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")  # HEAD too, wher
 PATH_CHARACTERS = 200  # of a requested path, in an answer
 VALUE_CHARACTERS = 120  # of a value, in an answer
 JSON_CHARACTERS = 20  # of JSON, from the character where it is malformed
-PYDANTIC = re.compile(
-    r"^\w+ should (be|have) |, unable to parse .*| after validation, not \d+$"
-)  # text around the expected value
+# Text around the expected value.
+PYDANTIC = re.compile(r"^\w+ should (be|have) |, unable to parse .*| after validation, not \d+$")
 CLOSE = {"Connection": "close"}  # the rest of the body must not be taken for the next request
 # Errors of the database's file or the disk below it: the request is not at fault, and nothing was stored.
 UNUSABLE = (

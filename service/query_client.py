@@ -287,9 +287,8 @@ class QueryClient:
         assert process is not None and worker is not None
         sizes = itertools.accumulate(map(len, lookahead))
         lines = [call.line, *(line for line, size in zip(lookahead, sizes, strict=True) if size <= AHEAD_BYTES)]
-        deadline = threading.Timer(
-            _remaining_seconds(call), process.kill
-        )  # a stopped process neither reads nor writes
+        # A stopped process neither reads nor writes.
+        deadline = threading.Timer(_remaining_seconds(call), process.kill)
         deadline.start()
         try:
             worker.send_bytes(b"[" + b", ".join(lines) + b"]")

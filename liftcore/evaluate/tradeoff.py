@@ -30,7 +30,7 @@ from liftcore.io.cameras import read_cameras
 from liftcore.io.remote import local_path, local_paths
 from liftcore.lifting.files import open_files
 from liftcore.lifting.pipeline import lift
-from liftcore.lifting.planning.views import spread
+from liftcore.lifting.planning.views import evenly_spaced
 from liftcore.lifting.warm_up import warm_up_lift
 from liftcore.query.ask import ask
 from liftcore.query.objects import objects
@@ -351,11 +351,6 @@ def _phrase_ious(spec: RunSpec, scene: Scene, masks: Mapping[str, Tensor]) -> li
             predicted, true = _resized(torch.from_numpy(answer_mask.mask), masks[view]), masks[view] == number
             ious.append(int((predicted & true).sum()) / int((predicted | true).sum()))
     return ious
-
-
-def evenly_spaced(items: Sequence[Any], limit: int) -> list[Any]:
-    """Select ``limit`` items, evenly spread."""
-    return [items[int(index)] for index in spread(len(items), min(limit, len(items)))]
 
 
 def _reference(spec: RunSpec, result: LiftResult) -> tuple[Tensor, Tensor]:

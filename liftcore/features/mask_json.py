@@ -61,9 +61,8 @@ class ImageMasks:
     masks: Masks = field(default_factory=list)  # by phrase; VOID for unlabelled pixels
     phrases: list[str] = field(default_factory=list)  # of all records, also those without a mask
     searched: set[str] = field(default_factory=set)  # normalized phrases, all of whose objects have a mask
-    not_searched: set[str] = field(
-        default_factory=set
-    )  # normalized phrases that were not searched for, or not completely
+    # Normalized phrases that were not searched for, or not completely.
+    not_searched: set[str] = field(default_factory=set)
     annotated: bool = True  # has a record, or is listed as empty
     ids: "IdObjects | None" = None  # objects of a picture of ids
     in_data_set: bool = False  # among the images of a data set

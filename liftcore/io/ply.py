@@ -53,9 +53,8 @@ CHANNELS = (
 )  # of a colour
 SPLAT_PROPERTIES = ("opacity", "scale_0", "rot_0", "f_dc_0", "sh0_0", "packed_position")  # one at least
 SCAFFOLD = ("f_anchor_feat_0", "f_offset_0")  # of Scaffold-GS, whose networks turn anchors into splats
-MODEL = re.compile(
-    r"[xyz]|opacity|beta|filter_3D|(scale|rot|f_dc|f_rest|sh0|shN|sb_params)_\d+|packed_\w+"
-)  # columns that are splats, in any dialect
+# Columns that are splats, in any dialect.
+MODEL = re.compile(r"[xyz]|opacity|beta|filter_3D|(scale|rot|f_dc|f_rest|sh0|shN|sb_params)_\d+|packed_\w+")
 SPELLING = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"}
 SPELLING |= {"f4": "float", "f8": "double"}
 WRITTEN_MODE = {RenderModel.ANTIALIASED: "mip", RenderModel.DISCS: "2dgs"}  # as editors read it

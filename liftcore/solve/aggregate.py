@@ -386,9 +386,8 @@ def contingency(labels: np.ndarray, kappa: np.ndarray, rows: int, clusters: int)
             is_counted &= regions != other  # a pixel counts once for a region on two levels
         earlier_levels.append(regions)
         ones = np.ones(int(is_counted.sum()), np.int64)
-        total += csr_matrix(
-            (ones, (regions[is_counted], shown_cluster[is_counted])), shape=total.shape
-        )  # equal places add up
+        # Equal places add up.
+        total += csr_matrix((ones, (regions[is_counted], shown_cluster[is_counted])), shape=total.shape)
     return total
 
 

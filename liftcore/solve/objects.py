@@ -292,9 +292,8 @@ def add_regions(tree: RegionTree, regions: np.ndarray, shares: Iterable[PieceSum
     node_weights = csr_array(tree.lineage().T.astype(np.float64) @ csr_array(table)[1:]).tocoo()
     is_majority = node_weights.data > totals[node_weights.col] / 2  # nodes of one path
     region = tree.region.copy()
-    np.maximum.at(
-        region, regions[node_weights.col[is_majority]], node_weights.row[is_majority]
-    )  # parts come after their wholes
+    # Parts come after their wholes.
+    np.maximum.at(region, regions[node_weights.col[is_majority]], node_weights.row[is_majority])
     return replace(tree, region=region)
 
 

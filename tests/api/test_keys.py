@@ -315,9 +315,8 @@ def test_shares_end_with_the_secret_that_made_them_unless_they_are_kept(
     assert ("of guest" in output.err) == ("--keep-shares" not in options)
     assert may_read(server, other) and may_read(server, new) and may_read(server, guest) == bool(options)
     if options == ["--grace", "1h"]:
-        late = share_of(
-            server, server.secrets["alice"], expires_s=86_400
-        )  # with the secret before, which still counts
+        # With the secret before, which still counts.
+        late = share_of(server, server.secrets["alice"], expires_s=86_400)
         for ending in (guest, late, bearer(server.secrets["alice"])):
             expires = server.client.get("/key", headers=ending).json()["expires"]
             assert expires == pytest.approx(time.time() + 3600, abs=60)
@@ -424,9 +423,8 @@ def test_open_until_the_first_key_and_never_again(tmp_path: Path, capsys: pytest
         assert len(server.ask(None, "GET", "/lifts").json()["lifts"]) == 1
         assert "security" not in str(server.ask(None, "GET", "/openapi.json").json()["paths"])
         data_option = ["--data", str(tmp_path / "data")]
-        assert (
-            main(["keys", "create", "--name", "first", "--scopes", "read", *data_option]) == 0
-        )  # while the server runs
+        # While the server runs.
+        assert main(["keys", "create", "--name", "first", "--scopes", "read", *data_option]) == 0
         secret = capsys.readouterr().out.strip()
         assert server.ask(None, "GET", "/jobs").status_code == 401
         require_keys(ServiceSettings.model_validate({"data": tmp_path / "data", "host": "0.0.0.0"}))

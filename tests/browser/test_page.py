@@ -610,9 +610,8 @@ def test_page_without_webgl_shows_the_views(server: PageServer, tmp_path: Path) 
 def test_accessibility_check_finds_nothing_serious(page: Browser, scheme: str) -> None:
     page.window(1280, 800, scheme)
     ask(page, "lamp")
-    page.value(
-        "(() => { splatlift.query.current.answer.rivals = ['book']; splatlift.query.render(); })()"
-    )  # not sure
+    # Not sure.
+    page.value("(() => { splatlift.query.current.answer.rivals = ['book']; splatlift.query.render(); })()")
     for tab in ("ask", "name", "look", "bring", "take"):
         page.press(f"#tab-{tab}")
         if tab == "name":

@@ -160,9 +160,8 @@ def test_readyz_reports_a_broken_database_that_takes_no_order(broken: Callable[[
         assert client.get("/healthz").status_code == 200
         other_connection = sqlite3.connect(tmp_path / "data" / DATABASE)
         if broken is replaced:
-            assert (
-                other_connection.execute("SELECT count(*) FROM jobs").fetchone()[0] == 0
-            )  # nothing goes to a stranger
+            # Nothing goes to a stranger.
+            assert other_connection.execute("SELECT count(*) FROM jobs").fetchone()[0] == 0
         other_connection.close()
 
 

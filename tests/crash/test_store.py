@@ -102,9 +102,8 @@ def test_start_over_files_without_their_database_is_refused_in_one_line(
         stderr = capsys.readouterr().err
         assert stderr.startswith("splatlift: data: expected the database that the files beside it were stored with")
         assert "splatlift store rebuild" in stderr and "serve --new" in stderr and stderr.count("\n") == 1
-    assert (
-        main(["keys", "create", "--name", "a", "--scopes", "read", "--data", str(data)]) == 2
-    )  # makes no database either
+    # Makes no database either.
+    assert main(["keys", "create", "--name", "a", "--scopes", "read", "--data", str(data)]) == 2
     assert "splatlift store rebuild" in capsys.readouterr().err
     assert blobs(data) == before
 

@@ -181,9 +181,8 @@ class StoreMachine(RuleBasedStateMachine):
             assert not line
             return "0" * 32, 1
         model = self.jobs[claimed_job.id]
-        assert claimed_job.id == next(
-            job for job in line if self.jobs[job].owner == model.owner
-        )  # its owner's oldest
+        # Its owner's oldest.
+        assert claimed_job.id == next(job for job in line if self.jobs[job].owner == model.owner)
         running = Counter(job.owner for job in self.jobs.values() if job.state in ("running", "canceling"))
         waiting = [(running[self.jobs[job].owner], self.turns[self.jobs[job].owner]) for job in line]
         assert (running[model.owner], self.turns[model.owner]) == min(waiting)

@@ -22,7 +22,6 @@ Maps are also checked alone (`liftcore.features.smoothness`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -31,7 +30,7 @@ import torch
 
 from liftcore.features.smoothness import some_grids, unlike_maps
 from liftcore.lifting.geometry import Geometry, weigh_views
-from liftcore.lifting.planning.views import NOISE_CHANNELS, SAMPLE, ViewDisagreement, spread
+from liftcore.lifting.planning.views import NOISE_CHANNELS, SAMPLE, ViewDisagreement, evenly_spaced, spaced_indices
 from liftcore.raster.base import Raster
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import silent
@@ -86,7 +85,7 @@ def contradictions(
 
 def probe_views(count: int) -> list[int]:
     """Return the numbers of the views, evenly spread among ``count``, that are checked for contradictions."""
-    return spread(count, min(PROBE_VIEWS, count)).tolist()
+    return spaced_indices(count, min(PROBE_VIEWS, count)).tolist()
 
 
 class ViewAgreement(NamedTuple):
@@ -174,7 +173,10 @@ def _agreement_of(geometry: Geometry) -> float | None:
         return None
     unit_means = torch.nn.functional.normalize(torch.cat([book.means(book.rows.float()) for book in books]), dim=1)
     unit_means = unit_means - (mass / mass.sum()) @ unit_means
-    channels, rows = unit_means.shape[1], torch.from_numpy(spread(len(W.indptr) - 1, min(SAMPLE, len(W.indptr) - 1)))
+    channels, rows = (
+        unit_means.shape[1],
+        torch.from_numpy(spaced_indices(len(W.indptr) - 1, min(SAMPLE, len(W.indptr) - 1))),
+    )
     disagreement = ViewDisagreement(W, unit_means @ random_axes(channels, min(NOISE_CHANNELS, channels), 0), rows)
     if not disagreement.weights.any():
         return None
@@ -189,8 +191,3 @@ def _agreement_of(geometry: Geometry) -> float | None:
     if same_view_share > MAX_SAME_VIEW or single <= 0 or not possible > 0:
         return None
     return (combined - same_view_share * single) / (1 - same_view_share) / single / possible
-
-
-def evenly_spaced(names: Sequence[str], count: int) -> list[str]:
-    """Select ``count`` names, evenly spread."""
-    return [names[int(index)] for index in spread(len(names), min(count, len(names)))]

@@ -26,8 +26,8 @@ import torch
 
 from liftcore.lifting.geometry import strided
 from liftcore.lifting.planning.contradictions import LEAST_IN_VIEW, LEAST_ROW_SUM, empty, unseen
-from liftcore.lifting.planning.plan import PlannedScene, first_names, planned_scene, scene_warnings
-from liftcore.lifting.planning.views import SAMPLE, WELL_COVERED, greedy, spread
+from liftcore.lifting.planning.plan import PlannedScene, join_names, planned_scene, scene_warnings
+from liftcore.lifting.planning.views import SAMPLE, WELL_COVERED, greedy, spaced_indices
 from liftcore.raster import check_splats_and_threads, open_raster
 from liftcore.raster.base import Raster, ViewRequest
 from liftcore.runtime.aliases import deprecated_names, with_old_names
@@ -93,9 +93,9 @@ class PhotoPlan(PlannedScene):
         for row in self.coverage:
             seconds = f"about {max(row.seconds, 1):.0f} s"
             yield f"  {row.photos:>6}  {row.once:>17.1%}  {row.twice:>13.1%}  {seconds:>15}"
-        yield f"encode first: {first_names(self.order, limit)}"
+        yield f"encode first: {join_names(self.order, limit)}"
         if self.spare:
-            spare_names = first_names(self.spare, limit)
+            spare_names = join_names(self.spare, limit)
             yield f"{len(self.spare)} add nothing that {WELL_COVERED} before them do not show: {spare_names}"
         yield from (f"warning: {warning}" for warning in self.warnings)
 
@@ -125,7 +125,7 @@ def plan_photos(
     settings = settings.for_splats(splats)
     all_cameras = cameras if isinstance(cameras, Cameras) else Cameras(cameras)
     views = list(all_cameras.values())[:: settings.view_stride]
-    rows = spread(splats.count, min(SAMPLE, splats.count))
+    rows = spaced_indices(splats.count, min(SAMPLE, splats.count))
     raster = open_raster(splats, CPU, threads)
     with one_thread(), shown_progress(progress) as reporter:
         total_weight, row_sum = total_weight_of_views(raster, views, rows, settings, reporter)

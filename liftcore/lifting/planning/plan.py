@@ -85,7 +85,7 @@ class PlannedScene:
         return f"{self.kernel}, antialiased: {self.rendering}" if self.antialiased else self.kernel
 
 
-def first_names(names: Sequence[str], limit: int | None) -> str:
+def join_names(names: Sequence[str], limit: int | None) -> str:
     """Join the first ``limit`` names for people; None for all."""
     return ", ".join(names[:limit]) + (", ..." if limit is not None and len(names) > limit else "")
 
@@ -196,7 +196,7 @@ class Plan(PlannedScene):
     def _spare_line(self) -> str:
         if not self.spare:
             return ""
-        names = first_names(self.spare, SHOWN_VIEWS)
+        names = join_names(self.spare, SHOWN_VIEWS)
         return f"; {len(self.spare)} add nothing that {WELL_COVERED} others do not show: {names}"
 
 

@@ -36,6 +36,7 @@ NOISE_CHANNELS random projections.
 import heapq
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -56,6 +57,7 @@ from liftcore.values.lift_views import LiftViews
 from liftcore.values.region_weights import RegionWeights, segment_sums
 from liftcore.values.settings import LiftSettings
 
+T = TypeVar("T")
 SAMPLE = 16_384  # splats at most; a view of them takes a millisecond
 ORDER_SPLATS = 4_096  # at most: 300 views are in order after .3 s, where 16,384 take 1 s
 SIDES = 24  # directions of view: three of each octant
@@ -102,7 +104,7 @@ def visibility(
     threads: int | None = None,
 ) -> Visibility:
     """Project evenly spaced splats, SAMPLE at most, into every camera."""
-    sample = spread_splats(splats, min(SAMPLE, splats.count))
+    sample = spaced_splats(splats, min(SAMPLE, splats.count))
     raster = open_raster(sample, device, threads)
     areas = np.zeros((len(cameras), sample.count), np.float32)
     for row, camera in zip(areas, cameras, strict=True):
@@ -111,14 +113,19 @@ def visibility(
     return Visibility(areas, centres, sample.means.numpy(), splats.count)
 
 
-def spread(total: int, count: int) -> np.ndarray:
+def evenly_spaced(items: Sequence[T], limit: int) -> list[T]:
+    """Select at most ``limit`` evenly spaced items, with the first and the last."""
+    return [items[int(index)] for index in spaced_indices(len(items), min(limit, len(items)))]
+
+
+def spaced_indices(total: int, count: int) -> np.ndarray:
     """Return [count] i64: evenly spaced numbers below ``total``, with the first and the last."""
     return np.linspace(0, total - 1, count).astype(np.int64)
 
 
-def spread_splats(splats: Splats, count: int) -> Splats:
+def spaced_splats(splats: Splats, count: int) -> Splats:
     """Copy the geometry of ``count`` evenly spaced splats."""
-    rows = torch.from_numpy(spread(splats.count, count))
+    rows = torch.from_numpy(spaced_indices(splats.count, count))
     return replace(
         splats,
         means=splats.means[rows],
@@ -245,14 +252,14 @@ def estimate_view_noise(
 ) -> ViewNoiseEstimate:
     """Estimate the noise of features from evenly spaced views, two at least; ``visible`` is of all views."""
     total, count = len(views.names), min(NOISE_VIEWS, len(views.names))
-    sample: list[int] = spread(total, count).tolist()
+    sample: list[int] = spaced_indices(total, count).tolist()
     sample_views = views.only(views.names[view] for view in sample)
     longest = max(max(sample_views.camera(k).width, sample_views.camera(k).height) for k in range(count))
     coarse = {"stride": max(1, longest // NOISE_SIDE), "diagnostic_rays": 0, "robust_steps": 0, "consensus": False}
     coarse_settings = settings.model_copy(update=coarse)
     channels = views.features.channels
     axes = random_axes(channels, min(NOISE_CHANNELS, channels), settings.seed)
-    rows = spread(raster.splats.count, visible.areas.shape[1])
+    rows = spaced_indices(raster.splats.count, visible.areas.shape[1])
     with one_thread():
         geometry = weigh_views(raster, raster.splats.count, sample_views, coarse_settings, silent, by_rows=False)
         means = [view.means(view.rows.float() @ axes) for view in geometry.codebook.views]
@@ -261,9 +268,8 @@ def estimate_view_noise(
     if not total_weight.any():  # no ray hits a splat: there is no estimate
         return ViewNoiseEstimate(visible.areas, np.ones(len(total_weight)), np.ones(len(total_weight)))
     variance, same_view_share = disagreement.disagreement(total_weight)
-    share = same_view_share / (
-        same_view_share + (1.0 - same_view_share) * (total - 1) / (count - 1)
-    )  # B, in the mean
+    # B, in the mean.
+    share = same_view_share / (same_view_share + (1.0 - same_view_share) * (total - 1) / (count - 1))
     by_area = _ratio(
         (visible.areas.astype(np.float64) ** 2).sum(axis=0), visible.areas.sum(axis=0, dtype=np.float64) ** 2
     )

@@ -426,9 +426,8 @@ def _log2_coefficients() -> list[float]:
 
 
 _POLYNOMIALS = np.array([*_exp2_coefficients(), *_log2_coefficients()], np.float32)
-_CUT_ROW, _LARGEST_ROW, _ALPHA_EXPONENT_ROW, _FLOOR_ROW, _CAP_ROW, _STOP_ROW, _EXP2_ROW = range(
-    7
-)  # then a row a coefficient
+# Then a row a coefficient.
+_CUT_ROW, _LARGEST_ROW, _ALPHA_EXPONENT_ROW, _FLOOR_ROW, _CAP_ROW, _STOP_ROW, _EXP2_ROW = range(7)
 _LOG2_ROW = _EXP2_ROW + _EXP2_DEGREE + 1
 STATE = TABLE + (_LOG2_ROW + _LOG2_DEGREE + 1) * LANES  # length of a tile's array
 

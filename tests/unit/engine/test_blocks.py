@@ -66,9 +66,8 @@ def halves_and_quarters(camera: lc.Camera, rng: np.random.Generator) -> np.ndarr
     along, centre = rays @ pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
     x, y, _ = np.moveaxis(centre - along * (centre[2] / along[..., 2:]), -1, 0)
     labels = np.stack([x > 0, 2 + (x > 0) + 2 * (y > 0)])
-    right_labels = np.stack(
-        [rng.integers(-1, 2, u.shape), rng.choice([-1, 2, 3, 4, 5], u.shape)]
-    )  # of the same level
+    # Of the same level.
+    right_labels = np.stack([rng.integers(-1, 2, u.shape), rng.choice([-1, 2, 3, 4, 5], u.shape)])
     return np.where(rng.random(labels.shape) < 0.05, right_labels, labels).astype(np.int32)
 
 
@@ -123,9 +122,8 @@ def assert_same_metadata(left: lc.LiftResult, right: lc.LiftResult) -> None:
 def test_blocks_give_the_bits_of_a_lift_in_memory(scene: dict[str, Any], overrides: dict[str, Any]) -> None:
     settings = LiftSettings.of(diagnostic_rays=200, **overrides)
     expected = lc.lift(scene["splats"], scene["cameras"], scene["views"], settings)
-    assert (
-        expected.node_parents is not None and int((expected.node_parents >= 0).sum()) == 4
-    )  # the quarters, of two halves
+    # The quarters, of two halves.
+    assert expected.node_parents is not None and int((expected.node_parents >= 0).sum()) == 4
     for engine in (Twice(1), Shuffled(2)):
         result = in_blocks(engine, scene, settings)
         assert_same(result, expected)

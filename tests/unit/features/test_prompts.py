@@ -208,9 +208,8 @@ def test_a_lift_of_prompts_is_asked_in_its_words_alone(tmp_path: Path, capsys: p
     pack.unlink()  # queries need the lift only
     status, out, err = run(capsys, "query", lifted, "a red apple", "--json")
     assert (status, err, json.loads(out)["selected"]) == (0, "", 20)
-    assert (
-        json.loads(out)["present"] is None and "not known" in json.loads(out)["answer"]["reason"]
-    )  # as no other words compete
+    # As no other words compete.
+    assert json.loads(out)["present"] is None and "not known" in json.loads(out)["answer"]["reason"]
     status, out, _ = run(capsys, "segment", lifted, "--json")
     assert (status, {entry["word"] for entry in json.loads(out)["found"]}) == (0, {"Lamp", "red apple"})
     status, _, err = run(capsys, "query", lifted, "red ample")

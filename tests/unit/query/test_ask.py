@@ -104,9 +104,8 @@ def test_splats_without_evidence_or_confidence_do_not_decide_the_threshold(exact
     answer = ask(crowd, Query.of(("x",), weight_by=weight_by), Axes())
     by_evidence = ask(crowd, Query.of(("x",)), Axes())
     assert np.array_equal(answer.scores, by_evidence.scores)
-    is_same = (
-        answer.threshold.explanation == by_evidence.threshold.explanation
-    )  # it has the share above the threshold
+    # It has the share above the threshold.
+    is_same = answer.threshold.explanation == by_evidence.threshold.explanation
     assert is_same == (weight_by == "evidence")
     assert np.array_equal(answer.selected[:COUNT], reference.selected)
     assert answer.selected[COUNT] and answer.count > reference.count  # the outliers are selected even so

@@ -45,9 +45,8 @@ def rasterized_views(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         return rasterize(self, camera, *rest, **keywords)
 
     monkeypatch.setattr(CpuRaster, "region_weights", recording)
-    monkeypatch.setattr(
-        "liftcore.lifting.in_memory.contradictions", lambda *_: []
-    )  # which may look at some views, coarsely
+    # Which may look at some views, coarsely.
+    monkeypatch.setattr("liftcore.lifting.in_memory.contradictions", lambda *_: [])
     monkeypatch.setattr("liftcore.lifting.pipeline.choose_device", lambda _: CPU)  # on machines with a GPU too
     return rasterized
 

@@ -141,9 +141,8 @@ def test_sums_of_a_million_entries_and_of_many_views_keep_their_digits(device):
     views = [of_dense(np.full((1, 1), 0.3))] * 2_000
     for views_of_case, codebooks in ((long, books), (views, [torch.full((1, 1), 0.7)] * 2_000)):
         solution = solve(stacked(views_of_case, 1), codebook_of(codebooks), torch.float32, device=device)
-        assert (
-            abs(float(solution.features[0, 0]) / float(torch.tensor(0.7)) - 1) < 5e-6
-        )  # one by one: the third digit
+        # One by one: the third digit.
+        assert abs(float(solution.features[0, 0]) / float(torch.tensor(0.7)) - 1) < 5e-6
 
 
 @every_device

@@ -78,6 +78,5 @@ def test_small_things_keep_their_masks_where_the_guard_stands(scene: Observed, c
     assert min(with_guard.values()) > 0.85
     if clusters == "hdbscan":
         without_guard = scene.ious(**merged, aggregation_guard=False)
-        assert (
-            without_guard["sword"] < 0.85 and max(without_guard["ring"], without_guard["nut"]) < 0.1
-        )  # it is the guard that keeps them
+        # It is the guard that keeps them.
+        assert without_guard["sword"] < 0.85 and max(without_guard["ring"], without_guard["nut"]) < 0.1
