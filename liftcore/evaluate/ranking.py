@@ -65,7 +65,7 @@ def choose(runs: Sequence[Mapping[str, Any]], accuracies: Sequence[Mapping[str, 
     Returns:
         ``recommended``: True if one is; ``name`` and ``options`` of it, else of the exact run; ``accuracy``: the
         measure; ``ties``: the names of those as good as the best, the cheapest first; ``intervals`` of that
-        figure by name; ``front``: runs that none beats in both time and accuracy, the fastest first; ``reason``.
+        figure by name; ``front``: runs that none beats in both time and accuracy, the fastest first; ``why``.
     """
     views = {
         name: min(_views(accuracy_data, name) for accuracy_data in accuracies) for name in NAMES if name != "cosine"
@@ -102,7 +102,7 @@ def choose(runs: Sequence[Mapping[str, Any]], accuracies: Sequence[Mapping[str, 
     ]
     ties.sort(key=lambda run: run["cpu_s"])
     best_tie = ties[0]
-    figure, seconds = f"{NAMES[accuracy]} ({best_tie[accuracy]:.4f})", f"{best_tie['cpu_s']:.2f} s of processor time"
+    figure, seconds = f"{NAMES[accuracy]} ({best_tie[accuracy]:.4f})", f"{best_tie['cpu_s']:.2f} s of CPU time"
     other_ties = [run["name"] for run in ties[1:]]
     tie_names = ", ".join(other_ties[:SHOWN_TIES] + ["..."] * (len(other_ties) > SHOWN_TIES))
     if not other_ties:

@@ -235,7 +235,7 @@ def _faithful(axes: Axes, runs: Sequence[Mapping[str, Any]]) -> None:
     lowest = min((run[name] for run in quality_runs for name in ("cosine", "cosine_plain")), default=0.0)
     margin = max(1.0 - lowest, 1e-3)
     axes.set_ylim(lowest - 0.6 * margin, 1.0 + 0.3 * margin)  # the worst splats may lie far below
-    _finish(axes, "times less processor time than exact", NAMES["cosine"])
+    _finish(axes, "times less CPU time than exact", NAMES["cosine"])
     axes.legend(fontsize="small", loc="lower left", edgecolor="none", framealpha=1.0)
 
 

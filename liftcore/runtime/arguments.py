@@ -44,7 +44,7 @@ def as_list(values: Any) -> list[Any]:
 
 
 def check_count(argument: str, value: object, none: str = "") -> None:
-    """Refuse a count that is no integer of at least one; None is accepted if ``none`` has its meaning.
+    """Refuse a count that is no integer of at least one; ``none`` is the meaning of None, empty if None is refused.
 
     Raises:
         InvalidSettings: the count is refused.

@@ -273,9 +273,9 @@ def filter_regions(
             kappa = np.where(raster.row_sums(camera, params).numpy() < LEAST_LIGHT, NO_CLUSTER, kappa)
             rows = observation.codebook.shape[0]
             matches = match_regions(observation.labels.numpy(), kappa, rows, clustering.count)
-            reliable = (matches.clusters >= 0) & (matches.ious >= settings.aggregation_iou)
-            region_sums.add(observation.codebook, matches.clusters, reliable)
-            region_sums.masks[name] = reliable
+            kept_rows = (matches.clusters >= 0) & (matches.ious >= settings.aggregation_iou)
+            region_sums.add(observation.codebook, matches.clusters, kept_rows)
+            region_sums.masks[name] = kept_rows
             region_sums.regions += int(matches.present.sum())
         progress("aggregate", number + 1, len(views), "views")
     return region_sums

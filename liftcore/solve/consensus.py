@@ -8,11 +8,11 @@ least BELONGS of splat j's weight in its group g (a level of a view), and ``t_j`
     c_jm  = (sum of q_jmv over the other views + PRIOR c) / (their number + PRIOR)
 
 g counts for m if ``vis_mg >= OBSERVES R_mm``: it sees enough of m. q is the share of m that another view puts into
-one region with j. For a right mask it is about one; for two merged objects a splat gets the share of its own object.
+one region with j. For a correct mask it is about one; for two merged objects a splat gets that of its own object.
 c is the mean of all q of the scene, so that an entry without other views has the average factor. The reason for each
 part:
 
-- **Per entry, not per region.** A large right mask that other views split keeps its weight at most splats, and a
+- **Per entry, not per region.** A large correct mask that other views split keeps its weight at most splats, and a
   small object in the mask of a large one loses its weight where the large one loses nothing.
 - **The best level of a view** counts: an object is no mistake if another level has its parts.
 - **Shares of m, not overlaps of m with n**: a part is no mistake inside its object.
@@ -141,7 +141,7 @@ def splat_tuples(
     """Return the tuples of some rows of W [n] i64, in their order.
 
     Args:
-        W, own: as `memberships` has them, of any views.
+        W, own_region: as `memberships` has them, of any views.
     """
     indptr, region = W.indptr.numpy(), W.region.numpy()
     counts = np.zeros(rows.size + 1, np.int64)

@@ -172,7 +172,8 @@ def sampled_splats(
     """Sample splats of the nodes of some views: return the offsets [n + 1] i64 of each, and rows of W.
 
     Args:
-        W, own: as `memberships` has them, of the regions ``base..base + offsets[-1]``. nodes: [N] i64, of all views.
+        W, own_region: as `memberships` has them, of the regions ``base..base + offsets[-1]``.
+        nodes: [N] i64, of all views.
     """
     view_nodes = nodes[slice(*np.searchsorted(nodes, [base, base + int(W.offsets[-1])]))]
     number = node_numbers(view_nodes - base, int(W.offsets[-1]))

@@ -20,7 +20,7 @@ before, and starts from the first W again. There are no tuned parameters; the re
   weights proportional to the signal give the least noise. There is no bandwidth; a region of two merged objects keeps
   part of its weight, and a region that points away from the others loses it.
 
-**Levels are separate where they disagree.** A whole and its part may have different vectors, and both are right:
+**Levels are separate where they disagree.** A whole and its part may have different vectors, and both are correct:
 their sum is neither, and at every border objects with the same vector on two levels would outvote the others. Where
 masks of parts and wholes differ (`NodeVectors.levels_disagree`), p, c, r, s and all sums are computed among the
 regions of one level, and each level keeps its weight at each splat. Cells of grids are one level. Levels that agree
@@ -40,7 +40,7 @@ and is worse. Cells of a grid do not claim that their splats are one object, so 
 an edge would lose their weight there.
 
 **Mask consensus** (`consensus`) enters as ``q_jm^(SHARPNESS (1 - r))``: where features agree, they reveal wrong masks
-themselves, and geometry counts more the less they agree. This exponent leaves right masks unchanged.
+themselves, and geometry counts more the less they agree. This exponent leaves correct masks unchanged.
 
 **Confidence** of a splat is the mean of c_jm over its entries, by their final weights: the agreement of independent
 views. **View consistency** of a splat is the same mean of ``(1 - p) c_jm + p c``: how well its own feature explains
@@ -74,7 +74,7 @@ BLOCK_ROWS, BLOCK_ENTRIES = 1 << 11, 1 << 15  # a splat has a sum per view
 POWERS = 1 << 12  # table size of powers of consensus; linear interpolation has a relative error of 3e-5 at most
 STEEP = np.float32(1 / 16)  # consensus below which interpolation is inaccurate; few entries are below
 NO_CONSENSUS = 1e-6  # of a splat's weight: a shorter r is the rounding error of inputs that cancel
-SHARPNESS = 4.0  # the largest value that costs right masks at most .001 of accuracy in any scene (docs/method.md)
+SHARPNESS = 4.0  # the largest value that costs correct masks at most .001 of accuracy in any scene (docs/method.md)
 
 
 @dataclass(frozen=True)

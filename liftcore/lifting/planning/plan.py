@@ -478,7 +478,7 @@ def check_device_memory(device: Device, splats: int, requested: str) -> list[str
     if requested == "cuda":
         raise Unavailable(
             "device", expected=f"{required} of free memory on {device.name}", got=available,
-            hint="end other programs there, lift fewer splats, smaller images or fewer channels, or take device=cpu",
+            hint="end other programs there, lift fewer splats, smaller images or fewer channels, or use device=cpu",
         )  # fmt: skip
     return [f"{device.name} has {available} free and the lift needs {required}: the lift runs on the CPU"]
 
