@@ -357,7 +357,9 @@ def test_the_current_card_may_be_named_by_its_number(scene):
         with pytest.raises(lc.Unavailable, match="device"):
             lc.lift(splats, cameras, views, device=device)
     for call in (lc.lift, lc.plan):
-        with pytest.raises(lc.InvalidSettings, match=r"cuda:0, .*got 'cuda:3'.*CUDA_VISIBLE"):
+        with pytest.raises(
+            lc.InvalidSettings, match=r"cuda:0, the current GPU, got 'cuda:3'.*CUDA_VISIBLE_DEVICES=3"
+        ):
             call(splats, cameras, views, device="cuda:3")
 
 

@@ -307,7 +307,7 @@ def test_tables_without_values_are_no_names(name: str, content: str, message: st
     [
         ({}, "no such folder"),
         ({"a.txt": "x"}, "got 1 other files"),
-        ({"a.png": MASKS["left"]["Lamp"]}, "outside of folders of phrases"),
+        ({"a.png": MASKS["left"]["Lamp"]}, "outside of folders of phrases, without names"),
         ({"mug/a.png": numbered_masks("left")}, r"one value besides 0, a mask, got values from 7 to 14"),
         ({"mug/a.png": np.full((2, 2, 4), 9, np.uint8)}, "colours with transparency"),
         ({"mug/a.png": "x"}, "not a PNG"),

@@ -85,7 +85,7 @@ def test_smoothness_changes_no_share_and_the_plan_says_so(smoothness, tmp_path, 
     assert reply["order"] == list(plan.order)
     assert [row["twice"] for row in reply["coverage"]] == pytest.approx([row.twice for row in plan.coverage])
     assert cli.main(arguments) == 0
-    assert ("smoothness" in capsys.readouterr().out) == (smoothness != "0")
+    assert ("smoothness does not change these shares" in capsys.readouterr().out) == (smoothness != "0")
 
 
 def test_splats_that_no_photo_sees_give_a_warning():

@@ -311,7 +311,7 @@ def test_what_is_whole_is_preferred_and_what_is_named_is_read(tmp_path: Path) ->
 
 def test_folder_without_a_usual_name_says_what_can_be_named(tmp_path: Path) -> None:
     (tmp_path / "transforms_test.json").write_text("{}")
-    with pytest.raises(InvalidCameras, match=r"such as .*transforms_test\.json"):
+    with pytest.raises(InvalidCameras, match=r"name one of the models or files, such as .*transforms_test\.json"):
         read_cameras(tmp_path)
     with pytest.raises(InvalidCameras, match=r"a folder without any of them$"):
         read_cameras(write_files(tmp_path / "empty", {}))
@@ -430,7 +430,7 @@ def test_one_model_of_a_later_number_is_read_without_a_word(tmp_path: Path) -> N
 def test_scenes_in_numbered_folders_are_no_models_of_one(tmp_path: Path) -> None:
     for number in (24, 37):
         write_files(tmp_path / "scans" / str(number), named_model(*ALL, shift=float(number)))
-    with pytest.raises(InvalidCameras, match=r"such as .*/24 or .*/37"):
+    with pytest.raises(InvalidCameras, match=r"name one of the models or files, such as .*/24 or .*/37"):
         read_cameras(tmp_path / "scans")
 
 
