@@ -30,8 +30,8 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--threshold", default="auto", metavar="T", help=f"of P2, P3 and own: {', '.join(METHODS)} or a number"
     )
-    competitors = "negative texts: all words up to the next option; may be repeated"
-    parser.add_argument("--negative", nargs="+", action="extend", default=[], metavar="WORD", help=competitors)
+    negative_help = "negative texts: all words up to the next option; may be repeated"
+    parser.add_argument("--negative", nargs="+", action="extend", default=[], metavar="WORD", help=negative_help)
     parser.add_argument(
         "--held-out", type=Path, metavar="FILE", help="file of the frames to evaluate, one name a line"
     )

@@ -114,7 +114,7 @@ def named_catalogue(options: argparse.Namespace, scene: Scene) -> tuple[TextEnco
 
 
 def named_tree(options: argparse.Namespace, scene: Scene) -> Catalogue | SceneTree:
-    """Return the same with parts and groups if the lift has them."""
+    """Return the named objects of a lift, with parts and groups if the lift has them."""
     encoder, words = _vocabulary(options, scene)
     return (scene.catalogue if scene.node is None else scene.tree)(words, encoder=encoder)
 

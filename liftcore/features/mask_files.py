@@ -362,7 +362,7 @@ def fill_polygons(size: tuple[int, int], parts: Iterable[np.ndarray]) -> np.ndar
     so its outlines differ by a fraction of a pixel.
 
     Raises:
-        InvalidFeatures: a part's edges cross more than MOST_CROSSINGS columns of pixels.
+        InvalidFeatures: a part's edges cross more than MAX_CROSSINGS columns of pixels.
     """
     height, width = size
     inside = np.zeros(size, bool)

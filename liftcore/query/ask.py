@@ -132,10 +132,10 @@ def ask(scene: OpenedLift, query: Query | str, encoder: TextEncoder | None = Non
     The threshold `auto` comes from a histogram of scores, in which each splat counts by its total weight, as splats
     hit by few rays have noisy scores; ``weight_by="confidence"`` multiplies it by the confidence. The selection uses
     the score alone. The threshold is compared with other words, and objects of the region graph may be selected
-    as a whole (`liftcore.query.selection`). Any other
-    threshold selects by the score alone. Scores that are all equal or zero select nothing. Absent words
-    (`liftcore.query.presence`) are left out of the scores, and without another positive nothing is selected, unless
-    the query keeps absent words. The presence of negatives and examples is not estimated.
+    as a whole (`liftcore.query.selection`). Any other threshold selects by the score alone. Scores that are all equal
+    or zero select nothing. Absent words (`liftcore.query.presence`) are left out of the scores, and without another
+    positive nothing is selected, unless the query keeps absent words. The presence of negatives and examples is not
+    estimated.
 
     Args:
         scene: an opened lift.

@@ -70,7 +70,7 @@ def relations(
 
     Args:
         splats: the scene. members: rows [n] i64 of the splats of each, the largest objects first; the first
-            MOST_THINGS are compared. weights: [P] of the splats.
+            MOST_OBJECTS are compared. weights: [P] of the splats.
         world: up axis and length unit, as far as they are known.
     """
     rotation = _rotation_to(world.up)
