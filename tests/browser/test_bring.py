@@ -223,7 +223,7 @@ def test_files_are_still_there_after_the_page_is_loaded_again(empty: Browser, fi
     empty.drop([files["features"]])
     empty.until("document.querySelectorAll('#sent .file').length === 3")
     empty.value("location.reload()")
-    empty.until("document.querySelector('.file.bad .state')")
+    empty.until("document.querySelector('.file.bad .state')?.textContent.includes('drop the file again')")
     assert "features.safetensors" in text_of(empty, ".file.bad .name")
     empty.drop([files["features"]])
     empty.until("!document.querySelector('#lift-it').disabled")
@@ -295,11 +295,11 @@ def test_lift_takes_a_name_and_photos(browser: Browser, server: PageServer, tmp_
     browser.press("#layer-photo")
     browser.until("document.querySelector('#over').naturalWidth === 32")
     browser.press("#view-after")
-    browser.until("!splatlift.layers.view.photo && document.querySelector('#over').hidden")
+    browser.until("document.querySelector('#layer-words').textContent === 'This view has no photo.'")
+    assert browser.value("document.querySelector('#over').hidden") is True
     browser.press("#panel-look input[value=evidence]")
-    browser.until(
-        "document.querySelector('#over').hidden && document.querySelector('#layer-words').textContent.includes('3D')"
-    )
+    browser.until("document.querySelector('#layer-words').textContent.endsWith('This layer is shown in 3D only.')")
+    assert browser.value("document.querySelector('#over').hidden") is True
 
 
 def test_strangers_files_become_an_object_that_lights_up(browser: Browser, tmp_path: Path) -> None:
@@ -314,7 +314,7 @@ def test_strangers_files_become_an_object_that_lights_up(browser: Browser, tmp_p
         page.give("#files", [tmp_path / "broken.ply", scene / "cameras.json"])
         page.until("document.querySelector('.file.bad')")
         assert "broken.ply" in text_of(page, ".file.bad .name")
-        assert "must be" in text_of(page, ".file.bad .state") and "got" in text_of(page, ".file.bad .state")
+        assert "It must be" in text_of(page, ".file.bad .state") and "got" in text_of(page, ".file.bad .state")
         assert page.value("document.querySelector('#lift-it').disabled") is True
         page.press(".file.bad .away")
         page.drop([scene / "point_cloud.ply", scene / "features.safetensors"])
