@@ -207,7 +207,7 @@ def require_share(argument: str, count: int, limit: int | None) -> None:
     """Require that a key is below its limit of such requests at a time; None means no limit.
 
     Raises:
-        TooMany: it has as many as it may.
+        KeyLimitReached: it has as many as it may.
     """
     if limit is not None and count >= limit:
         raise KeyLimitReached(

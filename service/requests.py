@@ -272,7 +272,7 @@ def get_and_post(router: APIRouter, path: str, parameters: Parameters[Any], **ro
 
 
 def _reading(endpoint: F, source: Any) -> F:
-    """Return the endpoint, with the argument ``parameters`` from there."""
+    """Return the endpoint, whose argument ``parameters`` has ``source`` as its annotation."""
 
     @wraps(endpoint)
     def reading(**arguments: Any) -> Any:

@@ -162,7 +162,7 @@ class _Asset:
             place, above = queue.pop()
             node = self._at(nodes, place, "node")
             if place in visited or max(len(visited), len(primitives)) >= MAX_NODES:
-                got = "one that meets a node twice, or more nodes"
+                got = "one that meets a node twice, or has more nodes"
                 raise self._broken(f"a tree of at most {MAX_NODES} nodes with splats", got)
             visited.add(place)
             matrix = above @ self._matrix(node, place) if TRANSFORM & node.keys() else above

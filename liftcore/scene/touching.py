@@ -39,7 +39,7 @@ def touching(splats: Splats, rows: np.ndarray, threads: int | None = None) -> np
 
 
 def touching_pairs(splats: Splats, rows: np.ndarray, threads: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return [m] and [m] i32, indices among rows [n] of pairs that touch, each once or twice; args of `touching`."""
+    """Return [m] and [m] i32, indices among rows [n] of pairs that touch, each once or twice."""
     if len(rows) < 2:
         return np.zeros(0, np.int32), np.zeros(0, np.int32)
     means = splats.means.cpu().numpy()[rows].astype(np.float64)

@@ -104,7 +104,7 @@ def open_lift(path: Path | str) -> Lift:
 
 
 def read_lift(path: Path | str) -> tuple[dict[str, np.ndarray], str]:
-    """Return the same as mapped arrays by their names, and its metadata as JSON: without torch and pydantic.
+    """Return the mapped arrays of a lift by their names, and its metadata as JSON: without torch and pydantic.
 
     Raises:
         InvalidLift: as `open_lift` has it.
@@ -292,7 +292,7 @@ def found_input(role: str, recorded: InputFile, metadata: LiftMetadata, lift: Pa
     Cameras match if those of the lifted views are unchanged, whatever other views there are.
 
     Args:
-        role: splats, cameras or features. lift: the lift's file; None looks at the remembered path alone.
+        role: splats, cameras or features. lift: the lift's file; None looks at the recorded path alone.
     """
     path = Path(recorded.path)
     places = [path] if lift is None else [path, *_candidates_beside(lift, path), *_in_store(lift, recorded.sha256)]
