@@ -208,11 +208,11 @@ class Hosts:
         bound: the address that the service listens on. When that is all of them, every address in digits is this
             service: rebinding needs a name.
         allowed_hosts: other names of this server, such as that of a proxy.
-        readers: origins of other sites whose pages may read, `*` for all.
+        cors_origins: origins of other sites whose pages may read, `*` for all.
     """
 
-    def __init__(self, bound: str, allowed_hosts: Iterable[str], readers: Iterable[str] = ()) -> None:
-        self._readers = frozenset(readers)
+    def __init__(self, bound: str, allowed_hosts: Iterable[str], cors_origins: Iterable[str] = ()) -> None:
+        self._cors_origins = frozenset(cors_origins)
         self._allowed_hosts = frozenset(name.lower() for name in allowed_hosts)
         self._names = LOOPBACK | {bound.lower()} | self._allowed_hosts
         self._all_addresses = _is_address(bound) and ipaddress.ip_address(bound).is_unspecified
@@ -242,7 +242,7 @@ class Hosts:
             raise ForeignOrigin("Origin", expected="this service's own page", got=", ".join(origins)[:200])
 
     def _may_read(self, origin: str) -> bool:
-        return "*" in self._readers or origin.lower() in self._readers
+        return "*" in self._cors_origins or origin.lower() in self._cors_origins
 
     def _same_site(self, origin: str, host: str) -> bool:
         try:

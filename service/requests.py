@@ -68,7 +68,7 @@ KnownParameters = Depends(_known_only)
 
 
 def _names(route: APIRoute) -> Iterator[str]:
-    """Return the query parameters that a route declares, one by one or as the fields of a model."""
+    """Yield the query parameters that a route declares, one by one or as the fields of a model."""
     for field in route.dependant.query_params:
         annotation = field.field_info.annotation
         if isinstance(annotation, type) and issubclass(annotation, BaseModel):
@@ -207,7 +207,7 @@ def _validated(request: Request, model: TypeAdapter[Any], content: bytearray) ->
 
 @dataclass(frozen=True)
 class Parameters(Generic[M]):
-    """Return a dependency that gives a model of the parameters of a request.
+    """Dependency that gives a model of the parameters of a request.
 
     Args:
         model: of the request. names: its fields that are parameters. needs: those that are required.

@@ -171,7 +171,7 @@ class ServiceSettings(BaseSettings):
 
 
 def variables() -> Iterator[tuple[str, str, str]]:
-    """Return the environment variable, default and description of each setting, in order."""
+    """Yield the environment variable, default and description of each setting, in order."""
     for name, field in ServiceSettings.model_fields.items():
         default = field.get_default(call_default_factory=True)
         unit, size = ("GiB", GiB) if name.endswith("bytes") and default and default % GiB == 0 else ("MiB", MiB)

@@ -87,7 +87,7 @@ class Readiness:
         self._failures: dict[str, str] = {}
 
     async def require(self) -> None:
-        """Return if all checks pass.
+        """Check the readiness; return if all checks pass.
 
         Raises:
             NotReady: the service stops, or a check failed; it says which.

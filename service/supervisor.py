@@ -570,7 +570,7 @@ def _processor_seconds(pid: int) -> float:
 
 
 def _family(pid: int) -> Iterator[int]:
-    """Return a process and its descendants, as Linux reports them; those that end meanwhile are left out."""
+    """Yield a process and its descendants, as Linux reports them; those that end meanwhile are left out."""
     yield pid
     for child in children_of(pid):
         yield from _family(child)

@@ -153,7 +153,7 @@ def _serve(
 
 
 def _read_example(name: str) -> bytes:
-    """Download a file of the example, with which the page orders a lift."""
+    """Read a file of the example, with which the page orders a lift."""
     if (EXAMPLE / name).exists():
         return (EXAMPLE / name).read_bytes()
     return zstandard.ZstdDecompressor().decompress((EXAMPLE / f"{name}.zst").read_bytes())

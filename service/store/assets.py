@@ -168,7 +168,7 @@ class AssetStore:
             return page_of(connection, VISIBLE, owner.terms(), limit, cursor, self._record)
 
     def all(self, owner: Owner) -> list[AssetRecord]:
-        """Yield every asset, newest first, without its names and words."""
+        """Return every asset, newest first, without its names and words."""
         return self.page(owner, sys.maxsize - 1).records
 
     def delete(self, owner: Owner, asset: str) -> None:

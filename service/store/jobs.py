@@ -203,7 +203,7 @@ class JobStore:
             return page_of(connection, select, owner.terms(), limit, cursor, lambda row: record(connection, row))
 
     def all(self, owner: Owner) -> list[JobRecord]:
-        """Yield every job, newest first."""
+        """Return every job, newest first."""
         return self.page(owner, sys.maxsize - 1).records
 
     def state(self, owner: Owner, job: str) -> JobState | None:
@@ -561,7 +561,7 @@ def _release(connection: sqlite3.Connection, row: sqlite3.Row, reason: str) -> N
 
 def _gave_up(reason: str) -> dict[str, str]:
     crashed = ProcessDied(
-        "job", expected="an answer from the job's process", got=f"none in {MAX_ATTEMPTS} attempts, last {reason}",
+        "job", expected="an answer from the job's process", got=f"none in {MAX_ATTEMPTS} attempts; last: {reason}",
         hint="signal 9 is mostly a lack of memory; the server's log has what the process printed",
     )  # fmt: skip
     return fault_of(crashed)

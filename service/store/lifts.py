@@ -347,7 +347,7 @@ class LiftStore:
             return page_of(connection, VISIBLE, owner.terms(), limit, cursor, self._record)
 
     def all(self, owner: Owner) -> list[LiftRecord]:
-        """Yield every lift, newest first."""
+        """Return every lift, newest first."""
         return self.page(owner, sys.maxsize - 1).records
 
     def _record(self, row: sqlite3.Row) -> LiftRecord:

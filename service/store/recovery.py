@@ -125,7 +125,7 @@ def _damage_of(path: Path, size: int, digest: str) -> str | None:
 
 
 def _files(data: Path) -> list[tuple[str, int, str]]:
-    """Yield path below the directory, bytes and sha256 of every file in the database."""
+    """Return path below the directory, bytes and sha256 of every file in the database."""
     with closing(open_to_read(data / DATABASE)) as connection:
         return connection.execute(
             "SELECT file, bytes, substr(id, 8) FROM assets UNION SELECT file, bytes, sha256 FROM lifts"
