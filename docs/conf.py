@@ -16,7 +16,7 @@ from fastapi.routing import APIRoute
 
 import liftcore
 import service.routes
-from liftcore.values.settings import Preset, Speed
+from liftcore.values.settings import Preset, Quality
 
 ROOT = Path(__file__).parents[1]
 
@@ -120,15 +120,15 @@ def table_of_routes() -> str:
     return table(("route", "answer"), *(rows[key] for key in sorted(rows)))
 
 
-def table_of_speeds() -> str:
-    """Return the settings that each speed sets, beside those of `exact`."""
-    speeds = {speed.value: liftcore.LiftSettings.of(speed=speed).model_dump(mode="json") for speed in Speed}
-    exact = speeds[Speed.EXACT]
+def table_of_quality() -> str:
+    """Return the settings that each level of quality sets, beside those of `exact`."""
+    levels = {level.value: liftcore.LiftSettings.of(quality=level).model_dump(mode="json") for level in Quality}
+    exact = levels[Quality.EXACT]
     names = [
-        name for name in exact if name != "speed" and any(values[name] != exact[name] for values in speeds.values())
+        name for name in exact if name != "quality" and any(values[name] != exact[name] for values in levels.values())
     ]
-    rows = ((f"`{speed}`", *(f"`{code(values[name])}`" for name in names)) for speed, values in speeds.items())
-    return table(("`speed`", *(f"`{name}`" for name in names)), *rows)
+    rows = ((f"`{level}`", *(f"`{code(values[name])}`" for name in names)) for level, values in levels.items())
+    return table(("`quality`", *(f"`{name}`" for name in names)), *rows)
 
 
 def code(value: Any) -> str:
@@ -138,7 +138,7 @@ def code(value: Any) -> str:
 
 TABLES = {
     "settings": table_of_settings,
-    "speeds": table_of_speeds,
+    "quality": table_of_quality,
     "fields of a question": table_of_question,
     "public names": table_of_names,
     "routes": table_of_routes,

@@ -17,7 +17,7 @@ def main(splats_path: str, cameras_path: str, features_path: str, word: str, out
     """Write ``out/masks/VIEW.png`` and ``out/scores.ply``."""
     splats = lc.read_splats(splats_path)
     cameras = lc.read_cameras(cameras_path)
-    result = lc.lift(splats, cameras, lc.read_features(features_path), speed="balanced", seed=0)
+    result = lc.lift(splats, cameras, lc.read_features(features_path), quality="balanced", seed=0)
     answer = result.query(word, splats=splats)
     print(answer.explanation)
 

@@ -76,8 +76,9 @@ class Published:
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         copy = deepcopy(handler.resolve_ref_schema(handler(self.model.__pydantic_core_schema__)))
-        for name in self.without:
-            copy["properties"].pop(name)
+        names = [old for old, new in getattr(self.model, "old_names", {}).items() if new in self.without]
+        for name in (*self.without, *names):
+            copy["properties"].pop(name, None)
         del copy["title"]
         return copy
 
@@ -99,7 +100,7 @@ Bounded = BeforeValidator(_bounded)
 
 ASSET_ID = r"^sha256:[0-9a-f]{64}$"
 JOB_ID = r"^[0-9a-f]{32}$"
-TRADEOFF_SETTING = "speed"  # set by the runs of a trade-off alone
+TRADEOFF_SETTING = "quality"  # set by the runs of a trade-off alone
 PRINTABLE = r"^[^\x00-\x1f\x7f]*$"
 
 BODY_CONFIG = ConfigDict(defer_build=False)  # for models of bodies, which FastAPI builds at the start
@@ -222,8 +223,8 @@ class LiftInputs(Body):
     ] = Field(description=f"feature packs, each counts once; at most {PACKS}")
     settings: Annotated[dict[str, Scalar], Bounded, Published(LiftSettings)] = Field(
         default_factory=dict,
-        description="settings of the lift; others take the values of the preset and the speed",
-        examples=[{"preset": "default", "speed": "balanced"}],
+        description="settings of the lift; others take the values of the preset and the quality",
+        examples=[{"preset": "default", "quality": "balanced"}],
     )
 
 
@@ -251,7 +252,7 @@ class TradeoffRequest(LiftInputs):
 
     settings: Annotated[dict[str, Scalar], Bounded, Published(LiftSettings, without=(TRADEOFF_SETTING,))] = Field(
         default_factory=dict,
-        description="settings of all runs, without speed, which is compared; the levels of speed begin with a preset",
+        description="settings of all runs, without quality, which is compared; its levels begin with a preset",
         examples=[{"robust_steps": 1}],
     )
     budget_s: Annotated[float, Field(ge=10, le=86_400), NoBoolean] = Field(
@@ -450,7 +451,7 @@ class Tradeoff(BaseModel):
     cameras: AssetId
     features: list[AssetId]
     labels: Labels | None = Field(description="the masks with the true labels")
-    runs: list[dict[str, Any]] = Field(description="one for each preset and speed: seconds and accuracy")
+    runs: list[dict[str, Any]] = Field(description="one for each preset and level of quality: seconds and accuracy")
     skipped: list[str] = Field(description="runs that did not fit the budget")
     refused: list[str] = Field(default=[], description="runs that the settings do not allow")
     choice: dict[str, Any] = Field(description="the recommended runs, with reasons")

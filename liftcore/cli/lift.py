@@ -107,14 +107,14 @@ def require_folder(folder: Path) -> None:
 
 
 def settings_of(options: argparse.Namespace) -> LiftSettings:
-    """Return the settings of ``--preset``, ``--speed``, ``--device`` and ``--set key=value``.
+    """Return the settings of ``--preset``, ``--quality``, ``--device`` and ``--set key=value``.
 
     Raises:
         InvalidSettings: a pair without ``=``, an unknown name, one with two values or a value out of range.
     """
     from liftcore import LiftSettings
 
-    options_by_name = {"preset": options.preset, "speed": options.speed, "device": options.device}
+    options_by_name = {"preset": options.preset, "quality": options.quality, "device": options.device}
     values = pairs_of(options.set)
     for name, value in options_by_name.items():
         if value is not None and values.setdefault(name, value) != value:

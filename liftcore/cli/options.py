@@ -142,7 +142,8 @@ def add_settings(parser: Parser) -> None:
     """Add the options of the settings of a lift."""
     parser.appendix = settings_help
     parser.add_argument("--preset", metavar="NAME", help=f"a set of weights: {PRESETS}")
-    parser.add_argument("--speed", metavar="NAME", help="the dial: exact, balanced, fast or draft")
+    quality_help = "level of quality: exact, balanced, fast or draft"
+    add_renamed(parser, "--quality", ["--speed"], metavar="NAME", help=quality_help)
     add_device(parser)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one of the settings below")
 

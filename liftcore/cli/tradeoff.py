@@ -19,7 +19,11 @@ def add_arguments(parser: Parser) -> None:
         "-o", "--out", type=Path, default=Path("tradeoff"), metavar="DIR", help="folder of the output"
     )
     parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of all runs; preset: of the dial's"
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="a setting of all runs; preset: of the runs that differ in quality",
     )
     parser.add_argument("--labels", type=Path, metavar="MASKS", help="VIEW/mask [h, w], class numbers")
     parser.add_argument("--table", type=Path, metavar="FILE", help="text embeddings of the classes")

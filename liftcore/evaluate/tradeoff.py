@@ -1,4 +1,4 @@
-"""Speed against accuracy on a scene of the user's: ``speed``, presets, smoothness, aggregation, in a budget of time.
+"""Speed against accuracy on a user's scene: ``quality``, presets, smoothness, aggregation, in a budget of time.
 
 Each run is a process of its own (``python -m liftcore.evaluate.tradeoff``: a pickled `RunSpec` on stdin, figures as
 JSON on stdout), so that its memory is measured alone. Time is CPU time, as wall time depends on other programs of the
@@ -75,11 +75,11 @@ class Candidate:
     times: float = 1.0  # assumed maximum ratio of its seconds to the exact run's
 
 
-EXACT = Candidate("exact", "dial", {"speed": "exact"})  # the caller's settings unchanged
-DRAFT = Candidate("draft", "dial", {"speed": "draft"})
+EXACT = Candidate("exact", "dial", {"quality": "exact"})  # the caller's settings unchanged
+DRAFT = Candidate("draft", "dial", {"quality": "draft"})
 CANDIDATES = (  # in the order in which the budget is spent; a candidate overrides some of the caller's settings
     EXACT,
-    Candidate("fast", "dial", {"speed": "fast"}),
+    Candidate("fast", "dial", {"quality": "fast"}),
     Candidate("default", "preset", {"preset": "default"}, 1.6),
     Candidate("row-sum", "preset", {"preset": "row-sum"}),
     Candidate("tikhonov", "preset", {"preset": "tikhonov"}),
@@ -87,7 +87,7 @@ CANDIDATES = (  # in the order in which the budget is spent; a candidate overrid
     Candidate("smooth", "preset", {"smoothness": "auto"}, 2.5),
     Candidate("aggregation", "preset", {"aggregation": True}, 2.5),
     Candidate("tikhonov + aggregation", "preset", {"preset": "tikhonov", "aggregation": True}, 2.5),
-    Candidate("balanced", "dial", {"speed": "balanced"}),
+    Candidate("balanced", "dial", {"quality": "balanced"}),
     Candidate("front-mass", "preset", {"preset": "front-mass"}),
     Candidate("argmax", "preset", {"preset": "argmax"}),
     Candidate("centre", "preset", {"preset": "centre"}),
@@ -103,7 +103,7 @@ def candidates_of(settings: Mapping[str, Any]) -> list[Candidate]:
     for candidate in CANDIDATES:
         lift_settings = _settings_of(settings, candidate)
         if lift_settings is not None:
-            lifts.setdefault(lift_settings.model_dump_json(exclude={"preset", "speed"}), candidate)
+            lifts.setdefault(lift_settings.model_dump_json(exclude={"preset", "quality"}), candidate)
     return list(lifts.values())
 
 

@@ -1,4 +1,4 @@
-"""A comparison of speeds and its report: ``tradeoff.png``, ``.md`` and ``.json`` in a folder."""
+"""A comparison of settings and its report: ``tradeoff.png``, ``.md`` and ``.json`` in a folder."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from liftcore.io.files import whole_file
 from liftcore.io.json_file import finite
 from liftcore.runtime.progress import Progress, shown_progress
 from liftcore.scene.kernel import Kernel
+from liftcore.values.settings import LiftSettings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,10 +28,10 @@ if TYPE_CHECKING:
 HEADS = ("run", "views", "wall s", "CPU s", "faster by CPU", "peak MiB", "cosine", "5 %", "lost", "centred",
          "mask IoU", "phrase IoU", "95 %")  # fmt: skip
 KEY = (
-    "*exact* is your settings as they are (`default` where they name no preset), which the dial and *aggregation* "
-    "keep. Seconds are of the lift without reading its files. *cosine* is against the exact run, over the splats "
-    "that it saw: the mean by total weight, and what 5 % of the splats stay below; *lost* is the share of them "
-    "without a feature. *centred* is the cosine of what is rendered into views that no run lifted "
+    "*exact* is your settings as they are (`default` where they name no preset), which the levels of quality "
+    "and *aggregation* keep. Seconds are of the lift without reading its files. *cosine* is against the exact run, "
+    "over the splats that it saw: the mean by total weight, and what 5 % of the splats stay below; *lost* is the "
+    "share of them without a feature. *centred* is the cosine of what is rendered into views that no run lifted "
     "with what these observe, "
     "both less the mean of what is observed, a region at a time. *95 %* is the interval of what runs are judged by, "
     "over draws of its views."
@@ -42,7 +43,7 @@ LEAST_SHARE = 0.02  # of any run's seconds, for a stage that the chart shows
 
 @dataclass(frozen=True)
 class SpeedComparison:
-    """Runs of a scene at several speeds and presets, and the recommended one."""
+    """Runs of a scene at several levels of quality and presets, and the recommended one."""
 
     document: dict[str, Any]
     """plain numbers, ready for JSON"""
@@ -67,30 +68,32 @@ def compare_speeds(
     scene: str = "",
     command: str = "",
 ) -> SpeedComparison:
-    """Lift a scene at several speeds and by several presets, as many as fit a budget of time, and choose.
+    """Lift a scene at several levels of quality and by several presets, as many as fit a budget of time, and choose.
 
     Each run is a process of its own.
 
     Args:
         files: of the scene, and labels for the evaluation; without labels held-out views are used.
         budget: seconds. The exact run is always made, from few views if necessary.
-        settings: of all runs, beside ``speed``, which is compared.
+        settings: of all runs, beside ``quality``, which is compared.
         kernel: of the splats, to compile all kernels before the budget begins.
         threads, progress: as in `liftcore.lift`.
         scene, command: that the report names.
 
     Raises:
-        InvalidSettings: ``speed`` among the settings. InvalidInput: the scene lacks an input, or a lift rejects one.
+        InvalidSettings: ``quality`` among the settings.
+        InvalidInput: the scene lacks an input, or a lift rejects one.
         Unavailable: matplotlib is not installed, which draws the chart; a run did not end within a day.
     """
     if not isinstance(files, SceneFiles):
         raise InvalidInput("files", expected="SceneFiles", got=repr(files)[:80])
-    if not isinstance(settings, Mapping) or "speed" in settings:
-        got = "speed" if isinstance(settings, Mapping) else repr(settings)[:80]
+    run_settings = LiftSettings.current_names(dict(settings)) if isinstance(settings, Mapping) else None
+    if run_settings is None or "quality" in run_settings:
+        got = repr(settings)[:80] if run_settings is None else "quality"
         raise InvalidSettings("settings", expected="settings that are the same in all runs", got=got)
     _check_chart()
     with shown_progress(progress) as reporter:
-        facts = compare(files, budget, settings, threads, reporter, kernel)
+        facts = compare(files, budget, run_settings, threads, reporter, kernel)
     return SpeedComparison(finite({"title": TITLE, "scene": scene, "command": command} | facts))
 
 

@@ -291,7 +291,7 @@ class OpenedLift:
         """Explain why the lift has no objects, and how to get some."""
         settings = self.metadata.settings
         if settings.objects is False:
-            cause = "speed=draft sets it" if settings.speed == "draft" else "they were not requested"
+            cause = "quality=draft sets it" if settings.quality == "draft" else "they were not requested"
             return f"this lift has no objects, as objects=false ({cause}): lift again with objects=auto"
         return (
             "this lift has no objects: they are found by lifts of masks, by the preset default or the setting "

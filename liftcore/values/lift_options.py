@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal, TypedDict
 
 from liftcore.scene.compositing import Selection
-from liftcore.values.settings import Speed
+from liftcore.values.settings import Quality
 
 if TYPE_CHECKING:
     import torch
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 class LiftOptions(TypedDict, total=False):
     """The fields of `LiftSettings` but the preset, which is an argument of its own; a test holds them equal."""
 
-    speed: Speed | Literal["exact", "balanced", "fast", "draft"]
+    quality: Quality | Literal["exact", "balanced", "fast", "draft"]
     selection: Selection | Literal["all", "top-k", "front-mass", "centre"]
     k: int
     mass: float

@@ -71,7 +71,7 @@ _PRESETS: dict[Preset, dict[str, Any]] = {
 }
 
 
-class Speed(StrEnum):
+class Quality(StrEnum):
     """Level of the trade-off between speed and accuracy."""
 
     EXACT = "exact"  # every pixel of every view
@@ -80,10 +80,10 @@ class Speed(StrEnum):
     DRAFT = "draft"
 
 
-_SPEEDS: dict[Speed, dict[str, Any]] = {
-    Speed.EXACT: {},
-    Speed.BALANCED: {"stride": 2, "diagnostic_rays": 2_000},
-    Speed.FAST: {
+_LEVELS: dict[Quality, dict[str, Any]] = {
+    Quality.EXACT: {},
+    Quality.BALANCED: {"stride": 2, "diagnostic_rays": 2_000},
+    Quality.FAST: {
         "stride": 3,
         "robust_directions": 128,
         "view_cosine": 0.992,
@@ -91,7 +91,7 @@ _SPEEDS: dict[Speed, dict[str, Any]] = {
         "transmittance_stop": 0.003,
         "diagnostic_rays": 500,
     },
-    Speed.DRAFT: {
+    Quality.DRAFT: {
         "stride": 4,
         "robust_directions": 64,
         "objects": False,
@@ -108,7 +108,7 @@ MOST_DIAGNOSTIC_RAYS = 1_000_000
 
 
 GROUPS = {  # of the settings, for people who read all of them
-    "a choice of many": ("preset", "speed"),
+    "a choice of many": ("preset", "quality"),
     "weights of a ray that count": ("selection", "k", "mass", "weight_floor", "power"),
     "pixels, views and levels": ("stride", "view_stride", "coverage", "view_cosine", "levels", "grid_reading"),
     "the rasterizer": ("kernel", "antialiased", "lift_gain", "render_gain", "alpha_cap", "transmittance_stop"),
@@ -128,7 +128,7 @@ class LiftSettings(PlainModel):
     """All that decides the result of a lift, and where it runs. Knobs left out take the preset's values."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
-    old_names: ClassVar = {"certificate_rays": "diagnostic_rays"}
+    old_names: ClassVar = {"certificate_rays": "diagnostic_rays", "speed": "quality"}
     error_type: ClassVar = InvalidSettings
 
     preset: Preset = Field(
@@ -137,9 +137,10 @@ class LiftSettings(PlainModel):
         "`default` also `robust_steps`, `reliability`, `consensus`, `aggregation_clusters` and "
         "`aggregation_guard`",
     )
-    speed: Speed = Field(
-        Speed.EXACT,
-        description="the dial: `exact`, `balanced`, `fast` or `draft` set others; what you set yourself wins",
+    quality: Quality = Field(
+        Quality.EXACT,
+        description="level of quality: `exact`, `balanced`, `fast` or `draft`, from the slowest to the fastest. It "
+        "sets others; what you set yourself wins",
     )
     selection: Selection = Field(
         Selection.ALL, description="which weights of a ray count: `all`, `top-k`, `front-mass` or `centre`"
@@ -331,18 +332,18 @@ class LiftSettings(PlainModel):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _fill_from_preset_and_speed(cls, values: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+    def _fill_from_preset_and_quality(cls, values: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
         if not isinstance(values, dict):
             return handler(values)
         values = cls.current_names(values)
         if "device" in values:
             values = values | {"device": device_name(values["device"])}
-        preset, speed = values.get("preset", Preset.DEFAULT), values.get("speed", Speed.EXACT)
+        preset, quality = values.get("preset", Preset.DEFAULT), values.get("quality", Quality.EXACT)
         weights = _PRESETS[Preset(preset)] if isinstance(preset, str) and preset in set(Preset) else {}
-        effort = _SPEEDS[Speed(speed)] if isinstance(speed, str) and speed in set(Speed) else {}
+        level = _LEVELS[Quality(quality)] if isinstance(quality, str) and quality in set(Quality) else {}
         if values.get("robust_steps") in (0, "0"):  # drop the preset's settings that need a step; a caller's own stay
             weights = {name: value for name, value in weights.items() if name not in _REWEIGHTED}
-        settings = handler({**weights, **effort, **values})
+        settings = handler({**weights, **level, **values})
         settings.model_fields_set.intersection_update(values)  # set by the caller; they stay when the preset changes
         return settings
 
@@ -373,8 +374,8 @@ class LiftSettings(PlainModel):
         return self
 
     def __repr__(self) -> str:
-        overrides = self.model_dump(mode="json", include=self.model_fields_set - {"preset", "speed"})
-        arguments = {"preset": str(self.preset), "speed": str(self.speed), **overrides}
+        overrides = self.model_dump(mode="json", include=self.model_fields_set - {"preset", "quality"})
+        arguments = {"preset": str(self.preset), "quality": str(self.quality), **overrides}
         return one_line(self, *(f"{name}={value!r}" for name, value in arguments.items()))
 
     @property
@@ -527,7 +528,7 @@ class LiftSettings(PlainModel):
             return cls.of(preset=preset, **changes)
         if not changes:
             return preset
-        base = {"preset": preset.preset, "speed": preset.speed}
+        base = {"preset": preset.preset, "quality": preset.quality}
         values, defaults = preset.model_dump(), cls.of(**base).model_dump()
         explicit = preset.model_fields_set
         explicit = explicit if len(explicit) < len(values) else set()  # all of them: settings of a file

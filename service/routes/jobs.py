@@ -129,10 +129,11 @@ def _planned(order: models.LiftRequest, deps: AppState) -> models.Plan:
 
 
 def _compare(order: models.TradeoffRequest, deps: AppState, key: str | None) -> Response:
-    if models.TRADEOFF_SETTING in order.settings:
+    settings = LiftSettings.current_names(order.settings)
+    if models.TRADEOFF_SETTING in settings:
         expected, got = "settings that are the same in all runs", "one that is compared"
         raise InvalidSettings(models.TRADEOFF_SETTING, expected=expected, got=got)
-    LiftSettings.of_json(order.settings)
+    LiftSettings.of_json(settings)
     if order.budget_s > deps.settings.tradeoff_seconds:
         limit = f"at most {deps.settings.tradeoff_seconds:g} s, as the operator allows"
         raise InvalidRequest("budget_s", expected=limit, got=f"{order.budget_s:g}")
@@ -143,7 +144,7 @@ def _compare(order: models.TradeoffRequest, deps: AppState, key: str | None) -> 
         deps,
         key,
         order_json=document,
-        settings=order.settings,
+        settings=settings,
         kind=models.JobKind.TRADEOFF,
         parameters=parameters,
     )
@@ -250,7 +251,10 @@ def shape(job: JobRecord) -> models.Job:
         links["cancel"] = f"/jobs/{job.id}/cancel"
     if job.state is models.JobState.SUCCEEDED:
         links |= RESULT_LINKS[job.kind](job.id)
-    return models.Job.model_validate({**vars(job), "problem": _problem(job.problem), "links": links})
+    settings = LiftSettings.with_old_names(job.settings)
+    return models.Job.model_validate(
+        {**vars(job), "settings": settings, "problem": _problem(job.problem), "links": links}
+    )
 
 
 def _problem(fault: Mapping[str, str] | None) -> models.Problem | None:

@@ -370,4 +370,10 @@ def shape_tradeoff(tradeoff: TradeoffRecord) -> models.Tradeoff:
     links = {"self": path, "job": f"/jobs/{tradeoff.id}", "chart": f"{path}/chart", "table": f"{path}/table"}
     names = ("id", "splats", "cameras", "features", "labels", "created")
     fields = {name: getattr(tradeoff, name) for name in names}
-    return models.Tradeoff.model_validate({**tradeoff.document, **fields, "links": links})
+    runs = [_run_with_old_names(run) for run in tradeoff.document["runs"]]
+    return models.Tradeoff.model_validate({**tradeoff.document, "runs": runs, **fields, "links": links})
+
+
+def _run_with_old_names(run: dict[str, Any]) -> dict[str, Any]:
+    settings = {name: LiftSettings.with_old_names(run[name]) for name in ("options", "settings") if name in run}
+    return run | settings

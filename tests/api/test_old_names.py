@@ -7,7 +7,13 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
+from liftcore import LiftSettings
+
+from .following import wait_for_end
+from .test_jobs import Quick, quick
 from .test_problems import assert_problem
+
+__all__ = ["quick"]  # a fixture
 
 
 @pytest.mark.parametrize(
@@ -70,6 +76,22 @@ def test_replies_have_old_names_beside_the_new_ones(client: TestClient, lift: di
         document = reply.json()
         for new, old in pairs:
             assert document[new] == document[old], reply.request.url
+
+
+def test_settings_are_read_by_old_names_and_returned_by_both(quick: Quick) -> None:
+    with quick("answer") as (client, body):
+        orders = {"/lift": {"speed": "draft", "certificate_rays": 7}, "/tradeoff": {"certificate_rays": 7}}
+        for path, settings in orders.items():
+            order = body | {"settings": settings} | ({"budget_s": 60} if path == "/tradeoff" else {})
+            job = wait_for_end(client, client.post(path, json=order).headers["location"])
+            assert {name: job["settings"][name] for name in settings} == settings
+            for old in settings:
+                new = LiftSettings.old_names[old]
+                assert job["settings"][new] == job["settings"][old]
+                wrong = order | {"settings": settings | {new: LiftSettings.model_fields[new].default}}
+                problem = assert_problem(client.post(path, json=wrong))
+                assert (problem["status"], problem["argument"]) == (422, new)
+                assert f"{old} is the old name of {new}" in problem["expected"]
 
 
 def test_a_zip_of_things_is_one_of_objects(client: TestClient, lift: dict[str, Any]) -> None:

@@ -226,7 +226,7 @@ def test_field_of_a_query_says_what_it_takes(client: TestClient, body: str, argu
         ("/query", {"x" * 500: 1}, "x" * 80, "text"),
         ("/lift", {"knobs": {}}, "knobs", "settings"),
         ("/tradeoff", {"labels": {"mask": 1}}, "labels.mask", "masks, table, classes"),
-        ("/lift", {"settings": {"x" * 500: 1}}, "x" * 80, "preset, speed, "),
+        ("/lift", {"settings": {"x" * 500: 1}}, "x" * 80, "preset, quality, "),
     ],
 )
 def test_unknown_field_is_refused_with_the_known_ones(

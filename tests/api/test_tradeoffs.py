@@ -87,6 +87,7 @@ def test_what_was_found_is_no_lift_and_goes_when_that_is_said(quick: Quick) -> N
         ({"budget_s": 3601}, "at most 3600 s"),
         ({"budget_s": math.nan}, "budget_s"),
         ({"budget_s": math.inf}, "budget_s"),
+        ({"settings": {"quality": "fast"}}, "the same in all runs"),
         ({"settings": {"speed": "fast"}}, "the same in all runs"),
         ({"settings": {"stride": 0}}, "stride"),
         ({"labels": "x"}, "labels"),
@@ -122,7 +123,7 @@ def test_real_tradeoff_is_judged_by_the_masks_of_its_order(
     tradeoff = client.get(job["links"]["tradeoff"]).json()
     exact = tradeoff["runs"][0]
     assert exact["name"] == "exact" and exact["cosine"] == pytest.approx(1.0) and exact["mask_iou"] > 0.5
-    assert exact["settings"]["preset"] == "tikhonov"  # where the dial starts
+    assert exact["settings"]["preset"] == "tikhonov"  # where the levels of quality begin
     assert all(run["settings"]["diagnostic_rays"] == 0 for run in tradeoff["runs"])
     assert (tradeoff["labelled_views"], tradeoff["labels"], tradeoff["choice"]["accuracy"]) == (
         1,

@@ -1,6 +1,6 @@
-"""The setting ``speed`` on one scene: processor seconds of whole lifts by turns, and how near to exact they come.
+"""The setting ``quality`` on one scene: processor seconds of whole lifts by turns, and how near to exact they come.
 
-    python -m tests.benchmarks.speeds FOLDER [--speeds NAME...] [--rounds N] [--json]
+    python -m tests.benchmarks.speeds FOLDER [--quality NAME...] [--rounds N] [--json]
 
 All views are lifted, on one thread, in one process; seconds are the fewest of the rounds, with reading, without
 compiling. ``splatlift tradeoff`` measures more, with views held out. FOLDER as `tests.benchmarks.scenes` makes it.
@@ -12,7 +12,7 @@ from pathlib import Path
 import liftcore as lc
 from liftcore.evaluate.accuracy import cosine_figures
 from liftcore.lifting.files import lift_files
-from liftcore.values.settings import Speed
+from liftcore.values.settings import Quality
 from tests.benchmarks.base import command_line, print_rows, scene_files
 
 
@@ -22,7 +22,7 @@ def main() -> None:
         "tests.benchmarks.speeds",
         __doc__,
         ("folder", {"type": Path}),
-        ("--speeds", {"nargs": "+", "default": list(map(str, Speed)), "choices": list(map(str, Speed))}),
+        ("--quality", {"nargs": "+", "default": list(map(str, Quality)), "choices": list(map(str, Quality))}),
         ("--rounds", {"type": int, "default": 2}),
     )
     options = parser.parse_args()
@@ -30,23 +30,23 @@ def main() -> None:
     seconds: dict[str, float] = {}
     lifts: dict[str, lc.LiftResult] = {}
     for number in range(1 + max(1, options.rounds)):  # the first round compiles
-        for speed in dict.fromkeys(["exact", *options.speeds]):
+        for level in dict.fromkeys(["exact", *options.quality]):
             start = time.process_time()
-            settings = lc.LiftSettings.of(preset="tikhonov", speed=speed, device="cpu")
-            lifts[speed] = lift_files(splats, cameras, [pack], settings, threads=1)
+            settings = lc.LiftSettings.of(preset="tikhonov", quality=level, device="cpu")
+            lifts[level] = lift_files(splats, cameras, [pack], settings, threads=1)
             if number:
-                seconds[speed] = min(seconds.get(speed, float("inf")), time.process_time() - start)
+                seconds[level] = min(seconds.get(level, float("inf")), time.process_time() - start)
     exact = lifts["exact"]
     rows = [
         {
-            "speed": speed,
+            "quality": level,
             "views": len(lifted.metadata.views),
-            "processor s": seconds[speed],
-            "times less": seconds["exact"] / seconds[speed],
+            "processor s": seconds[level],
+            "times less": seconds["exact"] / seconds[level],
             **cosine_figures(lifted.features, exact.features, exact.total_weight),
             "expected of the views": lifted.metadata.diagnostics["plan"]["view_cosine"],
         }
-        for speed, lifted in lifts.items()
+        for level, lifted in lifts.items()
     ]
     print_rows(rows, as_json=options.json)
 

@@ -100,7 +100,7 @@ def test_dropped_files_are_planned_compared_and_cancelled(empty: Browser, files:
     assert len(labels) == len(runs) and all(label.startswith(name) for name, label in zip(runs, labels, strict=True))
     empty.value(f"{POINT}.dispatchEvent(new Event('click'))")  # its lift, which is made anew
     empty.until(READY, LONG)
-    name_of = "({preset, speed}) => [preset, speed].join()"
+    name_of = "({preset, quality}) => [preset, quality].join()"
     assert (
         empty.value(f"[splatlift.uploads.chart.runs[0], splatlift.lift].map(one => one.settings).map({name_of})")
         == [empty.value(f"({name_of})(splatlift.lift.settings)")] * 2

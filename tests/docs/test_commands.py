@@ -15,7 +15,7 @@ import pytest
 
 from liftcore import Query
 from liftcore.cli import COMMANDS, SERVICE_COMMANDS, build_parser
-from liftcore.values.settings import LiftSettings, Preset, Speed
+from liftcore.values.settings import LiftSettings, Preset, Quality
 from service.settings import ServiceSettings
 
 from .readme import (
@@ -148,12 +148,12 @@ def test_every_setting_of_a_lift_is_in_the_sites_table_with_its_default() -> Non
 def test_every_speed_is_in_the_sites_table_with_what_it_sets() -> None:
     section = site_text(RESULTS).partition("### Speed against accuracy")[2].partition("\n### ")[0]
     head, _, *rows = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("|")]
-    for row, speed in zip(rows, Speed, strict=True):
-        values = LiftSettings.of(speed=speed).model_dump(mode="json")
+    for row, level in zip(rows, Quality, strict=True):
+        values = LiftSettings.of(quality=level).model_dump(mode="json")
         names = [name.strip("`") for name in head]
         expected = [json.dumps(values[name]).strip(chr(34)) for name in names]
-        assert [cell.strip("`") for cell in row] == expected, speed
-        assert {name for name, value in LiftSettings.of(speed="exact") if values[name] != value} <= {*names}, speed
+        assert [cell.strip("`") for cell in row] == expected, level
+        assert {name for name, value in LiftSettings.of(quality="exact") if values[name] != value} <= {*names}, level
 
 
 def test_help_of_a_lift_lists_every_setting_with_its_default_and_meaning_in_a_group(

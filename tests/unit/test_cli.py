@@ -263,11 +263,11 @@ def test_plan_is_printed_alone_and_before_a_lift_and_kept_with_it(
     assert plan["views"] == {"lifted": ["front"], "left_out": []}
     assert (plan["splats"], plan["channels"], plan["dtype"]) == (2, 3, "float16")
     assert plan["memory_bytes"] == sum(plan["memory"].values())
-    status, out, _ = run(capsys, *arguments, "--explain", "--speed", "draft", "--set", "stride=1")
+    status, out, _ = run(capsys, *arguments, "--explain", "--quality", "draft", "--set", "stride=1")
     summary = "plan: 2 splats (3dgs), 100.0% in some view's field; 1 of 1 views"
     assert status == 0 and out.startswith(f"{summary}\n")
     metadata = load_lift(scene / "lift.safetensors").metadata
-    assert (metadata.settings.speed, metadata.settings.stride, metadata.settings.view_cosine) == ("draft", 1, 0.98)
+    assert (metadata.settings.quality, metadata.settings.stride, metadata.settings.view_cosine) == ("draft", 1, 0.98)
     assert metadata.diagnostics["plan"]["memory_bytes"] == plan["memory_bytes"]
     status, out, err = run(capsys, *arguments)
     plan_text, _, rest = out.partition(f"{scene / 'lift.safetensors'}: ")

@@ -119,7 +119,7 @@ def test_method_and_argument_of_a_class_are_read_by_old_names() -> None:
             make()
 
 
-VALUES = {"certificate_rays": 7}  # of settings with an old name
+VALUES = {"certificate_rays": 7, "speed": "draft"}  # of settings with an old name
 
 
 @pytest.mark.parametrize("way", settings_by_old_names("certificate_rays", 7))
@@ -145,6 +145,23 @@ def test_settings_with_both_names_and_other_values_are_refused(old: str) -> None
             make({old: value, new: default})
     with pytest.raises(lc.InvalidSettings, match=f"{new}: expected one value"):
         pairs_of([f"{old}={value}", f"{new}={default}"])
+
+
+def test_option_by_its_old_name_is_read_noted_and_hidden(capsys: pytest.CaptureFixture[str]) -> None:
+    command, parser = ["lift", "s", "c", "f", "-o", "o"], build_parser()
+    assert settings_of(parser.parse_args([*command, "--speed", "draft"])).quality == "draft"
+    assert "--speed is now --quality" in capsys.readouterr().err
+    assert settings_of(parser.parse_args([*command, "--speed", "draft", "--set", "speed=draft"])).quality == "draft"
+    with pytest.raises(lc.InvalidSettings, match="--quality draft and --set quality=fast"):
+        settings_of(parser.parse_args([*command, "--speed", "draft", "--set", "speed=fast"]))
+    with pytest.raises(SystemExit):
+        parser.parse_args([*command, "--speed", "draft", "--quality", "fast"])
+    error = capsys.readouterr().err
+    assert "--speed" in error and "--quality" in error
+    with pytest.raises(SystemExit):
+        parser.parse_args(["lift", "--help"])
+    output = capsys.readouterr().out
+    assert "--quality" in output and "--speed" not in output
 
 
 def test_weights_file_of_the_first_format_opens(tmp_path: Path) -> None:

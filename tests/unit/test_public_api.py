@@ -288,8 +288,8 @@ def test_settings_and_keywords_beside_them_are_one(scene):
     assert lc.lift(splats, cameras, views, settings, view_stride=2).settings.stride == 2
     assert lc.plan(splats, cameras, views, settings, view_stride=2).views == strided.views == ("v0", "v2")
     assert float(full.weight.sum()) > 2 * float(strided.weight.sum())
-    merged = lc.lift(splats, cameras, views, lc.LiftSettings.of(speed="fast", seed=3), speed="exact").settings
-    assert merged == lc.LiftSettings.of(speed="exact", seed=3, antialiased=False)  # which auto came to
+    merged = lc.lift(splats, cameras, views, lc.LiftSettings.of(quality="fast", seed=3), quality="exact").settings
+    assert merged == lc.LiftSettings.of(quality="exact", seed=3, antialiased=False)  # which auto came to
     assert lc.lift(splats, cameras, views, lc.LiftSettings.of(), robust_steps=0).confidence is None
 
 
@@ -476,7 +476,7 @@ def test_repr_of_every_public_value_is_one_line_with_its_size(scene):
     segmentation, catalogue = result.segment(words, vectors, splats), result.objects(splats, words, vectors)
     sized = [splats, result, lc.region_weights(splats, cameras, views), answer, segmentation]
     sized += [lc.plan(splats, cameras, views), lc.plan_photos(splats, cameras)]
-    long = lc.LiftSettings.of(**dict(lc.LiftSettings.of(speed="fast")))
+    long = lc.LiftSettings.of(**dict(lc.LiftSettings.of(quality="fast")))
     unsized = [cameras, cameras["v0"].replace(name="x" * 300), *views.values(), long, lc.LiftSettings.of()]
     unsized += [
         answer.objects,
@@ -522,14 +522,14 @@ def test_repr_of_every_public_value_is_one_line_with_its_size(scene):
     )
 
 
-def test_what_a_caller_set_stays_when_a_call_names_another_speed_or_preset() -> None:
-    settings = lc.LiftSettings.of(speed="fast", stride=3, preset="default")
-    assert lc.LiftSettings.from_preset(settings, {"speed": "balanced"}) == lc.LiftSettings.of(
-        speed="balanced", stride=3
+def test_what_a_caller_set_stays_when_a_call_names_another_quality_or_preset() -> None:
+    settings = lc.LiftSettings.of(quality="fast", stride=3, preset="default")
+    assert lc.LiftSettings.from_preset(settings, {"quality": "balanced"}) == lc.LiftSettings.of(
+        quality="balanced", stride=3
     )
-    fast = lc.LiftSettings.of(speed="fast")
-    explicit = lc.LiftSettings.of(speed="fast", stride=fast.stride)  # the default of this level, but explicit
-    assert lc.LiftSettings.from_preset(explicit, {"speed": "exact"}).stride == fast.stride
-    assert lc.LiftSettings.from_preset(fast, {"speed": "exact"}) == lc.LiftSettings.of(speed="exact")
+    fast = lc.LiftSettings.of(quality="fast")
+    explicit = lc.LiftSettings.of(quality="fast", stride=fast.stride)  # the default of this level, but explicit
+    assert lc.LiftSettings.from_preset(explicit, {"quality": "exact"}).stride == fast.stride
+    assert lc.LiftSettings.from_preset(fast, {"quality": "exact"}) == lc.LiftSettings.of(quality="exact")
     loaded = lc.LiftSettings.model_validate_json(explicit.model_dump_json())
     assert loaded == explicit

@@ -22,7 +22,7 @@ const PRESETS = {
   "row-sum": ["Row sum", "Each splat takes the weighted mean of the features of its rays."],
   "top-k": ["Top k", "Only the largest weights of each ray count."],
 };
-const SPEEDS = { exact: "every pixel", balanced: "every 4th pixel", fast: "fewer views too", draft: "for a preview" };
+const QUALITIES = { exact: "every pixel", balanced: "every 4th pixel", fast: "fewer views too", draft: "for a preview" };
 const STAGES = { read: "Reading files", digest: "Reading files", compile: "Compiling kernels", plan: "Planning", geometry: "Rasterizing the views",
   solve: "Solving", robust: "Comparing views", halves: "Comparing halves of the views", smooth: "Smoothing", certify: "Checking the result", save: "Saving" };
 
@@ -48,7 +48,7 @@ export class UploadPanel {
     byId("plan-it").addEventListener("click", () => this.plan());
     byId("order").addEventListener("change", () => this.render());
     byId("preset").replaceChildren(...Object.entries(PRESETS).map(([name, [title, description]], index) => choice("preset", name, title, description, index === 0)));
-    byId("speed").replaceChildren(...Object.entries(SPEEDS).map(([name, description], index) => choice("speed", name, name, description, index === 0)));
+    byId("quality").replaceChildren(...Object.entries(QUALITIES).map(([name, description], index) => choice("quality", name, name, description, index === 0)));
     byId("more-settings").addEventListener("toggle", () => { if (byId("more-settings").open) this.schema(); });
     setInterval(() => { if (!document.hidden && !byId("panel-bring").hidden) this.refresh(); }, REFRESH_INTERVAL);
     const earlierFiles = earlierOrder();
@@ -229,7 +229,7 @@ export class UploadPanel {
     try {
       const { components: { schemas } } = await fetchJson("/openapi.json");
       const { properties } = schemas.LiftRequest.properties.settings;
-      byId("knobs").replaceChildren(...Object.entries(properties).filter(([name, schema]) => !schema.deprecated && !["speed"].includes(name)).map(([name, schema]) => {
+      byId("knobs").replaceChildren(...Object.entries(properties).filter(([name, schema]) => !schema.deprecated && name !== "quality").map(([name, schema]) => {
         const input = this.fields[name] = field(resolveSchema(schema, schemas));
         input.id = `knob-${name}`;
         return el("div", { className: "knob" }, el("label", { htmlFor: input.id }, name), input, el("small", {}, schema.description || ""));
@@ -241,7 +241,7 @@ export class UploadPanel {
   }
 
   settings() {
-    const settings = { preset: byId("order").elements.preset.value, speed: byId("order").elements.speed.value };
+    const settings = { preset: byId("order").elements.preset.value, quality: byId("order").elements.quality.value };
     for (const [name, input] of Object.entries(this.fields || {})) {
       if (input.value === "") continue;
       const value = input.value;
@@ -292,7 +292,7 @@ export class UploadPanel {
     const body = this.body();
     const { settings } = body;
     if (path === "/tradeoff") {
-      delete settings.speed;
+      delete settings.quality;
       delete body.table;
       body.budget_s = Number(byId("budget").value);
     }

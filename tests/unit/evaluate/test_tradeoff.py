@@ -50,7 +50,7 @@ def run_of(name: str, seconds: float, cosines: Sequence[float] | np.ndarray, kin
         "lost_share": 0.0,
         "accuracies": accuracies_of(cosines),
     } | stages
-    return {"name": name, "kind": kind, "options": {"speed": name}, **figures, **times, **measurements}
+    return {"name": name, "kind": kind, "options": {"quality": name}, **figures, **times, **measurements}
 
 
 def choice_of(*runs: dict[str, Any]) -> dict[str, Any]:
@@ -166,7 +166,7 @@ def test_a_run_is_judged_by_views_that_it_did_not_lift(tmp_path):
     assert -1 < exact["accuracies"]["centred_cosine"][0] < 1
     assert exact["peak_memory_bytes"] > 1 << 26
     assert exact["cpu_with_reading_s"] > exact["cpu_s"] > 0
-    draft_run = measure_run(replace(order, settings={"speed": "draft"}, exact=False))
+    draft_run = measure_run(replace(order, settings={"quality": "draft"}, exact=False))
     assert draft_run["cosine"] < 1
     full_run = measure_run(replace(order, lifted=("v0", "v1", "v2"), settings={}, exact=False))
     assert full_run["accuracies"]["centred_cosine"] > exact["accuracies"]["centred_cosine"]  # the view was lifted
@@ -261,7 +261,7 @@ def test_command_compares_in_processes_of_their_own(tmp_path, capsys):
     assert {key for key, value in options.items() if repeated_options[key] != value} == {"out", "json"}
 
 
-@pytest.mark.parametrize("wrong", [["--set", "speed=fast"], ["--set", "stride=0"], ["--labels", "nowhere"]])
+@pytest.mark.parametrize("wrong", [["--set", "quality=fast"], ["--set", "stride=0"], ["--labels", "nowhere"]])
 def test_bad_orders_are_refused_in_one_line(tmp_path, capsys, wrong):
     paths = write_scene(tmp_path, 2)
     assert cli.main(["tradeoff", *map(str, paths), "-o", str(tmp_path / "out"), *wrong]) == 2

@@ -50,12 +50,12 @@ def test_a_lift_from_before_opens_and_says_that_it_holds_none(scene: Scene, tmp_
 
 
 def test_a_draft_says_that_it_looked_for_no_objects_and_what_finds_them(scene: Scene, tmp_path: Path) -> None:
-    metadata = scene.lift.metadata.model_copy(update={"settings": LiftSettings.of(speed="draft")})
+    metadata = scene.lift.metadata.model_copy(update={"settings": LiftSettings.of(quality="draft")})
     bare = {field: None for field in vars(LiftResult.of(scene.lift)) if field.startswith(("object", "node"))}
     save_lift(replace(scene.lift, metadata=metadata, **bare), tmp_path / "draft.lift")
     draft = Scene(tmp_path / "draft.lift")
     for explanation in (draft.catalogue().explanation, draft.tree().explanation):
-        assert "speed=draft" in explanation and "objects=auto" in explanation
+        assert "quality=draft" in explanation and "objects=auto" in explanation
     with pytest.raises(NotFound, match="objects=auto"):
         draft.export(tmp_path / "object.ply", source=0)
 

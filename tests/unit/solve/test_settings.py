@@ -11,7 +11,7 @@ import torch
 from liftcore.errors import InvalidSettings
 from liftcore.values.lift import LiftMetadata
 from liftcore.values.lift_options import LiftOptions
-from liftcore.values.settings import LiftSettings, Preset, Speed
+from liftcore.values.settings import LiftSettings, Preset, Quality
 
 LEVELS = "'rows' or 'composite' or a valid integer"
 
@@ -52,7 +52,7 @@ def test_texts_may_stand_for_numbers_on_a_command_line() -> None:
 @pytest.mark.parametrize("read_settings", [LiftSettings.of_json, lambda values: LiftSettings.of(**values)])
 def test_errors_are_in_the_words_of_settings(read_settings: Any) -> None:
     with pytest.raises(
-        InvalidSettings, match=r"^lambda: expected one of preset, speed, .*, got an unknown setting; nearest: "
+        InvalidSettings, match=r"^lambda: expected one of preset, quality, .*, got an unknown setting; nearest: "
     ):
         read_settings({"lambda": 1.2})
     with pytest.raises(InvalidSettings, match=r"^settings: expected other levels than composite"):
@@ -90,9 +90,9 @@ def test_a_preset_only_fills_settings_that_are_not_given(preset: Preset) -> None
     assert LiftSettings.of(**preset_settings.model_dump(mode="json")) == preset_settings
 
 
-@pytest.mark.parametrize("speed", Speed)
-def test_a_lift_from_before_a_setting_has_the_value_of_its_time(speed: Speed) -> None:
-    settings = LiftSettings.of(speed=speed)
+@pytest.mark.parametrize("quality", Quality)
+def test_a_lift_from_before_a_setting_has_the_value_of_its_time(quality: Quality) -> None:
+    settings = LiftSettings.of(quality=quality)
     value = LiftMetadata(version="1", settings=settings, views=("a",), diagnostics={}, timings={})
     document = value.model_dump(mode="json")
     assert LiftMetadata.model_validate(document).settings == settings
