@@ -61,7 +61,9 @@ def run(options: argparse.Namespace) -> int:
         )
     with writing(options.out):
         files = comparison.save(options.out)
-    document = comparison.document | {"files": [str(file) for file in files]}
+    document = comparison.document
+    old_names = {"skipped": document["over_budget"], "refused": document["invalid_runs"]}
+    document = {**document, **old_names, "files": [str(file) for file in files]}
     reply(document, as_json=options.json, lines=[*comparison.lines(), "", *document["files"]])
     return 0
 

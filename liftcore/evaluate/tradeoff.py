@@ -179,8 +179,8 @@ def compare(
             uses it up.
 
     Returns:
-        Plain numbers: the ``runs``, the names ``over_budget`` for lack of time and ``refused`` by the settings, the
-        counts of ``views``, and the ``choice``.
+        Plain numbers: the ``runs``, the names ``over_budget`` for lack of time and ``invalid_runs`` by the settings,
+        the counts of ``views``, and the ``choice``.
 
     Raises:
         InvalidInput: the scene lacks an input, or a lift rejects one.
@@ -220,8 +220,8 @@ def compare(
             run[f"{name}_ratio"] = runs[0][f"{name}_s"] / run[f"{name}_s"]
     return {
         "runs": runs,
-        "skipped": over_budget,
-        "refused": [candidate.name for candidate in CANDIDATES if _settings_of(settings, candidate) is None],
+        "over_budget": over_budget,
+        "invalid_runs": [candidate.name for candidate in CANDIDATES if _settings_of(settings, candidate) is None],
         "choice": choose(runs, accuracies),
         "views": {"lifted": len(spec.lifted), "of": lifted, "held_out": len(spec.held_out)},
         "labelled_views": len(spec.labelled),

@@ -17,6 +17,7 @@ from liftcore.evaluate.ranking import NAMES
 from liftcore.evaluate.tradeoff import SceneFiles, compare
 from liftcore.io.files import whole_file
 from liftcore.io.json_file import finite
+from liftcore.runtime.aliases import current_names
 from liftcore.runtime.progress import Progress, shown_progress
 from liftcore.scene.kernel import Kernel
 from liftcore.values.settings import LiftSettings
@@ -37,6 +38,7 @@ KEY = (
     "over draws of its views."
 )
 TITLE = "Speed against accuracy"
+OLD_KEYS = {"skipped": "over_budget", "refused": "invalid_runs"}  # of documents of 0.4: new names by old ones
 LOST_SHARE = 0.001  # of the splats, above which the verdict mentions them
 LEAST_SHARE = 0.02  # of any run's seconds, for a stage that the chart shows
 
@@ -126,9 +128,10 @@ def save(document: Mapping[str, Any], out: Path) -> list[Path]:
 
 def page_of(document: Mapping[str, Any]) -> list[str]:
     """Return the table, the verdict and the conditions as lines of Markdown."""
+    document = current_names(document, OLD_KEYS)
     views, machine = document["views"], document["hardware"]
-    over_budget = f" Not run for want of time: {', '.join(document['skipped'])}." if document["skipped"] else ""
-    forbidden = ", ".join(document["refused"])
+    not_run, forbidden = ", ".join(document["over_budget"]), ", ".join(document["invalid_runs"])
+    over_budget = f" Not run for want of time: {not_run}." if not_run else ""
     invalid = f" Not compared, as your settings forbid it: {forbidden}." if forbidden else ""
     subset = "" if views["lifted"] == views["of"] else f" (every n-th of {views['of']}, to fit the budget)"
     return [

@@ -117,7 +117,7 @@ def finish_tradeoff(store: Store, chart: bytes) -> None:
     """Claim the oldest job in line and end it with a trade-off."""
     attempt = store.jobs.claim()
     assert attempt is not None
-    results = {"runs": [], "skipped": [], "choice": {}, "views": {}, "budget_s": 60, "seconds": 1}
+    results = {"runs": [], "over_budget": [], "choice": {}, "views": {}, "budget_s": 60, "seconds": 1}
     assert store.tradeoffs.finish(attempt.id, attempt.attempt, FinishedTradeoff(results, "a table", chart))
 
 

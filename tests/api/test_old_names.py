@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
 
 from liftcore import LiftSettings
+from service import models
+from service.routes.lifts import shape_tradeoff
+from service.store.lifts import FinishedTradeoff
+from service.store.owners import SERVICE
+from service.store.store import Store
+from tests.crash.conftest import order
 
 from .following import wait_for_end
 from .test_jobs import Quick, quick
@@ -92,6 +99,22 @@ def test_settings_are_read_by_old_names_and_returned_by_both(quick: Quick) -> No
                 problem = assert_problem(client.post(path, json=wrong))
                 assert (problem["status"], problem["argument"]) == (422, new)
                 assert f"{old} is the old name of {new}" in problem["expected"]
+
+
+def test_stored_tradeoffs_have_both_names_whichever_they_were_stored_by(store: Store) -> None:
+    for over_budget, invalid_runs, stride in (("skipped", "refused", "certificate_rays"),
+                                              ("over_budget", "invalid_runs", "diagnostic_rays")):  # fmt: skip
+        job, _ = store.jobs.submit(SERVICE, replace(order(store), kind=models.JobKind.TRADEOFF))
+        runs = [{"name": "exact", "options": {}, "settings": {stride: 7}}]
+        names = {over_budget: ["mean"], invalid_runs: ["argmax"], "runs": runs}
+        attempt = store.jobs.claim()
+        assert attempt is not None and attempt.id == job
+        document = names | {"choice": {}, "views": {}, "budget_s": 60, "seconds": 1}
+        assert store.tradeoffs.finish(job, attempt.attempt, FinishedTradeoff(document, "a table", b"a chart"))
+        reply = shape_tradeoff(store.tradeoffs.get(SERVICE, job)).model_dump(mode="json")
+        assert reply["over_budget"] == reply["skipped"] == ["mean"]
+        assert reply["invalid_runs"] == reply["refused"] == ["argmax"]
+        assert reply["runs"][0]["settings"] == {"diagnostic_rays": 7, "certificate_rays": 7}
 
 
 def test_a_zip_of_things_is_one_of_objects(client: TestClient, lift: dict[str, Any]) -> None:

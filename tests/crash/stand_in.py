@@ -28,7 +28,7 @@ def say(**message: Any) -> None:
 def finish(order: dict[str, Any]) -> None:
     if order["kind"] == "tradeoff":
         Path(order["output"]).write_bytes(b"a chart")
-        document = {"runs": [], "skipped": [], "choice": {}, "views": {}, "seconds": 0.0, **order["parameters"]}
+        document = {"runs": [], "over_budget": [], "choice": {}, "views": {}, "seconds": 0.0, **order["parameters"]}
         say(event="done", document=document, page="a table")
         return
     content = hashlib.sha256(json.dumps([order["splats"], order["settings"]]).encode()).digest()

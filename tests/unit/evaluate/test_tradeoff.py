@@ -204,11 +204,11 @@ def test_a_short_budget_takes_fewer_views_and_runs_the_exact_one_alone(tmp_path,
     document = comparison.compare(scene, 1.0, {}, 1, silent)
     assert [name for name, _ in calls] == ["draft", "exact"]
     assert [run["name"] for run in document["runs"]] == ["exact"]
-    assert document["skipped"] == [candidate.name for candidate in candidates_of({})[1:]]
+    assert document["over_budget"] == [candidate.name for candidate in candidates_of({})[1:]]
     assert (document["views"], calls[1][1]) == ({"lifted": 1, "of": 2, "held_out": 1}, ("v0",))
     calls.clear()
     document = comparison.compare(scene, 1e6, {}, 1, silent)
-    assert (len(document["runs"]), document["skipped"], document["views"]["lifted"]) == (
+    assert (len(document["runs"]), document["over_budget"], document["views"]["lifted"]) == (
         len(candidates_of({})),
         [],
         2,
@@ -219,7 +219,7 @@ def test_chart_table_and_json_are_written(tmp_path):
     lossy = [RUNS[0], RUNS[1], RUNS[2] | {"lost_share": 0.125}, RUNS[3]]
     runs = [{**run, **accuracy_of(run["accuracies"])} for run in lossy]
     document = {
-        "title": "t", "scene": "s", "command": "c", "runs": runs, "skipped": ["mean"], "refused": ["argmax"],
+        "title": "t", "scene": "s", "command": "c", "runs": runs, "over_budget": ["mean"], "invalid_runs": ["argmax"],
         "choice": choice_of(*RUNS),
         "views": {"lifted": 2, "of": 4, "held_out": 6}, "labelled_views": 0, "budget_s": 1.0, "seconds": 2.0,
         "date": "2026-11-21", "hardware": {"cpu": "x"},
@@ -241,6 +241,8 @@ def test_chart_table_and_json_are_written(tmp_path):
     assert [line.split(" | ")[0] for line in table_of(document)[2:]] == [
         "| **unclear**", "| **distinct**", "| **equal**", "| **exact**",
     ]  # fmt: skip
+    old = {{"over_budget": "skipped", "invalid_runs": "refused"}.get(name, name): document[name] for name in document}
+    assert report.page_of(old) == report.page_of(document)
     single = document | {"runs": runs[:1], "choice": choice_of(RUNS[0])}
     report.save(single, tmp_path / "alone")
     assert "\nNothing can be recommended: exact alone fitted" in "\n".join(report.page_of(single))
@@ -255,6 +257,9 @@ def test_command_compares_in_processes_of_their_own(tmp_path, capsys):
     assert "exact alone fitted the budget" in document["choice"]["why"] and not document["choice"]["recommended"]
     assert document["runs"][0]["cosine"] == pytest.approx(1.0)
     assert all(Path(file).is_file() for file in document["files"])
+    saved = json.loads((tmp_path / "out" / "tradeoff.json").read_text())
+    for new, old in (("over_budget", "skipped"), ("invalid_runs", "refused")):
+        assert document[old] == document[new] == saved[new] and old not in saved
     assert np.isfinite(document["runs"][0]["wall_with_reading_ratio"])
     repeated_options = vars(cli.build_parser().parse_args(shlex.split(document["command"])[1:]))
     options = vars(cli.build_parser().parse_args([*command, "--set", "diagnostic_rays=0", "--threads", "1"]))
