@@ -28,7 +28,7 @@ def main(splats_path: str, data: str, run: str, features_path: str, out: str) ->
         print("warning:", warning)
     result = lc.lift(splats, cameras, lc.read_features(features_path))
     result.save(folder / "lift.safetensors")
-    count = int(result.seen.sum())
+    count = int(result.has_feature.sum())
     print(f"{len(cameras)} cameras moved to the frame of the splats; {count} of {splats.count} splats have a feature")
 
 

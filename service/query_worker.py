@@ -241,7 +241,7 @@ class Answers:
         elif "query" in request:
             view_mask = self._view_mask(request) if operation in ("mask", "attention") else None
             kind = SPLATS_FILES[kind_asked] if operation == "splats" else operation
-            blocks = scene.blocks_of(self._answer(request), kind, view=view, seen=view_mask)
+            blocks = scene.blocks_of(self._answer(request), kind, view=view, view_mask=view_mask)
         else:  # one of its objects, its splats or a picture of it
             blocks = scene.blocks_of(
                 request.get("object"), "" if operation == "splats" else kind_asked or "splats", view=view
@@ -469,7 +469,7 @@ def _key(request: dict[str, Any]) -> str:
 def bytes_of(value: Cached) -> int:
     """Return the bytes that an answer takes, with its question; or its objects, a view of it, or named splats."""
     if isinstance(value, Answer):
-        tensors = value.scores.nbytes + value.seen.nbytes + value.selected.nbytes
+        tensors = value.scores.nbytes + value.has_feature.nbytes + value.selected.nbytes
         return ENTRY_BYTES + tensors + sum(map(_term_bytes, value.query.terms))
     if isinstance(value, Objects):
         return ENTRY_BYTES + value.numbers.nbytes

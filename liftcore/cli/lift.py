@@ -72,13 +72,14 @@ def run(options: argparse.Namespace) -> int:
     (plan,) = plans
     warnings = result.metadata.diagnostics["warnings"]
     document = {"out": str(options.output), **_summary(result), "warnings": [*plan.warnings, *warnings]}
+    current_names = {"diagnostics": result.diagnostics}
     lift_warnings = [
         warning for warning in warnings if warning not in plan.input_warnings
     ]  # the others were printed with the plan
     reply(
         document,
         as_json=options.json,
-        lines=_lines(document | {"warnings": lift_warnings}, options.cameras, options.verbose),
+        lines=_lines(document | current_names | {"warnings": lift_warnings}, options.cameras, options.verbose),
     )
     return 0
 
@@ -173,17 +174,20 @@ def plan_lines(plan: Plan) -> Iterable[str]:
 
 def _summary(result: LiftResult) -> dict[str, Any]:
     metadata = result.metadata
+    feature_share = float(result.has_feature.float().mean())
+    diagnostics = result.diagnostics_of_reply(result.diagnostics)
     return {
         "splats": result.features.shape[0],
-        "seen_share": float(result.seen.float().mean()),
+        "feature_share": feature_share,
+        "seen_share": feature_share,
         "channels": result.features.shape[1],
         "views": len(metadata.views),
         "lifted": list(metadata.views),
         "encoder": metadata.encoder,
         "text_space": metadata.text_space,
         "world": metadata.world.model_dump(mode="json"),
-        "diagnostics": metadata.diagnostics,
-        "certificate": metadata.diagnostics,
+        "diagnostics": diagnostics,
+        "certificate": diagnostics,
         "timings": metadata.timings,
         "settings": metadata.settings.with_old_names(metadata.settings.model_dump(mode="json")),
     }
@@ -192,7 +196,7 @@ def _summary(result: LiftResult) -> dict[str, Any]:
 def _lines(document: dict[str, Any], cameras: Path, verbose: bool) -> Iterable[str]:
     yield (
         f"{document['out']}: {document['splats']} splats x {document['channels']} channels "
-        f"from {document['views']} views, {document['seen_share']:.1%} of the splats seen, "
+        f"from {document['views']} views, {document['feature_share']:.1%} of the splats have a feature, "
         f"in {sum(document['timings'].values()):.1f} s"
     )
     yield from (f"warning: {warning}" for warning in document["warnings"])

@@ -88,7 +88,7 @@ def run(options: argparse.Namespace) -> int:
     objects = scene.objects(answer) if options.objects else None
     document = _document(answer, objects, view_mask, encoder)
     photo = None if view_mask is None else _picture(options.photo, view_mask.mask.shape[::-1])
-    export = partial(scene.export, source=answer, view=view, seen=view_mask, photo=photo)
+    export = partial(scene.export, source=answer, view=view, view_mask=view_mask, photo=photo)
     document["files"] = write_files(files, {kind: partial(export, what=kind) for kind in files})
     if options.object is not None and options.object.suffix.lower() in LOCAL_SUFFIXES and any(scene.splats.origin):
         document["origin"] = scene.splats.origin

@@ -316,20 +316,23 @@ def describe_lift(lift: Lift) -> dict[str, Any]:
     """Return counts, ranges, provenance and warnings of a lift."""
     metadata = lift.metadata
     count, channels = lift.features.shape
+    feature_share = float(lift.has_feature.float().mean())
+    diagnostics = lift.diagnostics_of_reply(lift.diagnostics)
     return {
         "splats": count,
         "channels": channels,
         "dtype": str(lift.features.dtype).removeprefix("torch."),
-        "seen_share": float(lift.seen.float().mean()),
+        "feature_share": feature_share,
+        "seen_share": feature_share,
         "total_weight": _ends(lift.total_weight),
         "evidence": _ends(lift.total_weight),
-        "agreement": _ends(lift.agreement[lift.seen]),
+        "agreement": _ends(lift.agreement[lift.has_feature]),
         "encoder": metadata.encoder,
         "text_space": metadata.text_space,
         "views": len(metadata.views),
         "settings": metadata.settings.with_old_names(metadata.settings.model_dump(mode="json")),
-        "diagnostics": metadata.diagnostics,
-        "certificate": metadata.diagnostics,
+        "diagnostics": diagnostics,
+        "certificate": diagnostics,
         "timings": metadata.timings,
         "version": metadata.version,
         "inputs": [file.path for file in (metadata.splats, metadata.cameras, *metadata.features)],
@@ -346,7 +349,7 @@ def _ends(values: torch.Tensor) -> dict[str, float]:
 
 def _lift_warnings(lift: Lift, metadata: LiftMetadata) -> list[str]:
     count = len(lift.features)
-    unseen = int((~lift.seen).sum())
+    unseen = int((~lift.has_feature).sum())
     bad = int((~torch.isfinite(lift.features)).any(dim=1).sum())
     warnings = list(metadata.diagnostics.get("warnings", ()))
     if unseen:

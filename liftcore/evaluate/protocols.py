@@ -178,7 +178,7 @@ class RenderedScores(Segmenter):
     def _values(self) -> Tensor:
         """[P, n + 1], the scores of the splats and ones, for all views."""
         # A splat without a feature adds nothing to a ray.
-        columns = [np.where(answer.seen, answer.scores, np.float32(0.0)) for answer in self.answers().values()]
+        columns = [np.where(answer.has_feature, answer.scores, np.float32(0.0)) for answer in self.answers().values()]
         columns.append(np.ones(len(self.scene.features), np.float32))
         return torch.from_numpy(np.stack(columns, axis=1))
 

@@ -301,6 +301,7 @@ def measure_run(spec: RunSpec) -> dict[str, Any]:
     result = lift(splats, cameras, lifted, settings, threads=spec.threads)
     seconds = {"cpu": time.process_time() - cpu, "wall": time.perf_counter() - wall}
     result = result.cpu()
+    feature_share = float(result.has_feature.float().mean())
     figures = {
         "cpu_s": seconds["cpu"],
         "wall_s": seconds["wall"],
@@ -310,7 +311,8 @@ def measure_run(spec: RunSpec) -> dict[str, Any]:
         "load": None if sys.platform == "win32" else os.getloadavg()[0],
         "views": len(result.metadata.views),
         "settings": result.metadata.settings.model_dump(mode="json"),
-        "seen_share": float(result.seen.float().mean()),
+        "feature_share": feature_share,
+        "seen_share": feature_share,
         "timings": {name: value for name, value in result.metadata.timings.items() if name not in UNTIMED},
     }
     return figures | _accuracy_figures(spec, splats, cameras, features, result)

@@ -163,7 +163,7 @@ def _run(
         total_weight=support.total_weight,
         agreement=support.agreement,
         confidence=support.confidence,
-        seen=torch.from_numpy(support.sums > 0),
+        has_feature=torch.from_numpy(support.sums > 0),
         metadata=views.metadata(settings, inputs.splats, diagnostics, timings.seconds),
         cluster=aggregation.clusters if aggregation else None,
         cluster_features=aggregation.cluster_features if aggregation else None,

@@ -291,7 +291,7 @@ def _part_answer(scene: OpenedLift, request: ResolvedQuery) -> Answer:
         if answer.count >= WHOLE_SHARE * inside.sum() and request.query.absent == "drop":
             reason = f"{phrase!r} is there, but {part.query.text[0]!r} tells no part of it from the rest."
             fields = {name: getattr(answer, name) for name in _OF_ANSWER} | {"clear": False, "present": False}
-            answer = Answer.of(answer.query, answer.scores, answer.seen, np.zeros_like(inside), **fields)
+            answer = Answer.of(answer.query, answer.scores, answer.has_feature, np.zeros_like(inside), **fields)
     else:
         answer, note = object_answer, "it" if object_answer.present is False else f"{phrase!r} is not found, and"
         reason = f"{object_answer.reason} So {note} has no parts."
@@ -301,7 +301,7 @@ def _part_answer(scene: OpenedLift, request: ResolvedQuery) -> Answer:
     if object_answer.present is False:
         fields |= {"present": False, "presence": object_answer.presence}
     wording = tuple(WordMatch(**word._asdict()) for word in part.asked_as.values() if word.match)
-    return Answer.of(request.query, answer.scores, answer.seen, answer.selected, **fields, wording=wording)
+    return Answer.of(request.query, answer.scores, answer.has_feature, answer.selected, **fields, wording=wording)
 
 
 def locate(scene: OpenedLift, answer: Answer, count: int | None = None) -> Answer:
@@ -316,7 +316,7 @@ def locate(scene: OpenedLift, answer: Answer, count: int | None = None) -> Answe
         InvalidLift: the splats moved or changed since the lift.
     """
     places, count = scene.axes, answer.query.top if count is None else count
-    rows = np.flatnonzero(answer.seen)
+    rows = np.flatnonzero(answer.has_feature)
     scores = answer.scores[rows]
     if 0 < count < len(scores):
         last = np.partition(scores, len(scores) - count)[len(scores) - count]
@@ -350,14 +350,14 @@ def _similarities(scene: OpenedLift, requests: Sequence[ResolvedQuery]) -> list[
 
 
 def _answer(scene: OpenedLift, request: ResolvedQuery, similarities: np.ndarray) -> Answer:
-    query, has_feature = request.query, scene.seen
+    query, has_feature = request.query, scene.has_feature
     if query.sets:
         return _set_answer(scene, query)
     presence, mask = _presence(scene, request, similarities)
     scores = combine(similarities if mask.all() else similarities[:, mask], int(mask[: len(query.positives)].sum()))
-    if not scene.all_seen:
+    if not scene.all_have_features:
         scores = np.where(has_feature, scores, np.float32(LOWEST_COSINE))
-    valid_scores = scores if scene.all_seen else scores[has_feature]
+    valid_scores = scores if scene.all_have_features else scores[has_feature]
     if presence.present is False and query.absent == "drop":
         method = query.threshold if isinstance(query.threshold, str) else "fixed"
         threshold = Threshold(value=math.inf, method=method, explanation=presence.reason, clear=False)
@@ -440,18 +440,18 @@ def _select(
             that times confidence.
     """
     query, positives = request.query, len(request.query.positives)
-    valid_scores = scores if scene.all_seen else scores[scene.seen]
+    valid_scores = scores if scene.all_have_features else scores[scene.has_feature]
     lack = explain_no_selection(valid_scores)
     if lack:
         method = query.threshold if isinstance(query.threshold, str) else "fixed"
         threshold = Threshold(value=math.inf, method=method, explanation=lack, clear=False)
-        return threshold, np.zeros_like(scene.seen)
+        return threshold, np.zeros_like(scene.has_feature)
     in_words = (request.by_cosine & mask)[:positives]
     least = -math.inf if in_words.any() else LEAST_LIKENESS
     weight_name = "total weight" if query.weight_by == "evidence" else "total weight times confidence"
     feature_weights = scene.weights if query.weight_by == "evidence" else scene.weights_with_feature(weights)
     threshold = find_threshold(valid_scores, query.threshold, feature_weights, least, weight_name)
-    selected = scene.seen & (scores >= np.float32(threshold.value))
+    selected = scene.has_feature & (scores >= np.float32(threshold.value))
     competitors = _competing_words(request, request.rows[:positives][in_words])
     if query.threshold != "auto" or not competitors or in_words.sum() < mask[:positives].sum():
         return threshold, selected
@@ -463,13 +463,13 @@ def _select(
         threshold = retry.model_copy(
             update={"value": value, "explanation": explanation, "clear": retry.clear and retry.value == value}
         )
-        selected = scene.seen & (scores >= np.float32(value))
+        selected = scene.has_feature & (scores >= np.float32(value))
     threshold = threshold.model_copy(update={"clear": threshold.clear and comparison.first >= LEAST_FIRST})
     if competitors[-1].nearer_limit == 0:  # a small table: splats nearer to another of its words are not selected
         selected = nearest_to_query(scene, selected, competitors[-1])
     parts = part_nodes(scene, competitors[0])
     if parts:
-        selected = scene.seen & np.logical_or.reduce([scene.members(node) for node in parts])
+        selected = scene.has_feature & np.logical_or.reduce([scene.members(node) for node in parts])
         addition = f"levels differ in meaning, so the named parts are selected: {', '.join(map(str, parts))}"
     else:
         selected, addition = correct_by_objects(scene, selected, weights, competitors[0])

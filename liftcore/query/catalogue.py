@@ -209,7 +209,7 @@ def _compute_object_features(scene: OpenedLift) -> np.ndarray:
     assert scene.object is not None and scene.object_views is not None
     number = len(scene.object_views)
     sums = np.zeros((number, scene.channels))
-    weights = np.where(scene.seen, scene.total_weight / np.where(scene.seen, scene.norms, 1.0), 0.0)
+    weights = np.where(scene.has_feature, scene.total_weight / np.where(scene.has_feature, scene.norms, 1.0), 0.0)
     indices = np.flatnonzero((scene.object >= 0) & (weights > 0))
     for first in range(0, indices.size, _BLOCK):
         rows = indices[first : first + _BLOCK]

@@ -214,7 +214,7 @@ def _feature(scene: OpenedLift, example: Area | SplatTerm | SplatSet | Vector) -
             raise InvalidQuery("vector", expected=f"{scene.channels} channels, as the lift has", got=str(example))
         return np.array(example.values)
     if isinstance(example, SplatSet):
-        rows = np.flatnonzero(set_members(scene, example) & scene.seen)
+        rows = np.flatnonzero(set_members(scene, example) & scene.has_feature)
         if not rows.size:
             raise InvalidQuery(str(example), expected="a set with splats that have a feature", got="none of them")
         return scene.mean_of(rows)

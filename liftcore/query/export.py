@@ -53,7 +53,7 @@ def blocks_of(
     *,
     view: str | Camera | None = None,
     suffix: str = "",
-    seen: ViewMask | None = None,
+    view_mask: ViewMask | None = None,
     photo: Image | None = None,
 ) -> Iterable[bytes]:
     """Make a file, in blocks: of an answer, a segmentation, an object of the lift by its id, or the scene.
@@ -79,7 +79,7 @@ def blocks_of(
     if isinstance(source, Catalogue):
         return [table_csv(source)]
     if isinstance(source, Answer):
-        return _of_answer(scene, source, content, view, suffix, seen, photo)
+        return _of_answer(scene, source, content, view, suffix, view_mask, photo)
     return _of_words(scene, source, content, view)
 
 
@@ -209,8 +209,8 @@ def coloured_ply(scene: OpenedLift, answer: Answer) -> Iterable[bytes]:
     """
     from liftcore.io.splats import recoloured
 
-    colours = heat_colours(answer.scores, answer.seen)
-    colours[~answer.seen | answer.is_dropped] = NOT_SEEN_COLOUR
+    colours = heat_colours(answer.scores, answer.has_feature)
+    colours[~answer.has_feature | answer.is_dropped] = NOT_SEEN_COLOUR
     return recoloured(scene.splat_file, colours)
 
 
@@ -265,10 +265,10 @@ def layer_colours(scene: OpenedLift, layer: str) -> np.ndarray:
             got = "a lift without reweighting"
             raise InvalidQuery("what", expected=f"a lift with {layer}", got=got, hint=hint)
         values = as_numpy(tensor).astype(np.float32)
-        valid = scene.seen & np.isfinite(values)
+        valid = scene.has_feature & np.isfinite(values)
         if layer == "total_weight":
             valid &= values > 0
             values = np.log(np.where(valid, values, 1.0))
         colours = heat_colours(values, valid)
-    colours[~scene.seen] = NOT_SEEN_COLOUR
+    colours[~scene.has_feature] = NOT_SEEN_COLOUR
     return colours

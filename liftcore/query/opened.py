@@ -19,7 +19,7 @@ from liftcore.runtime.aliases import deprecated_keywords, deprecated_names
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.world import UNKNOWN, WorldFrame
 from liftcore.text.table import TableEncoder, own_words
-from liftcore.values.lift_file import NODE_TENSORS, OBJECT_TENSORS, OLD_TENSORS, read_lift
+from liftcore.values.lift_file import NODE_TENSORS, OBJECT_TENSORS, read_lift
 
 if TYPE_CHECKING:  # these load torch
     from torch import Tensor
@@ -39,7 +39,7 @@ MOST_OF_OBJECT = 512  # splats of an object, likewise
 MOST_PIXELS = 1 << 26  # of a picture: 67 million take a minute of one core and 2 GB
 
 
-@deprecated_names(**OLD_TENSORS)
+@deprecated_names(evidence="total_weight", seen="has_feature", all_seen="all_have_features")
 class OpenedLift:
     """A lift with the splats and cameras of its scene: the state of `liftcore.query.scene.Scene`.
 
@@ -99,7 +99,15 @@ class OpenedLift:
             splats_path = self._new_paths["splats"]
             cached: dict[str, Any] = {}
         else:
-            names = ("features", "total_weight", "seen", "cluster", "cluster_features", "confidence", "embeddings")
+            names = (
+                "features",
+                "total_weight",
+                "has_feature",
+                "cluster",
+                "cluster_features",
+                "confidence",
+                "embeddings",
+            )
             arrays = {name: as_numpy(getattr(source, name)) for name in (*names, *OBJECT_TENSORS, *NODE_TENSORS)}
             self.path, splats_path = Path("lift"), None
             cached = {"lift": source, "metadata": self._with_places(source.metadata)}
@@ -114,7 +122,7 @@ class OpenedLift:
             self.__dict__["splats"] = splats.cpu()
 
     def _set_arrays(self, arrays: dict[str, Any]) -> None:
-        columns = (arrays[name] for name in ("features", "total_weight", "seen"))
+        columns = (arrays[name] for name in ("features", "total_weight", "has_feature"))
         self.features, self.total_weight, self._has_feature = columns
         self.cluster, self.cluster_features = arrays.get("cluster"), arrays.get("cluster_features")
         self.confidence = arrays.get("confidence")
@@ -218,14 +226,14 @@ class OpenedLift:
         return norms_of(self.features)
 
     @cached_property
-    def seen(self) -> np.ndarray:
+    def has_feature(self) -> np.ndarray:
         """[P] bool, True if a splat has a feature."""
         return self._has_feature & (self.norms > 0)
 
     @cached_property
-    def all_seen(self) -> bool:
+    def all_have_features(self) -> bool:
         """True if every splat has a feature."""
-        return bool(self.seen.all())
+        return bool(self.has_feature.all())
 
     @cached_property
     def weights(self) -> np.ndarray | None:
@@ -248,7 +256,7 @@ class OpenedLift:
 
     def weights_with_feature(self, weights: np.ndarray) -> np.ndarray | None:
         """Return the weights [P] of the splats with a feature; None, which means equal ones, if all are zero."""
-        weights = weights if self.all_seen else weights[self.seen]
+        weights = weights if self.all_have_features else weights[self.has_feature]
         return weights if weights.max(initial=0.0) > 0 else None
 
     @cached_property
@@ -266,7 +274,7 @@ class OpenedLift:
     def object_means(self) -> np.ndarray:
         """[N, F] f32, the unit mean of the features of each object of the lift (`mean_of`)."""
         assert self.object is not None and self.object_views is not None
-        objects = np.where(self.seen, self.object, -1)
+        objects = np.where(self.has_feature, self.object, -1)
         order = np.argsort(objects, kind="stable")
         ends = np.searchsorted(objects[order], np.arange(len(self.object_views) + 1))
         means = [self.mean_of(order[first:last]) for first, last in pairwise(ends.tolist())]
@@ -324,9 +332,9 @@ class OpenedLift:
         Means and shares of total weight are those of these splats, so that a query distinguishes among them.
         """
         inner = copy(self)
-        for name in ("seen", "all_seen", "weights", "mean", "object_means", "principal"):
+        for name in ("has_feature", "all_have_features", "weights", "mean", "object_means", "principal"):
             inner.__dict__.pop(name, None)
-        inner._has_feature = self.seen & members
+        inner._has_feature = self.has_feature & members
         inner.total_weight = np.where(members, self.total_weight, np.float32(0.0))
         rows = np.flatnonzero(inner._has_feature)
         rows = rows[:: -(-len(rows) // MOST_SAMPLED) or 1]

@@ -199,10 +199,10 @@ def best_splats(scene: OpenedLift, scores: np.ndarray) -> tuple[np.ndarray, np.n
     Returns:
         [m] i64, at most MOST_SPLATS, descending by score; and [m] f64, their total weight.
     """
-    total_weight = np.where(scene.seen, scene.total_weight, np.float32(0.0))
-    total_weight = total_weight if total_weight.any() else scene.seen.astype(np.float32)
+    total_weight = np.where(scene.has_feature, scene.total_weight, np.float32(0.0))
+    total_weight = total_weight if total_weight.any() else scene.has_feature.astype(np.float32)
     least, count = LEAST_SHARE * float(total_weight.sum(dtype=np.float64)), min(_FIRST, len(scores))
-    ranked = -scores if scene.all_seen else np.where(scene.seen, -scores, np.float32(np.inf))
+    ranked = -scores if scene.all_have_features else np.where(scene.has_feature, -scores, np.float32(np.inf))
     while True:
         rows = np.argpartition(ranked, count - 1)[:count] if count < len(ranked) else np.arange(count)
         if count == len(ranked) or total_weight[rows].sum(dtype=np.float64) >= least:

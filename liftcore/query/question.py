@@ -27,7 +27,7 @@ from pydantic_core import CoreSchema, core_schema
 
 from liftcore.errors import InvalidQuery
 from liftcore.query.terms import NOTATIONS, SETS, Example, SplatSet, Term, Vector, parse_example, parse_set
-from liftcore.runtime.aliases import add_deprecated_properties
+from liftcore.runtime.aliases import add_deprecated_properties, deprecated_keywords
 from liftcore.runtime.fields import Body, NoBoolean, PlainModel, old_field, takes
 from liftcore.scene.compositing import MAX_SIDE
 from liftcore.scene.world import WorldFrame
@@ -424,7 +424,7 @@ class Answer(SelectionSummary):
         default=(),
         description="other words that are nearer to what was found, or most like it; of a clear answer to most of it",
     )
-    statistics: Mapping[str, Any] = Field(description="of the scores over the seen splats")
+    statistics: Mapping[str, Any] = Field(description="of the scores over the splats with a feature")
     top: tuple[TopSplat, ...] = ()
     candidates: tuple[Candidate, ...] = Field(
         default=(),
@@ -436,7 +436,10 @@ class Answer(SelectionSummary):
     _arrays: tuple[np.ndarray, np.ndarray, np.ndarray] = PrivateAttr()
 
     @classmethod
-    def of(cls, query: Query, scores: np.ndarray, seen: np.ndarray, selected: np.ndarray, **fields: Any) -> Self:
+    @deprecated_keywords(seen="has_feature")
+    def of(
+        cls, query: Query, scores: np.ndarray, has_feature: np.ndarray, selected: np.ndarray, **fields: Any
+    ) -> Self:
         """Return an answer with its query and per-splat arrays, which JSON leaves out."""
         answer = cls(
             text=query.text,
@@ -444,7 +447,7 @@ class Answer(SelectionSummary):
             count=int(selected.sum()),
             **fields,
         )
-        answer._query, answer._arrays = query, (scores, seen, selected)
+        answer._query, answer._arrays = query, (scores, has_feature, selected)
         return answer
 
     @property
@@ -458,7 +461,7 @@ class Answer(SelectionSummary):
         return self._arrays[0]
 
     @property
-    def seen(self) -> np.ndarray:
+    def has_feature(self) -> np.ndarray:
         """[P] bool, True if a splat has a feature."""
         return self._arrays[1]
 
@@ -473,7 +476,7 @@ class Answer(SelectionSummary):
         return self.present is False and self.query.absent == "drop"
 
 
-add_deprecated_properties(Answer, {"dropped": "is_dropped"})
+add_deprecated_properties(Answer, {"dropped": "is_dropped", "seen": "has_feature"})
 
 
 class WithUnits(Value):
@@ -528,7 +531,7 @@ class NamedSplats(Value):
     value: int = Field(description="of its splats and pixels in labels and maps; 0 is none")
     colour: tuple[int, int, int] = Field(description="sRGB, 0 to 255, in pictures")
     splats: int = Field(description="number of its splats")
-    share: float = Field(description="of the total weight of all seen splats")
+    share: float = Field(description="of the total weight of all splats with a feature")
     score: float = Field(description="the mean cosine of its splats, by total weight")
     margin: float = Field(description="the mean of how much nearer they are to it than to the nearest other word")
     threshold: float = Field(description="of its cosines")

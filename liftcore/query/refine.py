@@ -68,7 +68,7 @@ def refine(
     in_file = free is not None and lift.features.nbytes > MEMORY_SHARE * free
     X = zeros(tuple(lift.features.shape), lift.features.dtype, name="features", in_file=in_file).copy_(lift.features)
     graph = SplatGraph.of(splats, threads)
-    X, facts = smooth(X, graph, lift.total_weight, lift.confidence, lift.seen, strength, progress, threads)
+    X, facts = smooth(X, graph, lift.total_weight, lift.confidence, lift.has_feature, strength, progress, threads)
     diagnostics: dict[str, Any] = lift.diagnostics | {"smoothing": facts}
     diagnostics |= {name: None for name in OF_FEATURES if name in diagnostics}
     if "beta" in diagnostics:

@@ -93,7 +93,7 @@ def view_mask(
         members, count = groups.numbers >= 0, len(groups.objects)
         subject = f"the {count} object{'s' * (count != 1)} that {'were' if count != 1 else 'was'} found"
     # A splat without a feature has a score of -1, which would lower the attention of its neighbours: it counts as 0.
-    scores = np.where(answer.seen & (not answer.is_dropped), answer.scores, np.float32(0.0))
+    scores = np.where(answer.has_feature & (not answer.is_dropped), answer.scores, np.float32(0.0))
     values = torch.from_numpy(np.stack([scores, members.astype(np.float32), np.ones_like(scores)], axis=1))
     image = scene.image(camera, lambda of: scene.raster.render(of, values, scene.compositing)).numpy()
     attention, weights, row_sums = (np.ascontiguousarray(image[..., column]) for column in range(3))

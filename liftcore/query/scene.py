@@ -363,6 +363,7 @@ class Scene(OpenedLift):
         with whole_file(Path(path)) as handle:
             handle.writelines(content)
 
+    @deprecated_keywords(seen="view_mask")
     def blocks_of(
         self,
         source: Source = None,
@@ -370,7 +371,7 @@ class Scene(OpenedLift):
         *,
         view: str | Camera | None = None,
         suffix: str = "",
-        seen: ViewMask | None = None,
+        view_mask: ViewMask | None = None,
         photo: Image | None = None,
         encoder: TextEncoder | str | Path | None = None,
     ) -> Iterable[bytes]:
@@ -387,7 +388,7 @@ class Scene(OpenedLift):
                 a segmentation or a catalogue as a .glb, .spz or .usdz labelled (a catalogue as a .ply, too), .json
                 masks, .jsonl lines; as a .zip the bundle.
             view: of pictures, as in `view_mask`. suffix: of its name, where there are several formats.
-            seen: the answer's mask in the view, if it is cached. photo: of the view, for an overlay.
+            view_mask: the answer's mask in the view, if it is cached. photo: of the view, for an overlay.
 
         Raises:
             InvalidQuery: there is no such file of the source, or the file would be empty.
@@ -401,7 +402,7 @@ class Scene(OpenedLift):
         if isinstance(source, np.ndarray):
             return array_blocks(source, what)
         source = self._answer(source, encoder) if isinstance(source, str | Query) else source
-        return blocks_of(self, source, what, view=view, suffix=suffix, seen=seen, photo=photo)
+        return blocks_of(self, source, what, view=view, suffix=suffix, view_mask=view_mask, photo=photo)
 
     def _answer(self, query: Query | str | Answer, encoder: TextEncoder | str | Path | None) -> Answer:
         from liftcore.query.question import Answer

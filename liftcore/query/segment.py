@@ -140,12 +140,12 @@ def segment(
     if len(set(words)) < len(words):
         twice = next(word for place, word in enumerate(words) if word in words[:place])
         raise InvalidQuery("words", expected="every word once", got=f"{twice!r} twice")
-    weights = np.where(scene.seen, scene.total_weight, 0.0).astype(np.float64)
-    weights = weights if weights.any() else scene.seen.astype(np.float64)
+    weights = np.where(scene.has_feature, scene.total_weight, 0.0).astype(np.float64)
+    weights = weights if weights.any() else scene.has_feature.astype(np.float64)
     thresholds, answer_weights = np.empty(len(words)), np.empty(len(words))
     nearest = _Nearest(len(weights))
     for row, scores in _scores(scene, rows, range(len(words))):
-        threshold = find_threshold(scores[scene.seen], "auto", scene.weights)
+        threshold = find_threshold(scores[scene.has_feature], "auto", scene.weights)
         thresholds[row] = threshold.value if threshold.clear else np.inf
         answer_weights[row] = weights[scores >= thresholds[row]].sum()
         nearest.take(row, scores)
@@ -166,7 +166,7 @@ def segment(
             parts[row] = False
             continue
         if shares[row] >= LEAST_OWN and not parts[row].any():
-            winners.take(row, np.where(scene.seen & (scores >= thresholds[row]), scores, -np.inf))
+            winners.take(row, np.where(scene.has_feature & (scores >= thresholds[row]), scores, -np.inf))
     labels = np.where(winners.score > -np.inf, winners.row, NO_WORD).astype(np.int32)
     labels = _by_nodes(scene, labels, weights, parts)
     score = np.zeros(len(labels), np.float32)
@@ -219,8 +219,8 @@ def _by_nodes(scene: OpenedLift, labels: np.ndarray, weights: np.ndarray, parts:
         return labels
     output = labels.copy()
     for node in sorted(np.flatnonzero(parts.any(axis=0)).tolist(), key=lambda n: len(scene.node_path(n))):
-        output[scene.seen & scene.members(node)] = int(parts[:, node].argmax())
-    nodes, word_count = np.where(scene.seen, scene.node, -1), len(parts)
+        output[scene.has_feature & scene.members(node)] = int(parts[:, node].argmax())
+    nodes, word_count = np.where(scene.has_feature, scene.node, -1), len(parts)
     within = nodes >= 0
     shape = len(scene.node_parents), word_count + 1
     places = nodes[within].astype(np.int64) * shape[1] + np.where(output < 0, word_count, output)[within]

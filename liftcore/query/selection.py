@@ -104,7 +104,7 @@ def compare_ranks(
     Args:
         scene: an opened lift. scores: [P] f32. weights: [P] f32 of the splats. threshold: on the scores.
     """
-    rows, widths = _octaves(_from_the_best(scores, np.flatnonzero(scene.seen)))
+    rows, widths = _octaves(_from_the_best(scores, np.flatnonzero(scene.has_feature)))
     counts = weights[rows] * widths
     if not counts.any():
         counts = widths
@@ -154,7 +154,7 @@ def correct_by_objects(
     """
     if scene.object is None or scene.object_views is None or len(scene.object) != len(selected):
         return selected, ""
-    count, objects = len(scene.object_views), np.where(scene.seen, scene.object, -1)
+    count, objects = len(scene.object_views), np.where(scene.has_feature, scene.object, -1)
     in_object = objects >= 0
     totals = np.bincount(objects[in_object], weights[in_object], count)
     inside = np.bincount(objects[in_object & selected], weights[in_object & selected], count)
@@ -286,7 +286,7 @@ def objects_within(scene: OpenedLift, selected: np.ndarray) -> np.ndarray:
     """Return the objects [N] bool of which `PARTLY_SELECTED` or more is among the selected splats [P] bool."""
     if scene.object is None or scene.object_views is None or len(scene.object) != len(selected):
         return np.zeros(0, np.bool_)
-    in_object, number = scene.seen & (scene.object >= 0), len(scene.object_views)
+    in_object, number = scene.has_feature & (scene.object >= 0), len(scene.object_views)
     totals, inside = (
         np.bincount(scene.object[rows], scene.total_weight[rows], number)
         for rows in (in_object, in_object & selected)
@@ -297,7 +297,7 @@ def objects_within(scene: OpenedLift, selected: np.ndarray) -> np.ndarray:
 def add_objects(scene: OpenedLift, selected: np.ndarray) -> np.ndarray:
     """Add to selected splats [P] bool the objects of which `PARTLY_SELECTED` or more is selected, with all parts."""
     objects = objects_within(scene, selected)
-    return selected | (scene.seen & np.append(objects, False)[scene.object]) if objects.any() else selected
+    return selected | (scene.has_feature & np.append(objects, False)[scene.object]) if objects.any() else selected
 
 
 def _quantity(count: int, noun: str) -> str:

@@ -202,7 +202,7 @@ def _mix_values(lift: Lift, index: _Index, new: Splats, progress: Progress) -> t
     tuple_of = np.full(count, -1)
     has_feature, copied_count, mixed_count = np.zeros(count, bool), 0, 0
     partners: list[tuple[np.ndarray, np.ndarray]] = []  # of each block
-    old = {name: getattr(lift, name).cpu().numpy() for name in (*values, "seen")}
+    old = {name: getattr(lift, name).cpu().numpy() for name in (*values, "has_feature")}
     own_tuple = own_tuple.reshape(-1)
     old_features = lift.features.cpu()
     for rows, near, overlaps in index.partners(new):
@@ -212,7 +212,7 @@ def _mix_values(lift: Lift, index: _Index, new: Splats, progress: Progress) -> t
         shares = np.where(top >= SAME_SPLAT, copies, overlaps**2 * (overlaps >= LEAST_OVERLAP))
         shares /= np.maximum(shares.sum(axis=1, keepdims=True), 1e-300)
         partners.append((near.astype(np.int32), shares.astype(np.float32)))
-        feature_shares = shares * old["seen"][near]
+        feature_shares = shares * old["has_feature"][near]
         sums = feature_shares.sum(axis=1)
         has_feature[rows] = sums >= 0.5
         is_row, is_mixed = top[:, 0] >= SAME_SPLAT, (top[:, 0] < SAME_SPLAT) & (top[:, 0] >= LEAST_OVERLAP)
@@ -236,7 +236,7 @@ def _mix_values(lift: Lift, index: _Index, new: Splats, progress: Progress) -> t
     values["total_weight"] = _divide_weight(
         lift.total_weight.cpu().numpy(), *map(np.concatenate, zip(*partners, strict=True))
     )
-    fields: dict[str, Any] = {"features": features, "seen": torch.from_numpy(has_feature)}
+    fields: dict[str, Any] = {"features": features, "has_feature": torch.from_numpy(has_feature)}
     fields |= {name: torch.from_numpy(column) for name, column in values.items()}
     labels = np.where(tuple_of[:, None] >= 0, tuples[tuple_of], -1).astype(np.int32)
     fields |= {name: torch.from_numpy(labels[:, place].copy()) for place, name in enumerate(kinds, 1)}

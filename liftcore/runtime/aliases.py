@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from functools import wraps
 from inspect import getattr_static
-from typing import Any, TypeVar, cast
+from typing import Any, ClassVar, Self, TypeVar, cast
 
 from liftcore.errors import InvalidInput, SplatliftError
 
@@ -121,6 +121,24 @@ def deprecated_keywords(**aliases: str) -> Callable[[F], F]:
         return cast("F", call_by_names)
 
     return decorate
+
+
+class AliasedDict(dict[str, Any]):
+    """A dictionary whose values are read by old keys too, each with a `DeprecationWarning`."""
+
+    aliases: ClassVar[Mapping[str, str]] = {}  # new keys by old ones
+
+    def __missing__(self, key: str) -> Any:
+        """Return the value of the new key of an old one."""
+        new = self.aliases.get(key)
+        if new is None:
+            raise KeyError(key)
+        _warn(type(self).__name__, key, new)
+        return self[new]
+
+    def __or__(self, other: Mapping[str, Any]) -> Self:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Return a dictionary of the same type with the values of both."""
+        return type(self)({**self, **other})
 
 
 def deprecated_module_names(module: str, **aliases: str) -> Callable[[str], Any]:

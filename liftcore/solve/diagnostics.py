@@ -75,8 +75,8 @@ def compute_diagnostics(
         "surrogate": _mean(measures.surrogates),
         "beta": beta,
         "bound": None if beta["max"] is None else 1.0 + beta["max"],
-        "seen_share": float((sums > 0).mean()),
-        "evidence_over_half_share": float((total_weight > 0.5).float().mean()),
+        "feature_share": float((sums > 0).mean()),
+        "total_weight_over_half_share": float((total_weight > 0.5).float().mean()),
     }
 
 

@@ -6,8 +6,8 @@ With e_m the direction of region m (`liftcore.solve.directions`), its weight in 
     r_jv = sum of W_jn e_n over the regions n of all other views,     c = sum W c_jm / sum W over the scene
 
 ``p_jv`` is the share of view v in the weight of splat j, and ``s_j`` restores the sum of weights of the splat, so
-denominators, ``seen`` and total weight do not change. A further step takes r and p from the weights of the step
-before, and starts from the first W again. There are no tuned parameters; the reason for each part:
+denominators, ``has_feature`` and total weight do not change. A further step takes r and p from the weights of the
+step before, and starts from the first W again. There are no tuned parameters; the reason for each part:
 
 - **Other views are the reference, never the region itself.** A region's vector is noisy, and the noise of a heavy
   region pulls the splat's mean towards it. Compared with that mean, a region is rewarded for its own noise, most

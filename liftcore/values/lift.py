@@ -10,18 +10,20 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, field_validator
 
-from liftcore.errors import InvalidSplats
-from liftcore.runtime.aliases import deprecated_names
+from liftcore.errors import InvalidLift, InvalidSplats
+from liftcore.runtime.aliases import AliasedDict, current_names, deprecated_names, with_old_names
 from liftcore.runtime.fields import AliasedModel
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.origin import FILE_ORIGIN, Origin
 from liftcore.scene.views import composed
 from liftcore.scene.world import UNKNOWN, WorldFrame
 from liftcore.text.table import TableEncoder, own_words
-from liftcore.values.lift_file import FORMAT, NODE_TENSORS, OLD_TENSORS
+from liftcore.values.lift_file import FORMAT, NODE_TENSORS, OLD_DIAGNOSTICS, OLD_TENSORS
 from liftcore.values.settings import LiftSettings
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     import torch
     from torch import Tensor
 
@@ -53,6 +55,21 @@ def landmarks_of(splats: Splats) -> tuple[Landmark, ...]:
     return tuple((row, x, y, z) for row, (x, y, z) in zip(rows, places, strict=True))
 
 
+class Diagnostics(AliasedDict):
+    """Measurements of a lift by their names, as plain numbers."""
+
+    aliases = OLD_DIAGNOSTICS
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> Self:
+        """Return diagnostics under their new names.
+
+        Raises:
+            InvalidLift: an old and a new name have different values.
+        """
+        return cls(current_names(values, OLD_DIAGNOSTICS, InvalidLift))
+
+
 class LiftMetadata(AliasedModel):
     """Settings, inputs and measurements of a lift."""
 
@@ -73,7 +90,7 @@ class LiftMetadata(AliasedModel):
     origin: Origin = FILE_ORIGIN  # of the splats (`Splats.origin`), and of the positions in ``.splat`` and ``.spz``
     world: WorldFrame = UNKNOWN  # of the splats: as their file, else that of the cameras says it, or somebody later
     landmarks: tuple[Landmark, ...] = ()  # positions of some splats, to verify their rows; () in older lifts
-    diagnostics: dict[str, Any]
+    diagnostics: Annotated[dict[str, Any], AfterValidator(Diagnostics.of)]
     timings: dict[str, float]  # seconds a stage
 
     @field_validator("settings", mode="before")
@@ -90,12 +107,12 @@ class Lift:
     """X and what supports it, one row a splat, in the splats' order."""
 
     features: Tensor
-    """[P, F] f16 or f32; zero rows where not seen"""
+    """[P, F] f16 or f32; zero rows without a feature"""
     total_weight: Tensor
     """[P] f32, sum of plain weights w over the feature views, each ray once"""
     agreement: Tensor
     """[P] f32 in 0..1, norm of the mean of unit regions or cells; says little of being right"""
-    seen: Tensor
+    has_feature: Tensor
     """[P] bool, whether any labelled ray reached the splat"""
     metadata: LiftMetadata
     confidence: Tensor | None = None
@@ -141,6 +158,15 @@ class Lift:
         """Measurements of the lift (residual, bound, row sums, warnings, plan), as plain numbers."""
         return self.metadata.diagnostics
 
+    @staticmethod
+    def diagnostics_of_reply(diagnostics: Mapping[str, Any]) -> dict[str, Any]:
+        """Return diagnostics of a lift, of an older file too, with each old name behind its new one.
+
+        Raises:
+            InvalidLift: an old and a new name have different values.
+        """
+        return with_old_names(Diagnostics.of(diagnostics), OLD_DIAGNOSTICS)
+
     @property
     def table(self) -> TableEncoder | None:
         """The words that its packs brought, with their vectors (`.words`, `.encode(words)`); None without any."""
@@ -162,7 +188,7 @@ class Lift:
         from liftcore.scene.rows import chosen_rows
 
         rows = chosen_rows(keep, len(self)).to(self.features.device)
-        names = ("features", "total_weight", "agreement", "seen", "confidence", "cluster", "object")
+        names = ("features", "total_weight", "agreement", "has_feature", "confidence", "cluster", "object")
         tensors = {name: getattr(self, name) for name in names}
         columns = {name: column[rows] for name, column in tensors.items() if column is not None}
         for labels, table in (("cluster", "cluster_features"), ("object", "object_views")):

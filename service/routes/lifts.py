@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 
-from liftcore import LiftSettings
+from liftcore import LiftResult, LiftSettings
 from liftcore.errors import NotFound
 from liftcore.files import in_camera_orientation
 from service import models
@@ -358,6 +358,7 @@ def shape_lift(lift: LiftRecord) -> models.LiftResult:
         "world": {},
         **lift.metadata,
         "settings": LiftSettings.with_old_names(lift.metadata["settings"]),
+        "diagnostics": LiftResult.diagnostics_of_reply(lift.metadata["diagnostics"]),
         **vars(lift),
         "links": links,
     }

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
+from safetensors import safe_open
+from safetensors.numpy import save
 
 from liftcore import LiftSettings
+from liftcore.values.lift_file import OLD_DIAGNOSTICS
 from service import models
 from service.routes.lifts import shape_tradeoff
 from service.store.lifts import FinishedTradeoff
@@ -115,6 +120,27 @@ def test_stored_tradeoffs_have_both_names_whichever_they_were_stored_by(store: S
         assert reply["over_budget"] == reply["skipped"] == ["mean"]
         assert reply["invalid_runs"] == reply["refused"] == ["argmax"]
         assert reply["runs"][0]["settings"] == {"diagnostic_rays": 7, "certificate_rays": 7}
+
+
+@pytest.mark.parametrize("old", OLD_DIAGNOSTICS)
+def test_diagnostics_of_a_lift_have_old_names_beside_the_new_ones(
+    client: TestClient, lift: dict[str, Any], old: str, tmp_path: Path
+) -> None:
+    content = client.get(f"/lifts/{lift['id']}/features").content
+    (tmp_path / "lift").write_bytes(content)
+    with safe_open(tmp_path / "lift", "np") as file:
+        metadata = json.loads(file.metadata()["splatlift"])
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    for name in (old, OLD_DIAGNOSTICS[old]):
+        diagnostics = {name: 0.25}
+        text = json.dumps(metadata | {"diagnostics": diagnostics})
+        reply = client.post("/lifts", content=save(tensors, {"splatlift": text}))
+        assert reply.status_code == 201
+        document = client.get(reply.json()["links"]["self"]).json()
+        assert document["diagnostics"] == document["certificate"] == {OLD_DIAGNOSTICS[old]: 0.25, old: 0.25}
+    text = json.dumps(metadata | {"diagnostics": {old: 0.25, OLD_DIAGNOSTICS[old]: 0.5}})
+    problem = assert_problem(client.post("/lifts", content=save(tensors, {"splatlift": text})))
+    assert problem["status"] == 422 and old in problem["expected"]
 
 
 def test_a_zip_of_things_is_one_of_objects(client: TestClient, lift: dict[str, Any]) -> None:

@@ -135,7 +135,7 @@ def large(splats: int, channels: int, views: int, preset: str) -> Cost:
         result.save(Path(folder, "lift"))
         entries, splats_a_view = result.diagnostics["weights_entries"], result.diagnostics["plan"]["splats_a_view"]
         blocks = sum(path.stat().st_size for path in work.rglob("weights-*"))
-    visible_share = float(result.seen.float().mean())
+    visible_share = float(result.has_feature.float().mean())
     return Cost(seconds, result.metadata.timings, peak[0], before, entries, blocks, splats_a_view, visible_share)
 
 

@@ -53,7 +53,7 @@ def measure(scene: Scene, cases: Iterable[Case]) -> dict[str, float]:
             rejected += 1
             continue
         auto = answers["auto"]
-        cut = find_threshold(auto.scores[auto.seen], "auto", scene.weights).value
+        cut = find_threshold(auto.scores[auto.has_feature], "auto", scene.weights).value
         answers["anywhere"] = ask(scene, Query.of((example,), threshold=cut))
         for name, values in compare_thresholds(scene, answers, truths).items():
             rows[name] += values

@@ -242,9 +242,11 @@ def lift_of(
         longest = max(float(view.codebook.double().abs().max()) for view in by_name.values())
         faint = (totals > 0) & (totals < FAINT)
         errors = np.abs(result.features.double().numpy() - X) / (longest or 1.0)
-        visible = result.seen.numpy()
+        visible = result.has_feature.numpy()
         sound = all(bool(part.isfinite().all()) for part in (result.features, result.total_weight, result.agreement))
-        sound &= np.array_equal(visible[~faint], totals[~faint] > 0) and not result.features[~result.seen].any()
+        sound &= (
+            np.array_equal(visible[~faint], totals[~faint] > 0) and not result.features[~result.has_feature].any()
+        )
         sound &= survives(
             run(by_name, scene_splats, **{**(settings or {}), **ALL_STEPS})[0], next(iter(by_name.values()))
         )
@@ -321,7 +323,9 @@ def survives(result: lc.LiftResult, view: ViewFeatures) -> bool:
         return bool(result.features.isfinite().all())
     answers = [result.query(vector, threshold=method) for method in METHODS]
     parts = [result.features, result.agreement, *(answer.scores for answer in answers)]
-    is_finite = all(not math.isnan(answer.threshold) and not answer.splats[~result.seen].any() for answer in answers)
+    is_finite = all(
+        not math.isnan(answer.threshold) and not answer.splats[~result.has_feature].any() for answer in answers
+    )
     return is_finite and all(bool(part.isfinite().all()) for part in parts)
 
 

@@ -109,7 +109,7 @@ def beside_processor(files: Sequence[Path], device: Device) -> dict[str, Any]:
         "least cosine": f"{float(cosine_similarity(first, second, dim=1).min()):.6f}",
         "largest difference / largest value": float((first - second).abs().max() / first.abs().max()),
         "total weight, relative": float(((total_weight - b.total_weight[has_weight]).abs() / total_weight).max()),
-        "seen by one": int((a.seen != b.seen).sum()),
+        "seen by one": int((a.has_feature != b.has_feature).sum()),
     }
 
 

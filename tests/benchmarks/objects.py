@@ -66,7 +66,7 @@ def _are_two(scene: Scene, answers: dict[int, Answer], owners: np.ndarray) -> bo
         first.selected | second.selected,
         first.model_dump(exclude={"text", "like", "count", "top", "box"}),
     )
-    grouped = objects(scene, Answer.of(first.query, first.scores, first.seen, union, **fields))
+    grouped = objects(scene, Answer.of(first.query, first.scores, first.has_feature, union, **fields))
     majorities = {
         int(np.bincount(owners[grouped.numbers == number]).argmax()) for number in range(len(grouped.objects))
     }

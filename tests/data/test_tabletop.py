@@ -125,7 +125,7 @@ def test_fourteen_words_are_found_among_many(
     absent = np.random.default_rng(0).choice(other_words, 100, replace=False).tolist()
     segmentation = segment(scene, words + absent, encoder.encode(words + absent))
     assert {label.word for label in segmentation.named_words} == set(words)
-    mask = scene.seen & (scene.total_weight > 0.5)
+    mask = scene.has_feature & (scene.total_weight > 0.5)
     assert (segmentation.labels == real)[mask].mean() > 0.9
     seven = segment(scene, words[:7], encoder.encode(words[:7])).labels
     assert (seven[mask & (real >= 7)] < 0).mean() > 0.5
@@ -138,7 +138,10 @@ def test_a_thing_stays_found_when_something_else_is_not_wanted(truth: Truth, def
     def iou(number: int, *unlike: int) -> float:
         """Of the splats found with those of the thing, asked by the splat of each class that was seen best."""
         like, *against = (SplatTerm(best[other]) for other in (number, *unlike))
-        selected, expected = ask(scene, Query.of((like,), tuple(against))).selected, (real == number) & scene.seen
+        selected, expected = (
+            ask(scene, Query.of((like,), tuple(against))).selected,
+            (real == number) & scene.has_feature,
+        )
         return float((selected & expected).sum() / (selected | expected).sum())
 
     ious = np.array([iou(number) for number in OBJECTS])

@@ -132,7 +132,7 @@ def test_pack_of_ones_own_program_makes_a_lift_that_python_reads(
     vertices = PlyData.read("scene.ply")["vertex"]
     positions = np.stack([vertices[axis] for axis in "xyz"], axis=1)
     assert np.array_equal(positions, read_splats(scene_folder / "scene.ply").means.numpy())
-    mask = lift["seen"] & (lift["total_weight"] > 0.5)
+    mask = lift["has_feature"] & (lift["total_weight"] > 0.5)
     clusters = np.digitize(positions[mask, 0], [-0.6, 0.6])  # 0 apple, 1 book, 2 lamp
     assert len(set(clusters)) == 3 and np.array_equal(lift["features"][mask].argmax(axis=1), clusters)
 
@@ -439,7 +439,7 @@ def test_tensors_of_a_training_loop_lift_as_their_files_do(loop: dict[str, Any],
         lc.read_features(tmp_path / "features.safetensors"),
     )  # fmt: skip
     assert torch.allclose(filed.features.float(), features, atol=2e-3)  # packs and poses are rounded, values are not
-    assert torch.equal(filed.seen, loop["result"].seen)
+    assert torch.equal(filed.has_feature, loop["result"].has_feature)
 
     columns = np.nonzero(np.asarray(loop["mask"]))[1]
     assert len(columns) > 10 and columns.max() < WIDTH / 2  # the cloud on the left was asked for

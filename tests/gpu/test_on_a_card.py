@@ -65,7 +65,7 @@ def test_a_lift_on_a_card_is_the_processors(paths: list[Path], grids: bool, opti
     for name in ("features", "total_weight", "agreement"):
         left, right = getattr(on_cpu, name).float(), getattr(on_gpu, name).float()
         assert torch.allclose(left, right, rtol=2e-3, atol=2e-3), name
-    assert torch.equal(on_cpu.seen, on_gpu.seen)
+    assert torch.equal(on_cpu.has_feature, on_gpu.has_feature)
 
 
 def test_what_follows_a_lift_takes_it_from_the_card(paths: list[Path], tmp_path: Path) -> None:
@@ -109,8 +109,8 @@ def test_tensors_of_a_card_come_in(paths: list[Path]) -> None:
         expected = lc.lift(splats_on_cpu, cameras, {"middle": views["middle"]}, device=device, **FEW).cpu()
         result = lc.lift(splats, cameras, {"middle": regions}, device=device, **FEW)
         assert torch.equal(result.cpu().features, expected.features)
-        assert lc.lift(splats, cameras, iter([("middle", grid)]), device=device, **FEW).seen.any()
-        assert lc.lift(splats, cameras, {"middle": grid}, "default", device=device, **FEW).seen.any()
+        assert lc.lift(splats, cameras, iter([("middle", grid)]), device=device, **FEW).has_feature.any()
+        assert lc.lift(splats, cameras, {"middle": grid}, "default", device=device, **FEW).has_feature.any()
         ones = lc.render(splats, cameras["middle"], torch.ones(60).to("cuda"), device=device)
         assert torch.equal(ones, lc.render(splats_on_cpu, camera, torch.ones(60), device=device))
         lc.region_weights(splats, cameras, {"middle": regions}, device=device)

@@ -28,7 +28,7 @@ def test_diagnostics_and_scores_are_the_same_at_any_length(scale):
     first, second = (lifted(observations, preset="row-sum", reference_channels=4) for observations in views)
     for key in ("beta", "bound", "reference"):
         assert numbers(second.diagnostics[key]) == pytest.approx(numbers(first.diagnostics[key]), rel=2e-3, abs=1e-3)
-    question = first.features[first.seen][:1].numpy()
+    question = first.features[first.has_feature][:1].numpy()
     assert torch.allclose(second.query(question).scores, first.query(question).scores, atol=1e-5)
 
 

@@ -46,7 +46,7 @@ def test_scene_is_lifted_inspected_and_queried(scene: Path, capsys: pytest.Captu
     document = json.loads(out)
     assert (document["splats"], document["channels"], document["views"]) == (2, 3, 1)
     assert document["settings"]["preset"] == "row-sum"
-    assert document["seen_share"] == 1
+    assert document["feature_share"] == document["seen_share"] == 1
     assert document["warnings"] == ["1 views have features but no camera and were skipped: lost"]
     assert {"diagnostics", "timings", "out"} <= set(document)
     features = load_lift(scene / "lift.safetensors").features

@@ -50,7 +50,7 @@ def lifted(folder: Path, lens: str, *, grids: bool = False) -> LiftResult:
 def share_of_own_quarter(result: LiftResult) -> torch.Tensor:
     """Return the share of its own quarter in the feature of each splat with a feature that is clear of borders."""
     x, y = (axis.numpy() for axis in wall().means.T[:2])
-    clear = is_clear(x, y, CLEAR) & result.seen.numpy()
+    clear = is_clear(x, y, CLEAR) & result.has_feature.numpy()
     own_weight = result.features.float()[torch.arange(len(x)), torch.from_numpy(quarter(x, y))]
     return (own_weight / result.features.float().sum(dim=1)).nan_to_num(nan=1.0)[torch.from_numpy(clear)]
 

@@ -136,11 +136,12 @@ def test_maps_in_another_order_and_masks_of_one_region_are_reported(tmp_path: Pa
 def test_lift_is_described(tmp_path: Path) -> None:
     lift = load_lift(write_lift(tmp_path))
     count, unseen = len(lift.features), len(lift.features) // 2
-    save_lift(replace(lift, seen=torch.arange(count) >= unseen), tmp_path / "l")
+    save_lift(replace(lift, has_feature=torch.arange(count) >= unseen), tmp_path / "l")
     (tmp_path / "splats.ply").unlink()
     report = inspected(tmp_path / "l")
     assert (report["kind"], report["splats"], report["channels"]) == ("lift", count, len(WORDS))
-    assert report["seen_share"] == pytest.approx(1 - unseen / count) and report["settings"]["preset"] == "row-sum"
+    assert report["feature_share"] == report["seen_share"] == pytest.approx(1 - unseen / count)
+    assert report["settings"]["preset"] == "row-sum"
     expected = f"{unseen} of {count} splats were reached by no labelled ray; they have no features of their own"
     assert report["warnings"][0] == expected and "no longer at" in report["warnings"][1]
 

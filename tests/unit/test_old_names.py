@@ -15,7 +15,7 @@ import liftcore as lc
 from liftcore.cli import build_parser
 from liftcore.cli.lift import pairs_of, settings_of
 from liftcore.values.lift import LiftMetadata
-from liftcore.values.lift_file import FORMATS, OLD_TENSORS
+from liftcore.values.lift_file import FORMATS, OLD_DIAGNOSTICS, OLD_TENSORS
 from liftcore.values.region_weights import OLD_TENSORS as OLD_WEIGHTS
 from tests.scenes import observed, write_scene
 from tests.unit.solve.sparse_views import random_view
@@ -46,12 +46,16 @@ def write_file(path: Path, tensors: dict[str, torch.Tensor], metadata: dict[str,
     return path
 
 
-def test_lift_file_of_the_first_format_opens_with_the_same_values(lift: lc.LiftResult, tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", FORMATS)
+def test_lift_file_of_old_names_opens_with_the_same_values(lift: lc.LiftResult, tmp_path: Path, number: str) -> None:
     lift.save(tmp_path / "new.safetensors")
     tensors, metadata = read_file(tmp_path / "new.safetensors")
     assert metadata["format"] == FORMATS[-1] and not OLD_TENSORS.keys() & tensors.keys()
+    assert not OLD_DIAGNOSTICS.keys() & metadata["diagnostics"].keys()
     settings = old_names(metadata["settings"], lc.LiftSettings.old_names)
-    metadata = old_names(metadata, LiftMetadata.old_names) | {"format": FORMATS[0], "settings": settings}
+    metadata |= {"format": number, "settings": settings}
+    metadata["diagnostics"] = old_names(metadata["diagnostics"], OLD_DIAGNOSTICS)
+    metadata = old_names(metadata, LiftMetadata.old_names)
     old = lc.load_lift(write_file(tmp_path / "old.safetensors", old_names(tensors, OLD_TENSORS), metadata))
     for name in OLD_TENSORS.values():
         assert torch.equal(getattr(old, name), getattr(lift, name))
@@ -83,10 +87,25 @@ def test_old_attributes_and_keywords_of_a_lift_are_deprecated(lift: lc.LiftResul
     new = OLD_TENSORS[old]
     with pytest.deprecated_call(match=f"{old} is now {new}"):
         assert getattr(lift, old) is getattr(lift, new)
-    columns = {name: getattr(lift, name) for name in ("features", "total_weight", "agreement", "seen", "metadata")}
+    columns = {
+        name: getattr(lift, name) for name in ("features", "total_weight", "agreement", "has_feature", "metadata")
+    }
     with pytest.deprecated_call(match=f"{old} is now {new}"):
         result = lc.LiftResult(**old_names(columns, {old: new}))
     assert getattr(result, new) is getattr(lift, new)
+
+
+@pytest.mark.parametrize("old", OLD_DIAGNOSTICS)
+def test_old_names_of_diagnostics_are_deprecated_and_replied_beside_the_new(lift: lc.LiftResult, old: str) -> None:
+    new, reply = OLD_DIAGNOSTICS[old], lift.diagnostics_of_reply(lift.diagnostics)
+    assert reply[old] == reply[new] and old not in lift.diagnostics
+    for diagnostics in (lift.diagnostics, lift[:2].diagnostics):
+        with pytest.deprecated_call(match=f"{old} is now {new}"):
+            assert diagnostics[old] == lift.diagnostics[new]
+    with pytest.raises(KeyError, match="nothing"):
+        lift.diagnostics["nothing"]
+    with pytest.raises(lc.InvalidLift, match=f"{old} is the old name of {new}"):
+        lift.diagnostics_of_reply({old: 0.0, new: 0.5})
 
 
 def settings_by_old_names(old: str, value: object) -> dict[str, Callable[[], lc.LiftSettings]]:

@@ -103,7 +103,7 @@ def test_lift_of_values_has_the_bits_of_the_lift_of_files(scene, form):
     }
     expected = lift_files(splats, cameras, [pack], lc.LiftSettings.of(preset="row-sum"))
     result = lc.lift(cloud, poses, forms[form](), preset="row-sum")
-    for name in ("features", "total_weight", "agreement", "seen"):
+    for name in ("features", "total_weight", "agreement", "has_feature"):
         assert torch.equal(getattr(result, name), getattr(expected, name))
     assert result.views == expected.views == ("v0", "v1", "v2")
     assert result.diagnostics["residual"] == pytest.approx(expected.diagnostics["residual"], rel=0.5)
@@ -182,7 +182,7 @@ def test_region_weights_times_codebooks_are_the_lift(scene):
     assert W.shape == (splats.count, len(E)) and weights.offsets.tolist()[0] == 0
     result = lc.lift(splats, cameras, views, preset="row-sum", dtype="float32")
     sums = W.sum(axis=1)
-    assert ((sums > 0) == result.seen.numpy()).all()
+    assert ((sums > 0) == result.has_feature.numpy()).all()
     X = np.divide(W @ E, sums[:, None], out=np.zeros((splats.count, E.shape[1])), where=sums[:, None] > 0)
     np.testing.assert_allclose(result.features.numpy(), X, atol=1e-5)
     weights_of_iterator = lc.region_weights(splats, cameras, iter(views.items()), preset="row-sum", threads=2)
@@ -199,7 +199,7 @@ def test_reweighted_region_weights_times_codebooks_are_the_lift_of_any_preset(sc
     W = reweighted.matrix(splats.count)
     E = np.concatenate([views[name].codebook.double().numpy() for name in reweighted.views])
     result = lc.lift(splats, cameras, views, dtype="float32", **settings)
-    has_feature = result.seen.numpy()
+    has_feature = result.has_feature.numpy()
     np.testing.assert_allclose(
         result.features.numpy()[has_feature], (W @ E)[has_feature] / W.sum(axis=1)[has_feature, None], atol=1e-5
     )

@@ -18,7 +18,7 @@ def answer_with(
     return Answer.of(
         answer.query.model_copy(update=query),
         answer.scores if scores is None else scores,
-        answer.seen,
+        answer.has_feature,
         answer.selected if selected is None else selected,
         **fields,
     )

@@ -42,7 +42,7 @@ def test_the_object_is_what_was_selected_and_can_be_lifted_again(scene: Scene, t
     second_lift = lift_files(*files, LiftSettings.of(preset="row-sum"))
     assert second_lift.features.shape[0] == len(rows)
     all_splats = of_lamp(scene, -1.0)
-    assert np.array_equal(all_splats.selected, all_splats.seen)
+    assert np.array_equal(all_splats.selected, all_splats.has_feature)
     assert b"".join(object_splats(scene, all_splats)) == ply(splat_rows())
 
 
@@ -62,7 +62,7 @@ def test_the_object_as_an_editors_file_has_the_same_rows(suffix: str, scene: Sce
 
 def test_scores_have_the_colours_of_the_map_and_what_was_not_seen_is_grey(scene: Scene, tmp_path: Path) -> None:
     answer = of_lamp(scene)
-    assert not answer.seen[-1]
+    assert not answer.has_feature[-1]
     (tmp_path / "scores.ply").write_bytes(b"".join(coloured_ply(scene, answer)))
     sh = read_splats(tmp_path / "scores.ply").sh
     assert sh is not None

@@ -37,6 +37,7 @@ def test_old_attributes_are_the_new_ones_with_a_warning(scene: lc.Scene) -> None
         (lc.load_lift(scene.path).query(np.eye(CHANNELS)[0]), "why", "reason"),
         (scene, "look", "view_mask"), (scene, "what", "nearest_words"), (scene, "counted", "splat_weights"),
         (scene, "seen_alone", "weights_with_feature"), (answer, "dropped", "is_dropped"),
+        (scene, "all_seen", "all_have_features"),
         (models.Edit(operation="grow"), "described", "to_json"),
     ]  # fmt: skip
     for value, old, new in pairs:
@@ -45,6 +46,7 @@ def test_old_attributes_are_the_new_ones_with_a_warning(scene: lc.Scene) -> None
 
 
 def test_old_keywords_and_fields_are_read_and_contradictions_are_refused(scene: lc.Scene) -> None:
+    answer = scene.ask("x", encoder=AXES)
     query: Any = lc.Query
     edit: Any = models.Edit
     assert query(text="x", weigh="confidence") == query(text="x", weight_by="confidence")
@@ -55,6 +57,18 @@ def test_old_keywords_and_fields_are_read_and_contradictions_are_refused(scene: 
         selection.edit(how="grow")
     with deprecated("channel"):
         assert (scene.render("middle", what="depth") == scene.render("middle", "depth")).all()  # pyright: ignore
+    for value in (scene, answer, scene.lift):
+        with deprecated("has_feature"):
+            assert (value.seen == value.has_feature).all()  # pyright: ignore
+    arrays = answer.scores, answer.selected
+    fields = {name: getattr(answer, name) for name in lc.Answer.model_fields if name not in ("text", "like", "count")}
+    with deprecated("has_feature"):
+        old = lc.Answer.of(answer.query, arrays[0], seen=answer.has_feature, selected=arrays[1], **fields)
+    assert old.has_feature is answer.has_feature
+    view_mask = scene.view_mask(answer, "middle")
+    with deprecated("view_mask"):
+        old_blocks = scene.blocks_of(answer, "mask", view="middle", seen=view_mask)  # pyright: ignore
+    assert [*old_blocks] == [*scene.blocks_of(answer, "mask", view="middle", view_mask=view_mask)]
     wrong: list[tuple[Callable[[], object], str]] = [
         (lambda: query(text="x", weigh="confidence", weight_by="evidence"), "weight_by"),
         (lambda: edit(how="grow", operation="shrink"), "operation"),

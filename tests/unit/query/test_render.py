@@ -79,7 +79,7 @@ def mostly(scene: Scene, members: np.ndarray) -> np.ndarray:
 def test_attention_is_the_scores_rendered_with_the_lifts_gain(scene: Scene) -> None:
     answer, camera = of(scene, 0), scene.cameras["middle"]
     in_view = view_mask(scene, answer, "middle")
-    scores = torch.from_numpy(np.where(answer.seen, answer.scores, np.float32(0)))[:, None]
+    scores = torch.from_numpy(np.where(answer.has_feature, answer.scores, np.float32(0)))[:, None]
     assert np.array_equal(in_view.attention, scene.raster.render(camera, scores, scene.compositing)[:, :, 0])
     np.testing.assert_allclose(in_view.row_sums, scene.raster.row_sums(camera, scene.compositing), rtol=1e-6)
     assert scene.compositing.opacity_logit_scale == scene.metadata.settings.render_gain == 1.2
@@ -246,7 +246,7 @@ def scene_of(base: Scene, splats: Splats, camera: Camera) -> Scene:
     ones = torch.ones(splats.count)
     metadata = base.metadata.model_copy(update={"landmarks": ()})
     lift = replace(
-        base.lift, features=torch.ones(splats.count, 1), total_weight=ones, seen=ones > 0, metadata=metadata
+        base.lift, features=torch.ones(splats.count, 1), total_weight=ones, has_feature=ones > 0, metadata=metadata
     )
     return Scene(lift, splats, Cameras((camera,)))
 

@@ -29,7 +29,13 @@ def table() -> TableEncoder:
 def lifted(scene: Scene, features: np.ndarray, **fields: Any) -> Scene:
     """Return the scene with these features [P, F], of total weight one."""
     ones = torch.ones(len(features))
-    defaults = {"total_weight": ones, "agreement": ones, "seen": ones > 0, "object": None, "object_views": None}
+    defaults = {
+        "total_weight": ones,
+        "agreement": ones,
+        "has_feature": ones > 0,
+        "object": None,
+        "object_views": None,
+    }
     return Scene(replace(scene.lift, features=torch.from_numpy(features.astype(np.float32)), **defaults | fields))
 
 

@@ -40,7 +40,7 @@ def test_rows_that_are_kept_come_back_as_they_were(lifted: tuple[LiftResult, Spl
     result, splats = lifted
     order = np.random.default_rng(1).permutation(splats.count)[:45]
     moved_lift = result.transferred(splats, splats[order])
-    for name in ("features", "total_weight", "agreement", "seen"):
+    for name in ("features", "total_weight", "agreement", "has_feature"):
         assert torch.equal(getattr(moved_lift, name), getattr(result, name)[order]), name
     expected = result[order]
     assert (
@@ -110,7 +110,7 @@ def test_splats_of_elsewhere_find_no_partner_and_have_no_feature(lifted: tuple[L
     moved_lift = result.transferred(splats, other)
     assert moved_lift.diagnostics["transfer"]["without_partner"] == 7
     assert (
-        not moved_lift.seen[:7].any()
+        not moved_lift.has_feature[:7].any()
         and not moved_lift.features[:7].any()
         and (moved_lift.object is None or (moved_lift.object[:7] == -1).all())
     )

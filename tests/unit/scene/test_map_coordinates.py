@@ -85,10 +85,10 @@ def test_a_moved_scene_has_the_same_features_pictures_and_plan(kernel: Kernel) -
     far = lc.lift(far_splats, Cameras(far_cameras), views, settings)
     assert far.metadata.origin == far_splats.origin != FILE_ORIGIN
     assert np.abs(np.array(far_splats.origin) - UTM).max() < 4
-    assert torch.equal(far.seen, original.seen)
+    assert torch.equal(far.has_feature, original.has_feature)
     relative_error = (far.features - original.features).norm(dim=1) / original.features.norm(dim=1).clamp_min(1e-9)
     # rays at the edge of a splat may fall on its other side
-    assert float(relative_error[original.seen].quantile(0.95)) < 1e-3
+    assert float(relative_error[original.has_feature].quantile(0.95)) < 1e-3
     assert torch.allclose(far.total_weight, original.total_weight, rtol=1e-2, atol=1e-2)
     first, second = Scene(original, splats, Cameras(cameras)), Scene(far, far_splats, Cameras(far_cameras))
     for name in ("v0", "v3"):
@@ -127,7 +127,7 @@ def test_an_offset_that_float64_holds_leaves_every_bit(kernel: Kernel) -> None:
             far_splats, Cameras([moved_camera(camera, np.array(far_splats.origin)) for camera in cameras]), views
         ),
     ]
-    for name in ("features", "total_weight", "agreement", "seen"):
+    for name in ("features", "total_weight", "agreement", "has_feature"):
         assert torch.equal(getattr(lifts[0], name), getattr(lifts[1], name)), name
 
 

@@ -64,7 +64,7 @@ def test_no_ray_meets_a_splat_that_is_no_number(kernel: Kernel) -> None:
     views = {name: observed(number, 0) for number, name in enumerate(cameras)}
     for preset in ("default", "mean"):
         result, expected = (lc.lift(scene, cameras, views, preset, device="cpu") for scene in (splats, valid_splats))
-        assert not result.seen[~VALID_ROWS].any() and not result.features[~VALID_ROWS].any()
+        assert not result.has_feature[~VALID_ROWS].any() and not result.features[~VALID_ROWS].any()
         assert torch.equal(result.features[VALID_ROWS], expected.features)
         assert any("4 of 40 splats" in text for text in result.diagnostics["warnings"])
     assert any("4 of 40 splats" in text for text in plan_photos(splats, cameras).warnings)

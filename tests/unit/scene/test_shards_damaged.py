@@ -13,7 +13,11 @@ from liftcore.values.lift_file import read_lift
 
 
 def write(folder: Path) -> Path:
-    columns = {"total_weight": torch.ones(4), "agreement": torch.ones(4), "seen": torch.ones(4, dtype=torch.bool)}
+    columns = {
+        "total_weight": torch.ones(4),
+        "agreement": torch.ones(4),
+        "has_feature": torch.ones(4, dtype=torch.bool),
+    }
     write_shards(folder, {"features": torch.ones(4, 2), **columns}, "{}")
     return folder
 

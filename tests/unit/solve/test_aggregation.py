@@ -187,7 +187,10 @@ def test_what_takes_no_cluster_is_solved_again_as_if_the_other_regions_had_never
     unclustered = ~(result.cluster_features != 0).any(dim=1)[result.cluster.long()] | (result.cluster < 0)
     share = weights_of(splats, cameras, maps, baseline.metadata.settings) / np.maximum(weights, 1e-30)
     has_most = torch.from_numpy(share >= least)
-    solved_again, not_solved = unclustered & without.seen & has_most, unclustered & without.seen & ~has_most
+    solved_again, not_solved = (
+        unclustered & without.has_feature & has_most,
+        unclustered & without.has_feature & ~has_most,
+    )
     assert not_solved.any() == (least > 0)
     assert torch.equal(result.features[not_solved], baseline.features[not_solved])
     assert facts["resolved"] == pytest.approx(float(solved_again.float().mean()))

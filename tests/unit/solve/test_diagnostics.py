@@ -76,4 +76,4 @@ def test_a_lift_without_sampled_rays_says_that_nothing_was_measured(tmp_path):
     assert diagnostics["rays"] == 0
     assert diagnostics["residual"] is None
     assert diagnostics["bound"] is None
-    assert 0 < diagnostics["seen_share"] <= 1
+    assert 0 < diagnostics["feature_share"] <= 1

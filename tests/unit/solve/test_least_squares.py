@@ -202,8 +202,8 @@ def test_all_that_was_seen_is_refined_however_faintly(tmp_path, monkeypatch):
         "liftcore.lifting.in_memory.refine", lambda *arguments: calls.append(arguments[2]) or refine(*arguments)
     )
     result = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(preset="row-sum", cg_steps=1))
-    assert np.array_equal(calls[0], result.seen.numpy())
-    assert (result.total_weight[result.seen] < 0.5).any()  # or it would say nothing of faint ones
+    assert np.array_equal(calls[0], result.has_feature.numpy())
+    assert (result.total_weight[result.has_feature] < 0.5).any()  # or it would say nothing of faint ones
 
 
 def test_a_lift_takes_no_step_unless_asked(tmp_path):

@@ -110,7 +110,7 @@ def test_a_lift_equals_the_dense_definition(tmp_path, case, grids, seed):
     assert read_splats(splats).kernel is case.kernel
     exact = dense_lift(seed, grids, case, read_splats(splats), read_cameras(cameras))
     unambiguous, has_weight = ~exact.undecided, exact.D > 0
-    assert np.array_equal(got.seen.numpy()[unambiguous], has_weight[unambiguous])
+    assert np.array_equal(got.has_feature.numpy()[unambiguous], has_weight[unambiguous])
     error = np.linalg.norm(got.features.double().numpy() - exact.X, axis=1)
     assert (error <= 1e-3 * np.linalg.norm(exact.X, axis=1) + 1e-7)[unambiguous & (exact.D > 1e-6)].all()
     assert (unambiguous & has_weight).sum() > 10
@@ -224,7 +224,7 @@ def test_levels_lift_and_certify_as_the_maps_that_they_stand_for(tmp_path, level
     write_pack(tmp_path / "other.safetensors", {f"v{k}": reference(observed(6, k)) for k in range(3)}, {})
     other = lifted((*paths[:2], tmp_path / "other.safetensors"))
     got = lifted(paths, levels=levels)
-    assert torch.equal(got.seen, other.seen)
+    assert torch.equal(got.has_feature, other.has_feature)
     assert torch.allclose(got.features, other.features, atol=1e-5)
     assert torch.allclose(got.agreement, other.agreement, atol=1e-5)
     actual, stand_in = got.metadata.diagnostics, other.metadata.diagnostics

@@ -62,7 +62,7 @@ def test_a_huber_lift_is_nearest_by_hubers_loss(tmp_path, grids):
     lifted, squares = (lc.lift(splats, **options, dtype="float32", loss=name) for name in ("huber", "l2"))
     np.testing.assert_allclose(lifted.features.numpy(), X, atol=1e-5)
     assert torch.equal(lifted.total_weight, squares.total_weight)
-    for splat in np.flatnonzero(lifted.seen.numpy())[::5]:
+    for splat in np.flatnonzero(lifted.has_feature.numpy())[::5]:
         shares = W[splat] / W[splat].sum()
         least = minimize(loss, squares.features[splat].double().numpy(), (shares, E, delta), tol=1e-12).fun
         before, after = (loss(lift.features[splat].double().numpy(), shares, E, delta) for lift in (squares, lifted))
