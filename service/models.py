@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -589,10 +589,8 @@ class ExportRequest(Words):
     """The content of a ZIP: the answers of questions, every splat's best word, or the objects of the lift."""
 
     model_config = BODY_CONFIG
-    of: Annotated[
-        Literal["questions", "words", "objects"],
-        BeforeValidator(lambda of: "objects" if of == "things" else of),  # the old name
-    ] = Field("objects", description="the labels of the content")
+    old_values: ClassVar[Mapping[str, Mapping[str, str]]] = {"of": {"things": "objects"}}
+    of: Literal["questions", "words", "objects"] = Field("objects", description="the labels of the content")
     questions: Annotated[list[NamedQuestion], Field(max_length=QUESTIONS, fail_fast=True)] = Field(
         [], description="for content `questions`: each is a class of the labels"
     )
@@ -729,11 +727,8 @@ class ListedSelection(OfLift):
 
 def _with_both_names(edit: dict[str, Any]) -> dict[str, Any]:
     """Return an edit with its old field names beside the new ones, whichever it was stored with."""
-    old_names = {"how": "operation", "weigh": "weight_by"}
-    fields = {old_names.get(name, name): value for name, value in edit.items()}
-    if "query" in fields:
-        fields["query"] = _with_both_names(fields["query"])
-    return fields | {old: fields[new] for old, new in old_names.items() if new in fields}
+    fields = Edit.with_old_names(edit)
+    return {**fields, "query": Query.with_old_names(fields["query"])} if "query" in fields else fields
 
 
 class SelectionStep(BaseModel):

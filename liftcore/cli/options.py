@@ -189,7 +189,7 @@ def add_fields(
         if get_origin(parts[0]) is list:
             keywords |= {"action": "append", "default": [], "metavar": "TEXT"}
         elif get_origin(parts[0]) is Literal and not union:
-            keywords["choices"] = get_args(parts[0])
+            keywords |= {"choices": get_args(parts[0]), "type": partial(model.current_value, name)}
         elif int in parts:
             keywords |= {"type": whole_number, "metavar": "N"}
         else:

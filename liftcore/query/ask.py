@@ -448,8 +448,8 @@ def _select(
         return threshold, np.zeros_like(scene.has_feature)
     in_words = (request.by_cosine & mask)[:positives]
     least = -math.inf if in_words.any() else LEAST_LIKENESS
-    weight_name = "total weight" if query.weight_by == "evidence" else "total weight times confidence"
-    feature_weights = scene.weights if query.weight_by == "evidence" else scene.weights_with_feature(weights)
+    weight_name = "total weight" if query.weight_by == "total_weight" else "total weight times confidence"
+    feature_weights = scene.weights if query.weight_by == "total_weight" else scene.weights_with_feature(weights)
     threshold = find_threshold(valid_scores, query.threshold, feature_weights, least, weight_name)
     selected = scene.has_feature & (scores >= np.float32(threshold.value))
     competitors = _competing_words(request, request.rows[:positives][in_words])

@@ -14,6 +14,7 @@ import numpy as np
 
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound
 from liftcore.io.splats import quick_count
+from liftcore.query.question import Query
 from liftcore.query.scores import mean_direction, norms_of
 from liftcore.runtime.aliases import deprecated_keywords, deprecated_names
 from liftcore.scene.kernel import Kernel
@@ -247,7 +248,7 @@ class OpenedLift:
         Raises:
             InvalidQuery: the lift has no confidence.
         """
-        if weight_by == "evidence":
+        if Query.current_value("weight_by", weight_by) == "total_weight":
             return self.total_weight
         if self.confidence is None:
             hint, got = "lift again with the preset default, or with robust_steps", "a lift that was not reweighted"

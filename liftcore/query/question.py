@@ -173,6 +173,7 @@ class Query(Viewpoint):
     model_config = ConfigDict(frozen=True)
     error_type: ClassVar = InvalidQuery
     old_names: ClassVar[Mapping[str, str]] = {"weigh": "weight_by"}
+    old_values: ClassVar[Mapping[str, Mapping[str, str]]] = {"weight_by": {"evidence": "total_weight"}}
 
     text: Texts = Field(default=[], description="what to look for; may be given several times")
     like: Examples = Field(
@@ -201,10 +202,10 @@ class Query(Viewpoint):
     absent: Literal["drop", "keep"] = Field(
         default="drop", description="words for what is not there: select nothing for them, or what is most like them"
     )
-    weight_by: Literal["evidence", "confidence"] = Field(
-        default="evidence",
-        description="the weight of a splat in the threshold's histogram and in objects: its total weight "
-        "(`evidence`), or that times its confidence",
+    weight_by: Literal["total_weight", "confidence"] = Field(
+        default="total_weight",
+        description="the weight of a splat in the threshold's histogram and in objects: its `total_weight`, or that "
+        "times its `confidence`",
     )
     top: Annotated[int, Field(ge=0, le=1000), NoBoolean] = Field(
         default=10, description="number of best splats to list"
@@ -631,10 +632,12 @@ class CoveringRegion(Value):
 
 
 def page_fields() -> dict[str, Any]:
-    """Return the JSON schema of each field that decides the answer, with its old names, for the page."""
+    """Return the JSON schema of each field that decides the answer, with its old names and values, for the page."""
     fields = Query.model_json_schema()["properties"]
     for old, new in Query.old_names.items():
         fields[new].setdefault("old_names", []).append(old)
+    for name, old_values in Query.old_values.items():
+        fields[name]["old_values"] = old_values
     return {name: fields[name] for name in Query.deciding()}
 
 

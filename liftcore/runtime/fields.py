@@ -54,6 +54,7 @@ class AliasedModel(BaseModel):
     """A model that is read by old names of its fields too, and written by the new (`liftcore.runtime.aliases`)."""
 
     old_names: ClassVar[Mapping[str, str]] = {}  # new names of fields by old ones
+    old_values: ClassVar[Mapping[str, Mapping[str, str]]] = {}  # by field: new values by old ones
     error_type: ClassVar[type[SplatliftError] | None] = None  # in place of pydantic's errors; None: these
 
     @classmethod
@@ -68,12 +69,19 @@ class AliasedModel(BaseModel):
 
     @classmethod
     def current_names(cls, values: dict[str, Any]) -> dict[str, Any]:
-        """Return values of fields under their new names.
+        """Return values of fields under their new names, with new values in place of old ones.
 
         Raises:
             SplatliftError: of the model's type of errors; an old and a new name have different values.
         """
+        if cls.old_values:
+            values = {name: cls.current_value(cls.old_names.get(name, name), value) for name, value in values.items()}
         return current_names(values, cls.old_names, cls.error_type or InvalidInput) if cls.old_names else values
+
+    @classmethod
+    def current_value(cls, name: str, value: Any) -> Any:
+        """Return the new value of a field for an old one; other values stay."""
+        return cls.old_values.get(name, {}).get(value, value) if isinstance(value, str) else value
 
     @classmethod
     def with_old_names(cls, values: dict[str, Any]) -> dict[str, Any]:

@@ -31,7 +31,7 @@ __all__ = ["quick"]  # a fixture
 @pytest.mark.parametrize(
     ("path", "fields", "old", "new", "values"),
     [
-        ("/query/scores", {"like": ["splat:1"]}, "weigh", "weight_by", ("evidence", "confidence")),
+        ("/query/scores", {"like": ["splat:1"]}, "weigh", "weight_by", ("total_weight", "confidence")),
         ("/render", {"view": "middle"}, "what", "channel", ("pca", "rgb")),
     ],
 )
@@ -58,6 +58,16 @@ def test_old_names_of_fields_are_read_and_contradictions_are_refused(
     assert new in names and old not in names
 
 
+def test_old_values_of_fields_are_read_as_the_new_ones(client: TestClient, lift: dict[str, Any]) -> None:
+    query = {"lift": lift["id"], "like": ["splat:1"]}
+    values = ({"weight_by": "evidence"}, {"weigh": "evidence", "weight_by": "total_weight"})
+    expected = client.get("/query/scores", params=query | {"weight_by": "total_weight"})
+    assert expected.status_code == 200
+    for names in values:
+        assert client.get("/query/scores", params=query | names).content == expected.content
+        assert client.post("/query/scores", json=query | names).content == expected.content
+
+
 def test_edits_are_read_by_their_old_names_and_listed_by_both(client: TestClient, lift: dict[str, Any]) -> None:
     route = f"/lifts/{lift['id']}/selections"
     edit = {"how": "set", "query": {"like": ["splat:1"], "weigh": "evidence", "keep": "largest"}}
@@ -68,6 +78,9 @@ def test_edits_are_read_by_their_old_names_and_listed_by_both(client: TestClient
     assert (problem["status"], problem["argument"]) == (422, "operation")
     history = client.get(selection["links"]["self"]).json()["history"]
     assert [(step["edit"]["operation"], step["edit"]["how"]) for step in history] == [("set",) * 2, ("grow",) * 2]
+    stored = {"how": "set", "query": {"like": ["splat:1"], "weigh": "evidence"}}
+    step = models.SelectionStep(number=1, edit=stored, count=1).edit
+    assert (step["operation"], step["query"]["weight_by"], step["query"]["weigh"]) == ("set",) + ("total_weight",) * 2
     client.delete(selection["links"]["self"])
 
 

@@ -297,7 +297,7 @@ def test_lift_takes_a_name_and_photos(browser: Browser, server: PageServer, tmp_
     browser.press("#view-after")
     browser.until("document.querySelector('#layer-words').textContent === 'This view has no photo.'")
     assert browser.value("document.querySelector('#over').hidden") is True
-    browser.press("#panel-look input[value=evidence]")
+    browser.press("#panel-look input[value=total_weight]")
     browser.until("document.querySelector('#layer-words').textContent.endsWith('This layer is shown in 3D only.')")
     assert browser.value("document.querySelector('#over').hidden") is True
 

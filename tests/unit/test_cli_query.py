@@ -155,7 +155,7 @@ def test_every_term_and_option_is_part_of_the_query(
     ):
         assert run(capsys, *question, *options)[0] == cli.INTERRUPTED
     choices = [(query.threshold, query.keep, query.instances, query.weight_by) for query in queries]
-    default = "evidence"
+    default = "total_weight"
     assert choices == [
         ("auto", "all", None, default), (0.25, "largest", None, default), ("auto", "all", 3, "confidence"),
     ]  # fmt: skip

@@ -9,16 +9,19 @@ const LAYERS = {
   rgb: "The colours of the splats.",
   pca: "The first three principal components of the features as red, green and blue. Similar colours are similar features.",
   cluster: "A colour for each cluster of the aggregation. Grey splats are in no cluster.",
-  evidence: "The total weight of each splat over all views, on a logarithmic scale.",
+  total_weight: "The total weight of each splat over all views, on a logarithmic scale.",
   agreement: "The consistency of the views' features at each splat.",
   confidence: "The confidence of each splat's feature, by the regions of other views.",
   photo: "The photo of the view, if one was uploaded.",
   depth: "The depth of the splats.",
 };
-const SCALE_ENDS = { evidence: ["low", "high"], agreement: ["low", "high"], confidence: ["low", "high"], depth: ["far", "near"] }; // dark and bright
+const SCALE_ENDS = { total_weight: ["low", "high"], agreement: ["low", "high"], confidence: ["low", "high"], depth: ["far", "near"] }; // dark and bright
+const OLD_NAMES = { evidence: "total_weight" }; // of layers in old links: their names now
 const MODES = ["scene", "both", "view"];
 const CLICK_DISTANCE = 5; // pixels that the pointer may move during a click
 const RENDERED_LAYERS = ["rgb", "pca", "cluster", "confidence", "depth"]; // layers that the service renders
+
+export const currentLayerName = name => (Object.hasOwn(OLD_NAMES, name) ? OLD_NAMES[name] : name);
 
 export class LayerPanel {
   // onChange(): colours or the link must be updated. flyToView(view): move the camera. onExample(term, less): a box or a
@@ -116,7 +119,8 @@ export class LayerPanel {
     if (Object.hasOwn(SCALE_ENDS, name)) byId("layer-scale").querySelectorAll("span").forEach((end, index) => { end.textContent = SCALE_ENDS[name][index]; });
   }
 
-  async setLayer(name) {
+  async setLayer(linkName) {
+    const name = currentLayerName(linkName);
     if (!Object.hasOwn(LAYERS, name)) return undefined;
     this.showLayer(name);
     this.drawView();

@@ -134,7 +134,7 @@ export class UploadPanel {
         showState("Checking it\u2026");
       }
       const job = await post("/lift", { splats: assets.splats.id, cameras: assets.cameras.id, features: [assets.features.id], settings: {} });
-      await this.followOrder(job, { name: "Example: objects on a table", step: ({ stage, done, total }) => showState(`${STAGES[stage] || stage}\u2026`, total ? done / total : undefined) });
+      await this.followOrder(job, { name: "Example: objects on a table", step: ({ stage, completed, total }) => showState(`${STAGES[stage] || stage}\u2026`, total ? completed / total : undefined) });
     } catch (problem) {
       state.textContent = problemText(problem);
     } finally {
@@ -389,8 +389,8 @@ export class UploadPanel {
     const step = job.progress;
     if (job.state === "running" && step) {
       const name = STAGES[step.stage] || step.stage;
-      parts.push(el("progress", { max: step.total || 1, value: step.done, "aria-label": name }),
-        el("span", { className: "state" }, `${name}${step.total > 1 ? `: ${formatCount(step.done)} of ${formatCount(step.total)} ${step.unit}` : ""}${step.eta_s ? `, ${Math.ceil(step.eta_s)} s left` : ""}`));
+      parts.push(el("progress", { max: step.total || 1, value: step.completed, "aria-label": name }),
+        el("span", { className: "state" }, `${name}${step.total > 1 ? `: ${formatCount(step.completed)} of ${formatCount(step.total)} ${step.unit}` : ""}${step.eta_s ? `, ${Math.ceil(step.eta_s)} s left` : ""}`));
     }
     if (job.plan && !FINAL_STATES.includes(job.state)) parts.push(el("ul", { className: "plan" }, ...planItems(job.plan)));
     if (job.problem) parts.push(el("span", { className: "state bad" }, problemText(job.problem)));

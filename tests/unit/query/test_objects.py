@@ -35,7 +35,7 @@ def means(scene: Scene, cluster: int) -> np.ndarray:
     return scene.splats.means.numpy()[cluster * SPLATS_A_CLUSTER : (cluster + 1) * SPLATS_A_CLUSTER]
 
 
-@pytest.mark.parametrize("weight_by", ["evidence", "confidence"])
+@pytest.mark.parametrize("weight_by", ["total_weight", "confidence"])
 def test_clusters_that_are_apart_are_objects_with_their_boxes(weight_by: str, scene: Scene) -> None:
     confidence = torch.rand(len(scene.features), generator=torch.Generator().manual_seed(0))
     answer = of(scene, 0, 2)

@@ -52,6 +52,9 @@ def test_old_keywords_and_fields_are_read_and_contradictions_are_refused(scene: 
     assert query(text="x", weigh="confidence") == query(text="x", weight_by="confidence")
     assert edit(how="grow") == edit(operation="grow", how="grow") == edit(operation="grow")
     assert lc.Answer.model_validate(scene.ask("x", encoder=AXES).model_dump()).reason
+    assert query(text="x", weight_by="evidence").weight_by == "total_weight"
+    assert query(text="x", weigh="evidence", weight_by="total_weight") == query(text="x")
+    assert np.array_equal(scene.splat_weights("evidence"), scene.splat_weights("total_weight"))
     selection: Any = scene.select("mine")
     with deprecated("operation"):
         selection.edit(how="grow")
@@ -70,7 +73,7 @@ def test_old_keywords_and_fields_are_read_and_contradictions_are_refused(scene: 
         old_blocks = scene.blocks_of(answer, "mask", view="middle", seen=view_mask)  # pyright: ignore
     assert [*old_blocks] == [*scene.blocks_of(answer, "mask", view="middle", view_mask=view_mask)]
     wrong: list[tuple[Callable[[], object], str]] = [
-        (lambda: query(text="x", weigh="confidence", weight_by="evidence"), "weight_by"),
+        (lambda: query(text="x", weigh="confidence", weight_by="total_weight"), "weight_by"),
         (lambda: edit(how="grow", operation="shrink"), "operation"),
     ]
     for call, argument in wrong:
@@ -109,7 +112,7 @@ def test_old_options_are_read_noted_and_refused_where_they_contradict(
         return status, out, err
 
     cases = (
-        (("query", tiny_lift, "--like", "splat:1"), "--weigh", "--weight-by", ("evidence", "confidence")),
+        (("query", tiny_lift, "--like", "splat:1"), "--weigh", "--weight-by", ("total_weight", "confidence")),
         (
             ("render", tiny_lift, "--view", "middle", "-o", tmp_path / "view.png"),
             "--what",
@@ -127,6 +130,11 @@ def test_old_options_are_read_noted_and_refused_where_they_contradict(
             status, _, error = run(*command, *words)
             assert status == cli.BAD_INPUT and old in error and new in error
         assert old not in run(command[0], "--help")[1].replace(new, "").split()
+    by_weight = [
+        run("query", tiny_lift, "--like", "splat:1", "--weight-by", value, "--json")[:2]
+        for value in ("total_weight", "evidence")
+    ]
+    assert by_weight[0] == by_weight[1] and by_weight[0][0] == 0
     words = tmp_path / "words.txt"
     words.write_text("apple\nlamp\n")
     (tmp_path / "table.safetensors").write_bytes(text_table())
