@@ -173,4 +173,7 @@ def _keep_used_files() -> None:
 
     for name, targets in (("unlink", 1), ("remove", 1), ("replace", 2), ("rename", 2)):
         mock.patch.object(os, name, guard(getattr(os, name), targets)).start()
-    mock.patch.object(shutil, "_use_fd_functions", False).start()  # removal by paths, as Windows has it
+    # Removal by paths, as Windows has it; from Python 3.14 on it is chosen when shutil is imported.
+    mock.patch.object(shutil, "_use_fd_functions", False).start()
+    if hasattr(shutil, "_rmtree_impl"):
+        mock.patch.object(shutil, "_rmtree_impl", vars(shutil)["_rmtree_unsafe"]).start()

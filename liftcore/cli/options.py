@@ -9,6 +9,7 @@ import sys
 import textwrap
 from contextlib import contextmanager
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from types import UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, Self, Union, get_args, get_origin
@@ -79,7 +80,10 @@ class Parser(argparse.ArgumentParser):
         """Parse with the last argument at any position: argparse ignores it after an option."""
         self.add_options()
         options, rest = super().parse_known_args(args, namespace)
-        if not self.last or not rest or (rest[0].startswith("-") and rest[0] != "--"):
+        if not self.last or not rest:
+            return options, rest
+        if rest[0].startswith("-") and rest[0] != "--":
+            self._restore_unknown_value(options, rest, sys.argv[1:] if args is None else args)
             return options, rest
         words = rest[1:] if rest[0] == "--" else rest
         if words and getattr(options, self.last) is None:
@@ -87,6 +91,13 @@ class Parser(argparse.ArgumentParser):
         if words and not any(word.startswith("-") for word in words):
             self.error(f"unrecognized arguments: {' '.join(words)}; a text of several words is one, in quotes")
         return options, words
+
+    def _restore_unknown_value(self, options: argparse.Namespace, rest: list[str], args: Sequence[str]) -> None:
+        """Put the value of an unknown option back into `rest`: Python 3.13 and later take it as the last argument."""
+        value = getattr(options, self.last)
+        if value is not None and [rest[0], value] in ([*pair] for pair in pairwise(args)):
+            setattr(options, self.last, None)
+            rest.insert(1, value)
 
     def error(self, message: str) -> NoReturn:
         self.exit(BAD_INPUT, f"{self.prog}: {' '.join(message.split())}; see '{self.prog} --help'\n")

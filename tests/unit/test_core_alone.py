@@ -19,7 +19,8 @@ def test_core_reads_lifts_asks_renders_and_exports_without_extras_and_without_li
 
 
 def test_service_says_that_it_needs_linux() -> None:
-    program = "import sys; sys.platform = 'win32'; from liftcore.cli import main; sys.exit(main(['serve']))"
+    # shutil imports a module of Windows by the system's name, from Python 3.13 on: it comes before the change.
+    program = "import shutil, sys; sys.platform = 'win32'; from liftcore.cli import main; sys.exit(main(['serve']))"
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert run.returncode == 2
     assert run.stderr.count("\n") == 1
