@@ -317,6 +317,7 @@ def describe_lift(lift: Lift) -> dict[str, Any]:
     metadata = lift.metadata
     count, channels = lift.features.shape
     feature_share = float(lift.has_feature.float().mean())
+    view_consistency = _ends(lift.view_consistency[lift.has_feature])
     diagnostics = lift.diagnostics_of_reply(lift.diagnostics)
     return {
         "splats": count,
@@ -326,7 +327,8 @@ def describe_lift(lift: Lift) -> dict[str, Any]:
         "seen_share": feature_share,
         "total_weight": _ends(lift.total_weight),
         "evidence": _ends(lift.total_weight),
-        "agreement": _ends(lift.agreement[lift.has_feature]),
+        "view_consistency": view_consistency,
+        "agreement": view_consistency,
         "encoder": metadata.encoder,
         "text_space": metadata.text_space,
         "views": len(metadata.views),

@@ -56,7 +56,7 @@ class SceneWeights:
     sums: np.ndarray | None = None  # [P] f64, of the rows of W before reweighting; None: W is not reweighted
     threads: int | None = None  # None: the cores that this process may use
     consensus: Tensor | None = None  # [nnz] f32, until W is reweighted
-    agreement: Reweighting | None = None
+    reweighting: Reweighting | None = None
 
     @property
     def weights(self) -> RegionWeights:
@@ -142,25 +142,25 @@ class InMemory(LiftSteps[SceneWeights]):
         return replace(W, consensus=torch.from_numpy(shares))
 
     def reweight(self, W: SceneWeights, levels_apart: bool) -> tuple[SceneWeights, float | None]:
-        def apply_agreement(weights: RegionWeights, on_card: bool) -> tuple[SceneWeights, float | None]:
-            agreement = reweighting_factors(
+        def apply_reweighting(weights: RegionWeights, on_card: bool) -> tuple[SceneWeights, float | None]:
+            reweighting = reweighting_factors(
                 weights, W.geometry.codebook, self.settings.robust_steps, self.timings.progress,
                 principal=self.settings.robust_directions, means=self.splats.means, threads=self.threads,
                 reliability=whole_regions(self.settings.reliability, W.geometry.levels), consensus=W.consensus,
                 levels=W.geometry.levels if levels_apart else None, on_card=on_card,
             )  # fmt: skip
-            result = replace(W.with_factors(weights, agreement.factors), consensus=None, agreement=agreement)
-            return result, agreement.reliability
+            result = replace(W.with_factors(weights, reweighting.factors), consensus=None, reweighting=reweighting)
+            return result, reweighting.reliability
 
         if W.device.kind == "cpu" or W.weights.device != W.device.place:
-            return apply_agreement(W.on_processor, False)
+            return apply_reweighting(W.on_processor, False)
         try:
-            return apply_agreement(W.weights, True)
+            return apply_reweighting(W.weights, True)
         except RuntimeError as error:
             if not out_of_memory(error):
                 raise
         give_back_memory()  # after the except block, where the error no longer references tensors
-        return apply_agreement(W.on_processor, False)
+        return apply_reweighting(W.on_processor, False)
 
     def discount_distance(self, W: SceneWeights) -> SceneWeights:
         weights, keywords = W.on_processor, {"means": self.splats.means, "threads": self.threads}
@@ -171,9 +171,9 @@ class InMemory(LiftSteps[SceneWeights]):
             W.weights, W.geometry.codebook, getattr(torch, self.settings.dtype), self.timings.progress,
             means=self.splats.means, threads=self.threads, device=W.device, memory=W.memory,
         )  # fmt: skip
-        confidence = W.agreement.confidence if W.agreement else None
+        confidence = W.reweighting.confidence if W.reweighting else None
         return solution.features, SplatSupport(
-            W.row_sums(), W.geometry.total_weight(), solution.agreement, confidence
+            W.row_sums(), W.geometry.total_weight(), solution.view_consistency, confidence
         )
 
     def solve_least_squares(self, W: SceneWeights, X: Tensor, visible: np.ndarray) -> tuple[Tensor, dict[str, Any]]:
@@ -213,12 +213,12 @@ class InMemory(LiftSteps[SceneWeights]):
         return X, facts | {"parted": weakened_edges} | choice
 
     def aggregate(self, W: SceneWeights, X: Tensor, clusters: RegionObjects | None) -> tuple[Tensor, Aggregation]:
-        settings, agreement, consistency = self.settings, W.agreement, None
-        if settings.aggregation_guard and agreement and agreement.view_consistency is not None:
-            consistency = W.on_processor, agreement.directions, agreement.view_consistency
+        settings, reweighting, guard_inputs = self.settings, W.reweighting, None
+        if settings.aggregation_guard and reweighting and reweighting.feature_consistency is not None:
+            guard_inputs = W.on_processor, reweighting.directions, reweighting.feature_consistency
         X, aggregation = aggregate(
             X, W.geometry.total_weight().numpy(), self.splats, W.raster, W.views, settings, self.timings.progress,
-            self.threads, objects=clusters, guard_inputs=consistency,
+            self.threads, objects=clusters, guard_inputs=guard_inputs,
         )  # fmt: skip
         if not settings.aggregation_resolve:
             return X, aggregation

@@ -76,8 +76,8 @@ def lift(
         settings: fields of `LiftSettings` that differ from the preset's.
 
     Returns:
-        Features [P, F] f16 (or f32) with total weight, agreement and diagnostics, on the device that computed them,
-        or on the CPU where that device has too little memory.
+        Features [P, F] f16 (or f32) with total weight, view consistency and diagnostics, on the device that computed
+        them, or on the CPU where that device has too little memory.
 
     Raises:
         InvalidSplats, InvalidCameras: splats or cameras are of another type, such as a path.
@@ -161,7 +161,7 @@ def _run(
     lift = LiftResult(
         features=X,
         total_weight=support.total_weight,
-        agreement=support.agreement,
+        view_consistency=support.view_consistency,
         confidence=support.confidence,
         has_feature=torch.from_numpy(support.sums > 0),
         metadata=views.metadata(settings, inputs.splats, diagnostics, timings.seconds),

@@ -328,7 +328,10 @@ class Scene(OpenedLift):
         return region_mask(self, Region(view, level, region))
 
     def colours(self, what: str) -> np.ndarray:
-        """Return [P, 3] u8 sRGB of splats by ``pca``, ``cluster``, ``total_weight``, ``agreement`` or ``confidence``.
+        """Return [P, 3] u8 sRGB of splats by a layer.
+
+        Args:
+            what: pca, cluster, total_weight, view_consistency or confidence.
 
         Raises:
             InvalidQuery: the lift has no such layer.

@@ -47,7 +47,7 @@ UNLIKELY = 0.5  # share below which the scene must have been transformed
 GAIN = 0.1  # least gain of that share by a transformation
 SAMPLE = 4_000
 _BLOCK = 1 << 12  # new splats at once: [n, 16, F] features in f32
-_VALUES = ("agreement", "confidence")
+_VALUES = ("view_consistency", "confidence")
 
 
 @default_modes()

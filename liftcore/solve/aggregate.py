@@ -107,7 +107,7 @@ def aggregate(
         views: the lifted views.
         threads: None uses the cores that this process may use. The result is bitwise identical for any number.
         objects: the clusters; None: clusters of features.
-        guard_inputs: reweighted W on the CPU, directions of its regions, and the view consistency [P] f32 of the
+        guard_inputs: reweighted W on the CPU, directions of its regions, and the feature consistency [P] f32 of the
             splats (`Reweighting`); None: no guard.
     """
     names = views.names
@@ -207,8 +207,7 @@ def guard(
 
     Args:
         candidates: [n] bool, splats whose cluster has a feature. labels, merged: of `cluster_consistency`.
-        W: reweighted, of the same block of splats. own_consistency: [n] f32, view consistency with their own
-            features.
+        W: reweighted, of the same block of splats. own_consistency: [n] f32, consistency of their own features.
     """
     consistency = cluster_consistency(W, directions, labels, merged, threads)
     return candidates & (consistency < own_consistency - RESOLUTION)  # a smaller difference is rounding to float16

@@ -38,10 +38,10 @@ BlockMeans = Callable[
 
 @dataclass(frozen=True)
 class Solution:
-    """X and the agreement of each splat's inputs."""
+    """X and the consistency of the vectors that views give each splat."""
 
     features: Tensor  # [P, F] f16 or f32, zero rows of splats without weights
-    agreement: Tensor  # [P] f32, norm of the weighted mean of unit codebook rows
+    view_consistency: Tensor  # [P] f32, norm of the weighted mean of unit codebook rows
 
 
 @one_thread()
@@ -56,7 +56,7 @@ def solve(
     device: Device = CPU,
     memory: int | None = None,
 ) -> Solution:
-    """Return ``X = D^-1 W E`` and the agreement of each splat's inputs.
+    """Return ``X = D^-1 W E`` and the consistency of the vectors that views give each splat.
 
     Args:
         W: of all views, with a row for every splat, on any device.

@@ -43,8 +43,8 @@ an edge would lose their weight there.
 themselves, and geometry counts more the less they agree. This exponent leaves correct masks unchanged.
 
 **Confidence** of a splat is the mean of c_jm over its entries, by their final weights: the agreement of independent
-views. **View consistency** of a splat is the same mean of ``(1 - p) c_jm + p c``: how well its own feature explains
-its views, where a splat of a single view has the scene's mean, not zero.
+views. **Feature consistency** of a splat is the same mean of ``(1 - p) c_jm + p c``: how well its own feature
+explains its views, where a splat of a single view has the scene's mean, not zero.
 
 **Blocks of splats.** Cosines, factors and scores are functions of a splat's own row of W (`ViewConsistency`, on any
 block of splats). From the scene they need c, r and the r_m: sums over all splats, by pieces (`SceneConsistency`).
@@ -84,9 +84,7 @@ class Reweighting:
     factors: Tensor  # [nnz] f32, of each entry of W; the sums of rows do not change
     directions: RegionDirections  # of the compared regions
     confidence: Tensor | None  # [P] f32 in 0..1; None after no step
-    view_consistency: (
-        Tensor | None
-    )  # [P] f32 in 0..1, how well a splat's own feature agrees with its views; None likewise
+    feature_consistency: Tensor | None  # [P] f32 in 0..1, of a splat's own feature with its views; None likewise
     reliability: float | None = None  # r, the median over regions; None if not requested
 
 
@@ -282,7 +280,7 @@ class ViewConsistency:
             consensus: [nnz] f32 of each entry (`mask_consensus`); None: no consensus.
 
         Returns:
-            [2, n] f32: confidence and view consistency of each splat.
+            [2, n] f32: confidence and feature consistency of each splat.
         """
         scores = torch.zeros(2, self.W.indptr.shape[0] - 1, dtype=torch.float32)
         parts = cosines, scene.regions, _or_ones(consensus), scores, scene.mean_cosine, scene.power

@@ -61,10 +61,10 @@ Level = Annotated[int, Query(ge=0, le=10**9, description="as in GET /lifts/{lift
 ObjectId = Annotated[int, Path(alias="object", ge=0, le=10**9, description="the id of an object of the lift")]
 ShareId = Annotated[str, Path(pattern=r"^[0-9a-f]{12}$", description="the id of a share of the lift")]
 Layer = Annotated[
-    Literal["pca", "cluster", "total_weight", "evidence", "agreement", "confidence"],
+    Literal["pca", "cluster", "total_weight", "view_consistency", "confidence", "evidence", "agreement"],
     Query(
         description="principal components of features, clusters, or one of the others through a colour map; "
-        "evidence is the old name of total_weight"
+        "evidence and agreement are the old names of total_weight and view_consistency"
     ),
 ]
 

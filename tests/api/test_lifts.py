@@ -276,13 +276,14 @@ def test_splats_come_in_the_rows_of_the_lift(client: TestClient, lift: dict[str,
 
 def test_each_splat_has_a_colour_in_each_layer(client: TestClient, lift: dict[str, Any]) -> None:
     path, opacities = f"/lifts/{lift['id']}/colours", {}
-    for layer in ("pca", "evidence", "agreement", "total_weight"):
+    for layer in ("pca", "evidence", "agreement", "total_weight", "view_consistency"):
         reply = client.get(path, params={"what": layer})
         opacities[layer] = np.load(io.BytesIO(reply.content), allow_pickle=False)
         assert (opacities[layer].shape, opacities[layer].dtype) == ((lift["count"], 3), np.uint8) and reply.headers[
             "etag"
         ]
-    assert np.array_equal(opacities["evidence"], opacities["total_weight"])  # by its old name
+    for old, new in (("evidence", "total_weight"), ("agreement", "view_consistency")):
+        assert np.array_equal(opacities[old], opacities[new])
     means = opacities["pca"].reshape(3, SPLATS_A_CLUSTER, 3).mean(axis=1)  # of three words, that lie apart
     assert min(np.abs(means[entry] - means[other]).max() for entry, other in ((0, 1), (0, 2), (1, 2))) > 60
     problem = assert_problem(client.get(path, params={"what": "cluster"}))  # which this lift has none of

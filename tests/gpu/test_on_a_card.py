@@ -62,7 +62,7 @@ def test_a_lift_on_a_card_is_the_processors(paths: list[Path], grids: bool, opti
     on_cpu, on_gpu = (lifted(paths, views, device=device, **options) for device in ("cpu", "cuda"))
     assert on_gpu.features.is_cuda or "engine" in options, "results stay where the work was; an engine's lie in files"
     on_gpu = on_gpu.cpu()
-    for name in ("features", "total_weight", "agreement"):
+    for name in ("features", "total_weight", "view_consistency"):
         left, right = getattr(on_cpu, name).float(), getattr(on_gpu, name).float()
         assert torch.allclose(left, right, rtol=2e-3, atol=2e-3), name
     assert torch.equal(on_cpu.has_feature, on_gpu.has_feature)

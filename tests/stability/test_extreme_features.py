@@ -1,4 +1,4 @@
-"""Extremes of the solution that no table has: agreement, readings, and steps that diverge."""
+"""Extremes of the solution that no table has: view consistency, readings, and steps that diverge."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ def lifted(views, splats=None, **settings):
     return run(views, splats or cloud(), **{"preset": "tikhonov", **settings})[0]
 
 
-def test_agreement_is_the_same_at_any_length_of_the_vectors():
-    runs = [lifted({"v0": checkerboard(5, 40, scale)}).agreement for scale in (1.0, 1e14, 1e-25)]
+def test_view_consistency_is_the_same_at_any_length_of_the_vectors():
+    runs = [lifted({"v0": checkerboard(5, 40, scale)}).view_consistency for scale in (1.0, 1e14, 1e-25)]
     assert torch.allclose(runs[0], runs[1], atol=1e-5)
     assert torch.allclose(runs[0], runs[2], atol=1e-5)
 

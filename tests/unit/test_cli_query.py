@@ -261,7 +261,7 @@ def test_rows_of_another_number_of_splats_are_refused_wherever_a_lift_is_asked(
     scene: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lift = load_lift(scene / "lift.safetensors")
-    rows = ("features", "total_weight", "agreement", "has_feature", "confidence", "cluster", "object", "node")
+    rows = ("features", "total_weight", "view_consistency", "has_feature", "confidence", "cluster", "object", "node")
     cut = {name: getattr(lift, name)[:-1] for name in rows if getattr(lift, name) is not None}
     cropped = replace(lift, **cut)
     save_lift(cropped, scene / "cropped.safetensors")

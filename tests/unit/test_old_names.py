@@ -88,7 +88,8 @@ def test_old_attributes_and_keywords_of_a_lift_are_deprecated(lift: lc.LiftResul
     with pytest.deprecated_call(match=f"{old} is now {new}"):
         assert getattr(lift, old) is getattr(lift, new)
     columns = {
-        name: getattr(lift, name) for name in ("features", "total_weight", "agreement", "has_feature", "metadata")
+        name: getattr(lift, name)
+        for name in ("features", "total_weight", "view_consistency", "has_feature", "metadata")
     }
     with pytest.deprecated_call(match=f"{old} is now {new}"):
         result = lc.LiftResult(**old_names(columns, {old: new}))

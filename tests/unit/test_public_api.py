@@ -103,7 +103,7 @@ def test_lift_of_values_has_the_bits_of_the_lift_of_files(scene, form):
     }
     expected = lift_files(splats, cameras, [pack], lc.LiftSettings.of(preset="row-sum"))
     result = lc.lift(cloud, poses, forms[form](), preset="row-sum")
-    for name in ("features", "total_weight", "agreement", "has_feature"):
+    for name in ("features", "total_weight", "view_consistency", "has_feature"):
         assert torch.equal(getattr(result, name), getattr(expected, name))
     assert result.views == expected.views == ("v0", "v1", "v2")
     assert result.diagnostics["residual"] == pytest.approx(expected.diagnostics["residual"], rel=0.5)

@@ -318,7 +318,7 @@ class InBlocks(LiftSteps[Job]):
                 "robust", steps.compare, replace(W, step=step, by_region=region_mask is not None), W.splat_pieces
             )
             scene = SceneConsistency.of(_sums(W, f"cosines-{step}", shape), region_mask, level)
-            steps.write_agreement(W, step, scene)
+            steps.write_scene_consistency(W, step, scene)
         return W, scene.reliability if scene else None
 
     def discount_distance(self, W: Job) -> Job:
@@ -329,9 +329,9 @@ class InBlocks(LiftSteps[Job]):
         job = _with_clusters(W, clusters)
         self.run("solve", steps.solve, job, job.splat_pieces)
         sums, total_weight = _column(job, "rows", "sums"), _column(job, "rows", "total_weight")
-        agreement, robust = _column(job, "columns", "agreement"), job.settings.robust_steps
+        view_consistency, robust = _column(job, "columns", "view_consistency"), job.settings.robust_steps
         confidence = torch.from_numpy(_column(job, "columns", "confidence")) if robust else None
-        support = SplatSupport(sums, torch.from_numpy(total_weight), torch.from_numpy(agreement), confidence)
+        support = SplatSupport(sums, torch.from_numpy(total_weight), torch.from_numpy(view_consistency), confidence)
         return _mapped(job, job.solved_file), support
 
     def solve_least_squares(self, W: Job, X: Tensor, visible: np.ndarray) -> NoReturn:

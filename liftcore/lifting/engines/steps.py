@@ -12,7 +12,7 @@ them up and writes the totals as files too. So the result is bitwise identical t
     share     views      the consensus of other views about their entries (`liftcore.solve.consensus`)
     compare   splats     cosines of regions with the other views (`liftcore.solve.reweight`)
     measure   splats     distances of regions from features (`liftcore.solve.loss`)
-    solve     splats     X, agreement and confidence
+    solve     splats     X, view consistency and confidence
     spread    splats     X with the features of clusters (`liftcore.solve.aggregate`)
 
 A worker holds one piece: W of some views or of a block, in mapped files where it is large, and tables of size M, of
@@ -72,7 +72,9 @@ NODES = "nodes.safetensors"  # nodes and other_masks, i64
 TREE = "tree-{}.safetensors"  # of regions (`RegionTree`), by the step of `label`
 OBJECTS = "objects.safetensors"  # object [N + 1] i32, the object that each node of the tree is of
 MERGED = "merged.safetensors"  # merged [K, F], the features of the aggregation
-AGREEMENT = "agreement-{}.safetensors"  # regions [M] f32, mean_cosine and power [K] f64, reliability [1] f64
+SCENE_CONSISTENCY = (
+    "consistency-{}.safetensors"  # regions [M] f32, mean_cosine and power [K] f64, reliability [1] f64
+)
 
 
 def mapped(path: Path) -> dict[str, Any]:
@@ -353,23 +355,23 @@ def _consensus(job: Job, block: SplatBlock, threads: int | None) -> Tensor | Non
     return sums
 
 
-def scene_agreement(job: Job, step: int) -> SceneConsistency:
+def scene_consistency(job: Job, step: int) -> SceneConsistency:
     """Read the driver's totals of a robust step."""
-    arrays = map_tensors(job.folder / AGREEMENT.format(step))[0]
+    arrays = map_tensors(job.folder / SCENE_CONSISTENCY.format(step))[0]
     mean_cosine, regions, power = (torch.from_numpy(arrays[name]) for name in ("mean_cosine", "regions", "power"))
     reliability = float(arrays["reliability"][0])
     return SceneConsistency(mean_cosine, regions, power, None if np.isnan(reliability) else reliability)
 
 
-def write_agreement(job: Job, step: int, scene: SceneConsistency) -> None:
+def write_scene_consistency(job: Job, step: int, scene: SceneConsistency) -> None:
     """Write the driver's totals of a robust step."""
     reliability = np.nan if scene.reliability is None else scene.reliability
     arrays = {"regions": scene.regions, "mean_cosine": scene.mean_cosine, "power": scene.power}
     arrays["reliability"] = torch.tensor([reliability], dtype=torch.float64)
-    write_tensors(job.folder / AGREEMENT.format(step), arrays, {})
+    write_tensors(job.folder / SCENE_CONSISTENCY.format(step), arrays, {})
 
 
-def _view_consistency(job: Job, block: SplatBlock, threads: int | None) -> ViewConsistency:
+def _block_consistency(job: Job, block: SplatBlock, threads: int | None) -> ViewConsistency:
     return ViewConsistency(block.W, block.means, threads, compared_levels(job))
 
 
@@ -385,7 +387,7 @@ def _factors_after(
     cosines = torch.from_numpy(map_tensors(job.piece_file(f"cosines-{step - 1}", piece))[0]["cosines"])
     before = _before(job, piece, step - 1)
     factors = values_of(cosines.shape[0], torch.float32).copy_(cosines)
-    scores = consistency.weigh(factors, before, scene_agreement(job, step - 1), _consensus(job, block, threads))
+    scores = consistency.weigh(factors, before, scene_consistency(job, step - 1), _consensus(job, block, threads))
     return factors, scores
 
 
@@ -400,7 +402,7 @@ def _before(job: Job, piece: int, step: int) -> Tensor | None:
 def compare(job: Job, piece: int, threads: int | None) -> Piece:
     """Write the cosines of a step with their sums over the scene, and the factors of the step before."""
     block = _splat_block(job, piece)
-    consistency, sums, before = _view_consistency(job, block, threads), list[PieceSums](), None
+    consistency, sums, before = _block_consistency(job, block, threads), list[PieceSums](), None
     if job.step:
         before, _ = _factors_after(job, piece, block, consistency, job.step, threads)
         write_piece(job.piece_file(f"factors-{job.step}", piece), {"factors": before})
@@ -412,7 +414,7 @@ def _reweighted(job: Job, piece: int, block: SplatBlock, threads: int | None) ->
     """Compute W of a block after all robust steps, and the scores of splats [2, n]; None without a step."""
     if not job.settings.robust_steps:
         return block.W, None
-    consistency = _view_consistency(job, block, threads)
+    consistency = _block_consistency(job, block, threads)
     factors, scores = _factors_after(job, piece, block, consistency, job.settings.robust_steps, threads)
     return scale_weights(block.W, factors), scores
 
@@ -428,7 +430,7 @@ def measure(job: Job, piece: int, threads: int | None) -> Piece:
 
 @one_thread()
 def solve(job: Job, piece: int, threads: int | None) -> None:
-    """Write X of a block of splats with agreement and confidence."""
+    """Write X of a block of splats with view consistency and confidence."""
     columns_file, features_file = job.columns_file(piece), job.solved_file(piece)
     if columns_file.exists() and features_file.exists():
         return
@@ -440,7 +442,7 @@ def solve(job: Job, piece: int, threads: int | None) -> None:
     rows, device = torch.nonzero(W.indptr.diff())[:, 0], choose_device(settings.device)
     squares = solve_rows(X, rows, W, codebook, means=block.means, threads=threads, device=device)
     write_rows(features_file, X)
-    columns = {"agreement": squares.sqrt().clamp(0.0, 1.0).float()}
+    columns = {"view_consistency": squares.sqrt().clamp(0.0, 1.0).float()}
     if scores is not None:
         columns["confidence"] = scores[0]
     parts = list[PieceSums]()

@@ -31,7 +31,7 @@ def lifted(scene: Scene, features: np.ndarray, **fields: Any) -> Scene:
     ones = torch.ones(len(features))
     defaults = {
         "total_weight": ones,
-        "agreement": ones,
+        "view_consistency": ones,
         "has_feature": ones > 0,
         "object": None,
         "object_views": None,

@@ -15,7 +15,7 @@ from liftcore.values.lift_file import read_lift
 def write(folder: Path) -> Path:
     columns = {
         "total_weight": torch.ones(4),
-        "agreement": torch.ones(4),
+        "view_consistency": torch.ones(4),
         "has_feature": torch.ones(4, dtype=torch.bool),
     }
     write_shards(folder, {"features": torch.ones(4, 2), **columns}, "{}")

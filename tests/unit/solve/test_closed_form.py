@@ -36,22 +36,22 @@ def solved(views, books, dtype=torch.float32, **options) -> Solution:
 
 def assert_same_bits(first: Solution, second: Solution) -> None:
     assert torch.equal(first.features, second.features)
-    assert torch.equal(first.agreement, second.agreement)
+    assert torch.equal(first.view_consistency, second.view_consistency)
 
 
 @every_device
 @pytest.mark.parametrize("channels", [1, 3, 70])
 @pytest.mark.parametrize("unit", [True, False])
-def test_features_and_agreement_equal_their_definition(device, channels, unit):
+def test_features_and_view_consistency_equal_their_definition(device, channels, unit):
     views, books = scene(channels, unit)
     expected, sums = defined(views, books, SPLATS)
     solution = solved(views, books, device=device)
     np.testing.assert_allclose(solution.features.numpy(), expected, rtol=1e-5, atol=1e-6)
     units = [torch.nn.functional.normalize(book.double(), dim=1) for book in books]
     lengths = np.linalg.norm(defined(views, units, SPLATS)[0], axis=1)
-    np.testing.assert_allclose(solution.agreement.numpy(), lengths, atol=1e-3 if unit else 1e-6)
+    np.testing.assert_allclose(solution.view_consistency.numpy(), lengths, atol=1e-3 if unit else 1e-6)
     unseen = torch.from_numpy(sums == 0)
-    assert unseen.any() and not solution.features[unseen].any() and not solution.agreement[unseen].any()
+    assert unseen.any() and not solution.features[unseen].any() and not solution.view_consistency[unseen].any()
     halves = solved(views, books, torch.float16, device=device).features
     assert halves.dtype == torch.float16
     torch.testing.assert_close(halves.float(), solution.features, rtol=2**-10, atol=2**-24)
@@ -86,7 +86,7 @@ def test_slices_of_channels_are_put_together(monkeypatch, device):
     calls = []
     cut = solved(views, books, device=device, progress=lambda *step: calls.append(step))
     assert torch.equal(cut.features, expected.features)
-    torch.testing.assert_close(cut.agreement, expected.agreement, rtol=0, atol=1e-6)
+    torch.testing.assert_close(cut.view_consistency, expected.view_consistency, rtol=0, atol=1e-6)
     assert calls[-1] == ("solve", 5, 5, "slices")
 
 
@@ -128,7 +128,7 @@ def test_a_device_without_room_is_given_less_at_a_time(monkeypatch):
     solution = solved(views, books, device=DEVICES[1])
     assert sizes[0] > 256 >= sizes[-1]
     assert torch.equal(solution.features, expected.features)
-    torch.testing.assert_close(solution.agreement, expected.agreement, rtol=0, atol=1e-6)
+    torch.testing.assert_close(solution.view_consistency, expected.view_consistency, rtol=0, atol=1e-6)
     monkeypatch.setattr(closed_form, "LEAST_ROWS", SPLATS)
     with pytest.raises(torch.OutOfMemoryError):
         solved(views, books, device=DEVICES[1])
@@ -149,9 +149,9 @@ def test_sums_of_a_million_entries_and_of_many_views_keep_their_digits(device):
 def test_no_view_no_region_and_codebooks_of_zeros_are_zeros(device):
     no_weights = of_dense(np.zeros((SPLATS, 2)))
     solution = solved([no_weights, no_weights], [torch.ones(2, 3)] * 2, torch.float16, device=device)
-    assert not solution.features.any() and not solution.agreement.any()
+    assert not solution.features.any() and not solution.view_consistency.any()
     zeros = solved([random_view(0, 4, SPLATS)], [torch.zeros(4, 3)], torch.float16, device=device)
-    assert not zeros.features.any() and not zeros.agreement.any()
+    assert not zeros.features.any() and not zeros.view_consistency.any()
 
 
 @every_device

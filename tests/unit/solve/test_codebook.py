@@ -54,7 +54,7 @@ def test_tuples_give_what_rows_give_with_fewer_entries(seed, levels, power, size
     (rows, sums), (tuples, fewer_sums) = (solved(maps, by_rows, power) for by_rows in (True, False))
     np.testing.assert_allclose(fewer_sums, sums, rtol=1e-6)
     np.testing.assert_allclose(tuples.features / size, rows.features / size, atol=1e-5)
-    np.testing.assert_allclose(tuples.agreement, rows.agreement, atol=1e-5)
+    np.testing.assert_allclose(tuples.view_consistency, rows.view_consistency, atol=1e-5)
     (by_row, _), (by_tuple, _) = stacked_weights(maps, True), stacked_weights(maps, False)
     assert by_tuple.region.numel() < by_row.region.numel()
     assert torch.equal(by_tuple.total_weight, by_row.total_weight)
@@ -67,7 +67,7 @@ def test_means_of_float16_rows_are_rounded_as_the_features_are():
         tuples, _ = solved([regions], by_rows=False, dtype=dtype)
         assert tuples.features.dtype == dtype
         np.testing.assert_allclose(tuples.features, rows.features, atol=error)
-        np.testing.assert_allclose(tuples.agreement, rows.agreement, atol=error)
+        np.testing.assert_allclose(tuples.view_consistency, rows.view_consistency, atol=error)
 
 
 def test_a_map_is_left_as_it_is_where_tuples_save_nothing():

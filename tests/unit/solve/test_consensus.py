@@ -211,13 +211,13 @@ def test_reliability_and_confidence_equal_their_definition(seed: int, on_card: b
     books, q = books_of(W, seed), mask_consensus(W, levels)
     consensus = torch.from_numpy(q)
     got = reweighting_factors(W, codebook_of(books), 1, reliability=masks, consensus=consensus, on_card=on_card)
-    after, (confidence, view_consistency), median = step_of(W, books, entries(W, q), masks.numpy())
+    after, (confidence, feature_consistency), median = step_of(W, books, entries(W, q), masks.numpy())
     assert got.reliability == pytest.approx(median, rel=1e-4)
     np.testing.assert_allclose(entries(W, (W.weight * got.factors).numpy()), after, rtol=2e-3, atol=1e-5)
-    assert got.confidence is not None and got.view_consistency is not None
+    assert got.confidence is not None and got.feature_consistency is not None
     np.testing.assert_allclose(got.confidence.numpy(), confidence, rtol=2e-3, atol=1e-5)
-    consistency = got.view_consistency.numpy()[W.row_sums().numpy() > 0]
-    np.testing.assert_allclose(consistency, view_consistency[W.row_sums().numpy() > 0], rtol=2e-3, atol=1e-5)
+    consistency = got.feature_consistency.numpy()[W.row_sums().numpy() > 0]
+    np.testing.assert_allclose(consistency, feature_consistency[W.row_sums().numpy() > 0], rtol=2e-3, atol=1e-5)
 
 
 def test_reliability_changes_no_bit_with_threads() -> None:

@@ -119,12 +119,12 @@ def test_a_lift_equals_the_dense_definition(tmp_path, case, grids, seed):
 
 
 @pytest.mark.parametrize("preset", ["row-sum", "tikhonov"])
-def test_agreement_is_the_norm_of_the_mean_of_unit_inputs(tmp_path, preset):
+def test_view_consistency_is_the_norm_of_the_mean_of_unit_inputs(tmp_path, preset):
     splats, cameras, features = write_scene(tmp_path, 5)
     got = lift_files(splats, cameras, [features], LiftSettings.of(preset=preset, dtype="float32"))
     norms = torch.linalg.vector_norm(got.features, dim=1)  # the codebooks are unit vectors
-    assert torch.allclose(got.agreement, norms, atol=1e-5)
-    assert float(got.agreement.max()) <= 1.0
+    assert torch.allclose(got.view_consistency, norms, atol=1e-5)
+    assert float(got.view_consistency.max()) <= 1.0
 
 
 def same_bits(first: LiftResult, second: LiftResult) -> bool:
@@ -226,7 +226,7 @@ def test_levels_lift_and_certify_as_the_maps_that_they_stand_for(tmp_path, level
     got = lifted(paths, levels=levels)
     assert torch.equal(got.has_feature, other.has_feature)
     assert torch.allclose(got.features, other.features, atol=1e-5)
-    assert torch.allclose(got.agreement, other.agreement, atol=1e-5)
+    assert torch.allclose(got.view_consistency, other.view_consistency, atol=1e-5)
     actual, stand_in = got.metadata.diagnostics, other.metadata.diagnostics
     for name in ("rays", "rows", "row_sum_mean", "residual", "surrogate", "bound"):
         assert actual[name] == pytest.approx(stand_in[name], rel=1e-4), name

@@ -227,7 +227,7 @@ def test_refined_lift_is_the_lift_with_that_smoothness(grids: tuple[Path, Path, 
     refined = baseline.refined(lc.read_splats(grids[0]), smoothness=1.5)
     assert torch.equal(baseline.features, before)
     assert not torch.equal(smoothed.features, before)
-    for name in ("features", "total_weight", "agreement", "confidence", "has_feature"):
+    for name in ("features", "total_weight", "view_consistency", "confidence", "has_feature"):
         assert torch.equal(getattr(refined, name), getattr(smoothed, name)), name
     assert refined.settings == smoothed.settings
     assert refined.diagnostics["smoothing"] | {"parted": 0} == smoothed.diagnostics["smoothing"]

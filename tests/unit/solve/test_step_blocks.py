@@ -120,7 +120,7 @@ def test_robust_steps_in_blocks_are_those_of_the_whole_scene(
     assert torch.equal(torch.cat([part for part in factors if part is not None]), expected.factors)
     confidence, consistency = torch.cat(scores, dim=1)
     assert expected.confidence is not None and torch.equal(confidence, expected.confidence)
-    assert expected.view_consistency is not None and torch.equal(consistency, expected.view_consistency)
+    assert expected.feature_consistency is not None and torch.equal(consistency, expected.feature_consistency)
     assert len(torch.unique(expected.factors)) > 1000
 
 
