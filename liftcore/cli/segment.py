@@ -37,7 +37,7 @@ def add_arguments(parser: Parser) -> None:
         "--words", type=Path, metavar="FILE", help="the words, one a line; default: all words of the table"
     )
     add_encoder(parser)
-    example_help = "list the best words for an example, as of 'query --like'; may be repeated"
+    example_help = "list the best words for an example, as for 'query --like'; may be repeated"
     add_renamed(parser, "--example", ["--what"], action="append", default=[], metavar="EXAMPLE", help=example_help)
     parser.add_argument("--top", type=count, default=5, metavar="N", help="words for each --example; default 5")
     add_view(parser)

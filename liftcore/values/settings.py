@@ -14,7 +14,7 @@ from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, ValidationErr
 from pydantic_core import PydanticCustomError
 
 from liftcore.errors import InvalidSettings
-from liftcore.runtime.aliases import add_deprecated_properties
+from liftcore.runtime.aliases import add_deprecated_properties, deprecated_keywords
 from liftcore.runtime.device_name import device_name
 from liftcore.runtime.fields import PlainModel
 from liftcore.runtime.nearest import nearest
@@ -517,6 +517,7 @@ class LiftSettings(PlainModel):
         return cls.of() if settings is None else settings
 
     @classmethod
+    @deprecated_keywords(others="changes")
     def from_preset(cls, preset: Preset | str | Self, changes: Mapping[str, Any]) -> Self:
         """Return a preset by its name, or settings as they are, with others in place of some.
 

@@ -127,6 +127,8 @@ def test_method_and_argument_of_a_class_are_read_by_old_names() -> None:
     settings: Any = lc.LiftSettings
     with pytest.deprecated_call(match="chosen is now from_preset"):
         assert settings.chosen("row-sum", {"seed": 3}) == lc.LiftSettings.from_preset("row-sum", {"seed": 3})
+    with pytest.deprecated_call(match="others is now changes"):
+        assert settings.from_preset("row-sum", others={"seed": 3}).seed == 3
     regions: Any = lc.Regions
     for make in (
         lambda: regions([[1]], torch.ones(1, 2), where="view 'a'"),
