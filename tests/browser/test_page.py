@@ -562,11 +562,11 @@ def test_link_opens_question_layer_and_camera_again(page: Browser, server: PageS
     page.until("splatlift.query.current !== null && splatlift.query.current !== undefined")
     fields = dict(page.value("[...splatlift.query.requestParameters(splatlift.query.current)]"))
     assert fields["weight_by"] == "confidence" and "weigh" not in fields
-    page.open(f"{server.address}/?lift={server.lift}&text=apple&weight_by=evidence&what=evidence")  # by old values
+    page.open(f"{server.address}/?lift={server.lift}&text=apple&weight_by=evidence&what=agreement")  # by old values
     page.until(READY)
     page.until("splatlift.query.current !== null && splatlift.query.current !== undefined")
     assert page.value("splatlift.query.current.weight_by") == "total_weight"
-    page.until("splatlift.layers.layerName === 'total_weight'")
+    page.until("splatlift.layers.layerName === 'view_consistency'")
 
 
 def test_link_to_a_scene_that_is_gone_leaves_the_others_to_choose(page: Browser, server: PageServer) -> None:
