@@ -129,7 +129,7 @@ def main() -> None:
     spec.add_argument("folder", type=Path)
     for name, default in (("splats", 500_000), ("views", 160), ("width", 986), ("height", 728), ("channels", 512)):
         spec.add_argument(f"--{name}", type=int, default=default)
-    spec.add_argument("--alike", type=float, default=0.0, metavar="C")
+    spec.add_argument("--alike", dest="cosine", type=float, default=0.0, metavar="C")
     options = parser.parse_args()
     size = options.width, options.height
     write_room(options.folder, RoomSpec(options.splats, options.views, size, options.channels, options.cosine))
