@@ -291,7 +291,7 @@ def main() -> None:
         parser.add_argument("--look", type=Path)
         parser.add_argument("clicks", nargs="+")
         options = parser.parse_args()
-        print_clicks(options.print_clicks, options.clicks)
+        print_clicks(options.look, options.clicks)
         return
     parser = command_line(
         "tests.benchmarks.parts",
