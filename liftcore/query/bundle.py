@@ -119,7 +119,7 @@ class _Sink(io.RawIOBase):
 
 
 def _title(instance: dict[str, Any]) -> str:
-    return f"{instance.get('name') or 'thing'} {instance['instance_id']}"
+    return f"{instance.get('name') or 'object'} {instance['instance_id']}"
 
 
 def _table(instances: list[dict[str, Any]]) -> bytes:

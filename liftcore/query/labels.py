@@ -17,7 +17,7 @@ from liftcore.errors import InvalidLift, InvalidQuery
 from liftcore.io.labels import FORMAT, Labels
 from liftcore.query.catalogue import Catalogue
 from liftcore.query.colours import cluster_colours
-from liftcore.query.objects import LEAST_EVIDENCE, objects, trimmed_box
+from liftcore.query.objects import LEAST_OBJECT_WEIGHT, objects, trimmed_box
 from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.question import Answer, SceneNode, SceneObject, SceneTree
 from liftcore.runtime.version import __version__
@@ -81,7 +81,9 @@ def _of_words(scene: OpenedLift, segmentation: Segmentation) -> Labels:
         weights = _weights(scene, rows)
         groups = touching(scene.splats, rows)
         sums = np.bincount(groups, weights)
-        for group in np.argsort(-sums, kind="stable")[: int((sums >= LEAST_EVIDENCE * sums.max()).sum())].tolist():
+        for group in np.argsort(-sums, kind="stable")[
+            : int((sums >= LEAST_OBJECT_WEIGHT * sums.max()).sum())
+        ].tolist():
             members = rows[groups == group]
             instances[members] = len(entries) + 1
             entry = {"instance_id": len(entries) + 1, "class_id": value, "name": label.word, "question": label.word}

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
     from liftcore.scene.world import WorldFrame
 
-LEAST_EVIDENCE = 0.05  # of an object, as a share of the largest's
+LEAST_OBJECT_WEIGHT = 0.05  # of an object, as a share of the largest's
 LEAST_OF_FRAGMENT = 0.25  # the same of a fragment of another object, and of a group in the box of one object
 MOST_SPLATS = 1 << 20  # that are grouped: a million take seven seconds of two cores and a gigabyte
 _TAIL = 1e-3  # of an object's total weight that its box leaves out at each end of each axis
@@ -92,7 +92,7 @@ def _without_leaks(
         rows: [n] i64, selected splats. groups: [n] i64, the group of each. sums: [g] f64, their total weight.
         order: [k] i64, groups, the largest first.
     """
-    large = order[sums[order] >= LEAST_EVIDENCE * sums.max()]
+    large = order[sums[order] >= LEAST_OBJECT_WEIGHT * sums.max()]
     small = sums[large] < LEAST_OF_FRAGMENT * sums.max()
     if scene.object is None or not small.any():
         return large

@@ -186,13 +186,13 @@ def correct_by_objects(
     if grown_count:
         added_count = int(corrected.sum() - selected.sum())
         clauses = [
-            f"{_quantity(added_count, 'more splat')} of {_quantity(grown_count, 'thing')} mostly above it count too"
+            f"{_quantity(added_count, 'more splat')} of {_quantity(grown_count, 'object')} mostly above it count too"
         ]
     partly = has_mean & (inside > 0) & (shares < PARTLY_SELECTED)
     excess = selected & np.isin(objects, _objects_of_other_words(scene, objects, selected, partly, competitors))
     if excess.any() and weights[excess].sum() < weights[selected].sum() / 2:
         corrected &= ~excess
-        clauses += [f"{_quantity(int(excess.sum()), 'splat')} of things to which another word is nearer do not"]
+        clauses += [f"{_quantity(int(excess.sum()), 'splat')} of objects to which another word is nearer do not"]
     return corrected, ", ".join(clauses)
 
 

@@ -26,7 +26,7 @@ from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.values.views import NO_LABEL, ViewFeatures
 from tests.benchmarks.base import command_line, print_rows, read_pack, read_scene
 
-EVIDENCE_OVER = 0.5  # of the splats that count
+LEAST_TOTAL_WEIGHT = 0.5  # of the splats that count
 
 
 @dataclass(frozen=True)
@@ -113,11 +113,11 @@ def tabletop(folder: Path) -> Truth:
 
 
 def evaluated_splats(splats: lc.Splats, cameras: lc.Cameras, views: Mapping[str, ViewFeatures]) -> Tensor:
-    """[P] bool: the splats with total weight over EVIDENCE_OVER in these views."""
+    """[P] bool: the splats with total weight over LEAST_TOTAL_WEIGHT in these views."""
     weights = lc.region_weights(splats, cameras, views, preset="row-sum")
     total_weight = torch.zeros(splats.count)
     total_weight[weights.total_weight_splats.long()] = weights.total_weight
-    return total_weight > EVIDENCE_OVER
+    return total_weight > LEAST_TOTAL_WEIGHT
 
 
 @dataclass(frozen=True)

@@ -119,7 +119,7 @@ def test_footprint_of_a_ball_is_as_large_as_the_pixels_that_it_holds(backend):
 
 @every_footprint
 @every_backend
-def test_region_weights_and_evidence_equal_the_oracle(footprint, backend):
+def test_region_weights_and_total_weight_equal_the_oracle(footprint, backend):
     @backend.holds(st.data(), st.sampled_from(POWERS))
     def check(data, weighting) -> None:
         splats, camera, observation, params = draw_case(data, footprint, backend, strided=True)

@@ -166,7 +166,7 @@ def test_more_splats_than_are_grouped_are_refused(scene: Scene, monkeypatch) -> 
         objects(scene, of(scene, 0, rows=(2 * SPLATS_A_CLUSTER,)))
 
 
-def test_a_twentieth_of_the_evidence_of_the_largest_makes_an_object(scene: Scene) -> None:
+def test_a_twentieth_of_the_weight_of_the_largest_makes_an_object(scene: Scene) -> None:
     rows = len(scene.features)
     for share, count in ((0.049, 1), (0.051, 2), (1.0, 2)):
         total_weight = torch.ones(rows)

@@ -78,7 +78,7 @@ def test_kept_regions_are_those_of_the_paper_pixel_by_pixel(tmp_path_factory, se
     assert np.abs(kept_masks.sums - sums).max() < 1e-6
 
 
-def test_clusters_of_grids_take_the_mean_of_their_splats_weighted_by_evidence():
+def test_clusters_of_grids_take_the_mean_of_their_splats_weighted_by_total_weight():
     rng = np.random.default_rng(0)
     labels, total_weight = rng.integers(-1, K - 1, 500), rng.uniform(0, 3, 500)
     features = torch.tensor(rng.normal(size=(500, 4)), dtype=torch.float32)

@@ -91,7 +91,7 @@ def test_equal_features_in_two_groups_are_two_clusters_at_any_scale(scale):
     assert clustering.labels[0] != clustering.labels[150]
 
 
-def test_splats_without_evidence_are_never_drawn_and_faint_ones_less_often():
+def test_splats_without_weight_are_never_drawn_and_faint_ones_less_often():
     odds = np.concatenate([np.zeros(1_000), np.full(1_000, 0.1), np.ones(1_000)])
     rows = draw(odds, 500, seed=0)
     assert rows.size == np.unique(rows).size == 500 and rows.min() >= 1_000

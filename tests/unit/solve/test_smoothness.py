@@ -86,7 +86,7 @@ def test_features_of_more_channels_than_are_solved_at_a_time_are_those_of_the_le
 
 @settings(max_examples=20, deadline=None)
 @given(seed=SEEDS, unseen=st.floats(0.05, 0.99))
-def test_splats_without_evidence_take_the_mean_of_their_neighbours(seed: int, unseen: float) -> None:
+def test_splats_without_weight_take_the_mean_of_their_neighbours(seed: int, unseen: float) -> None:
     scene = Scene(seed, 120, unseen=unseen)
     X, weights = scene.smooth(1.0).double().numpy(), scene.minimum(1.0)[1]
     affinities, roots = dense(SplatGraph.of(scene.splats)), np.sqrt(weights)
