@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from liftcore.runtime.one_line import join_names
+
 RESAMPLES = 2_000
 TAIL = 0.025  # and intervals hold what lies between the two tails: 95 %
 WITHIN = 0.01  # of the best figure: the loss that is acceptable for less time
@@ -104,7 +106,7 @@ def choose(runs: Sequence[Mapping[str, Any]], accuracies: Sequence[Mapping[str, 
     best_tie = ties[0]
     figure, seconds = f"{NAMES[accuracy]} ({best_tie[accuracy]:.4f})", f"{best_tie['cpu_s']:.2f} s of CPU time"
     other_ties = [run["name"] for run in ties[1:]]
-    tie_names = ", ".join(other_ties[:SHOWN_TIES] + ["..."] * (len(other_ties) > SHOWN_TIES))
+    tie_names = join_names(other_ties, SHOWN_TIES)
     if not other_ties:
         reason = f"it has the best {figure}, and {count} views show no other that is as good"
     elif best_tie is best:

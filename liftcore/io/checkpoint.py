@@ -16,6 +16,7 @@ from liftcore.errors import InvalidSplats
 from liftcore.io.kinds import EXPORT_PLY, TRAINED
 from liftcore.io.quantised import Fields
 from liftcore.io.ranks import missing_ranks, rank_files
+from liftcore.runtime.one_line import join_names
 from liftcore.scene.render_mode import mode_beside
 
 # Fields of `Splats` -> names of the two trainers.
@@ -30,10 +31,8 @@ def _rank_warnings(path: Path) -> tuple[str, ...]:
     files = rank_files(path)
     siblings = [file.name for file in files if file.name != path.name]
     if not path.is_dir() and siblings:
-        listed_names = ", ".join(siblings[:3]) + (", ..." if len(siblings) > 3 else "")
-        return (
-            f"{listed_names} beside {path.name} holds further splats of the same step: give their folder to take all",
-        )
+        names = join_names(siblings, 3)
+        return (f"{names} beside {path.name} holds further splats of the same step: give their folder to take all",)
     missing = missing_ranks(files) if path.is_dir() else []
     return (f"the checkpoint of rank {missing[0]} is missing, and its splats with it",) if missing else ()
 

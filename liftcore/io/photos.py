@@ -18,6 +18,7 @@ from typing import IO, TYPE_CHECKING, NamedTuple
 
 from liftcore.errors import InvalidInput
 from liftcore.io.files import BROKEN_ZIP
+from liftcore.runtime.one_line import join_names
 from liftcore.scene.views import IMAGE_SUFFIXES, without_image_suffix
 
 if TYPE_CHECKING:
@@ -82,7 +83,7 @@ def orientation_warnings(readings: Mapping[str, Reading], counterparts: str) -> 
     lines = []
     for reading, text in advice.items():
         if views := [view for view, value in readings.items() if value is reading]:
-            view_names = ", ".join(views[:MAX_LISTED]) + (", ..." if len(views) > MAX_LISTED else "")
+            view_names = join_names(views, MAX_LISTED)
             lines.append(f"{len(views)} of {len(readings)} photos ({view_names}) {text}")
     return lines
 

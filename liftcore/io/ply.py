@@ -22,6 +22,7 @@ import numpy as np
 
 from liftcore.errors import InvalidSplats
 from liftcore.io.files import open_regular
+from liftcore.runtime.one_line import join_names
 from liftcore.scene.harmonics import SH_C0, constant_terms
 from liftcore.scene.kernel import DARK_LOBE, LOBE_COLOURS, NORMALS, Kernel, kernel_named, scale_count
 from liftcore.scene.render_mode import RenderMode, RenderModel, kernel_of_mode, mode_beside, mode_of_comments
@@ -372,7 +373,7 @@ def unread_warnings(names: Sequence[str], slots: Mapping[str, Slot]) -> list[str
     warnings = []
     for effect, pattern in UNREAD.items():
         unread = [name for name in extra_names if re.fullmatch(pattern, name, re.I)]
-        listing = ", ".join(unread[:3]) + (", ..." if len(unread) > 3 else "")
+        listing = join_names(unread, 3)
         warnings += [f"the properties {listing} are not read: these splats {effect}"] if unread else []
     return warnings
 

@@ -1,4 +1,4 @@
-"""One-line representations of values."""
+"""One-line representations of values and of lists of names."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,6 +12,11 @@ def one_line(value: object, *parts: str) -> str:
     """Return ``Name(part, part)`` of the value's class, cut to MAX_CHARACTERS."""
     line = f"{type(value).__name__}({', '.join(parts)})"
     return line if len(line) <= MAX_CHARACTERS else f"{line[: MAX_CHARACTERS - 4]}...)"
+
+
+def join_names(names: Sequence[str], limit: int | None) -> str:
+    """Join the first ``limit`` names for people; None for all."""
+    return ", ".join(names[:limit]) + (", ..." if limit is not None and len(names) > limit else "")
 
 
 def point_text(point: Sequence[float]) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 
 from liftcore.errors import InvalidCameras, NotFound
 from liftcore.runtime.nearest import nearest
-from liftcore.runtime.one_line import one_line
+from liftcore.runtime.one_line import join_names, one_line
 from liftcore.scene.compositing import MAX_SIDE
 from liftcore.scene.distortion import Distortion, Lens, Rectangle, shared_lens
 from liftcore.scene.origin import FILE_ORIGIN, MAP_REACH, Origin
@@ -487,7 +487,7 @@ def read_views(
     first = next(iter(broken.values()))
     if not cameras:
         raise first
-    listing = ", ".join(map(repr, list(broken)[:MAX_LISTED])) + (", ..." if len(broken) > MAX_LISTED else "")
+    listing = join_names(list(map(repr, broken)), MAX_LISTED)
     count = f"{len(broken)} cameras were skipped for broken poses and {len(cameras)} read"
     return cameras, [f"{count}: {listing}, the first with {first.got} in place of {first.expected}"]
 

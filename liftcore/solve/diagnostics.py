@@ -25,6 +25,7 @@ from torch import Tensor
 
 from liftcore.runtime.cores import cores
 from liftcore.runtime.jit import vectorised
+from liftcore.runtime.one_line import join_names
 from liftcore.runtime.one_thread import one_thread
 from liftcore.scene.cameras import Camera
 from liftcore.scene.compositing import LOW_PASS, MAX_LOG_SCALE
@@ -215,9 +216,9 @@ def lift_warnings(
     without_camera, empty = facts["views_without_camera"], facts["views_without_splats"]
     if without_camera:
         message = f"{len(without_camera)} views have features but no camera and were skipped"
-        warnings.append(f"{message}: {_first_names(without_camera)}{_folders_of(views)}")
+        warnings.append(f"{message}: {join_names(without_camera, NAMES)}{_folders_of(views)}")
     if empty:
-        message = f"{len(empty)} of {len(views)} views meet no splat: {_first_names(empty)}"
+        message = f"{len(empty)} of {len(views)} views meet no splat: {join_names(empty, NAMES)}"
         warnings.append(message + (f"; {POSES}" if len(empty) > MOSTLY * len(views) else ""))
     unseen, faint = int((sums == 0).sum()), int(((sums > 0) & (sums < FAINT)).sum())
     if unseen == len(sums):
@@ -254,7 +255,7 @@ def order_warnings(splats: Splats, views: Sequence[Camera]) -> list[str]:
         return []
     return [
         f"{len(coarse)} of {len(views)} views are so far from the splats that float32 depths cannot order most of "
-        f"them: {_first_names(coarse)}"
+        f"them: {join_names(coarse, NAMES)}"
     ]
 
 
@@ -262,10 +263,6 @@ def _folders_of(views: Sequence[Camera]) -> str:
     """Return advice if cameras are named with their folders, as those of a rig; else an empty text."""
     example = next((camera.name for camera in views if "/" in camera.name), None)
     return f"; cameras are named with their folders here, such as {example}: name views like them" if example else ""
-
-
-def _first_names(names: Sequence[str]) -> str:
-    return ", ".join(names[:NAMES])
 
 
 FEW_CELLS = 4  # on a side; with fewer, the aspect is too coarse

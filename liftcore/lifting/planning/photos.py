@@ -26,13 +26,13 @@ import torch
 
 from liftcore.lifting.geometry import strided
 from liftcore.lifting.planning.contradictions import LEAST_IN_VIEW, LEAST_ROW_SUM, empty, unseen
-from liftcore.lifting.planning.plan import PlannedScene, join_names, planned_scene, scene_warnings
+from liftcore.lifting.planning.plan import PlannedScene, planned_scene, scene_warnings
 from liftcore.lifting.planning.views import SAMPLE, WELL_COVERED, greedy, spaced_indices
 from liftcore.raster import check_splats_and_threads, open_raster
 from liftcore.raster.base import Raster, ViewRequest
 from liftcore.runtime.aliases import deprecated_names, with_old_names
 from liftcore.runtime.device import CPU
-from liftcore.runtime.one_line import one_line
+from liftcore.runtime.one_line import join_names, one_line
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, shown_progress, silent
 from liftcore.runtime.torch_modes import default_modes

@@ -29,7 +29,7 @@ from liftcore.raster.base import Raster
 from liftcore.runtime.aliases import deprecated_names
 from liftcore.runtime.device import CPU, Device
 from liftcore.runtime.memory import check_disk, free_memory, lack_of_disk
-from liftcore.runtime.one_line import one_line
+from liftcore.runtime.one_line import join_names, one_line
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import silent
 from liftcore.scene.cameras import Camera, Cameras, distortion_warning
@@ -83,11 +83,6 @@ class PlannedScene:
     def rendered(self) -> str:
         """The kernel and the rendering, as text for people."""
         return f"{self.kernel}, antialiased: {self.rendering}" if self.antialiased else self.kernel
-
-
-def join_names(names: Sequence[str], limit: int | None) -> str:
-    """Join the first ``limit`` names for people; None for all."""
-    return ", ".join(names[:limit]) + (", ..." if limit is not None and len(names) > limit else "")
 
 
 def planned_scene(splats: Splats, settings: LiftSettings) -> PlannedScene:
