@@ -209,10 +209,10 @@ def _accuracy(axes: Axes, runs: Sequence[Mapping[str, Any]], choice: Mapping[str
     plotted = [run for run in runs if run[accuracy] is not None]
     front = [run for name in choice["front"] for run in plotted if run["name"] == name]
     axes.plot([run["cpu_s"] for run in front], [run[accuracy] for run in front], color="#999999", lw=1, zorder=1)
-    for kind, marker in (("dial", "o"), ("preset", "s")):
+    for kind, marker, label in (("dial", "o", "quality level"), ("preset", "s", "preset")):
         of_kind = [run for run in plotted if run["kind"] == kind]
         places = [run["cpu_s"] for run in of_kind], [run[accuracy] for run in of_kind]
-        axes.scatter(*places, color=COLOURS[kind], marker=marker, s=34, zorder=2, label=kind)
+        axes.scatter(*places, color=COLOURS[kind], marker=marker, s=34, zorder=2, label=label)
     recommended = [run for run in plotted if choice["recommended"] and run["name"] == choice["name"]]
     ring = {"facecolors": "none", "edgecolors": "#222222", "s": 130, "zorder": 3}
     axes.scatter([run["cpu_s"] for run in recommended], [run[accuracy] for run in recommended], label="taken", **ring)
