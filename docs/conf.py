@@ -1,4 +1,4 @@
-"""The docs site (`make docs`): the Markdown pages here, and a reference from docstrings of the public modules.
+"""The docs site (`make docs`): the Markdown pages and the notebook here, and a reference from docstrings of the public modules.
 
 Tables that repeat what code says are in no page: a comment of a page, such as ``<!-- settings -->``, stands where the
 site has one of `TABLES`.
@@ -23,11 +23,11 @@ ROOT = Path(__file__).parents[1]
 project = "splatlift"
 author = "The splatlift authors"
 release = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 exclude_patterns = ["requirements.txt"]
 html_theme = "furo"
 html_title = f"splatlift {release}"
-html_extra_path = ["quickstart.ipynb"]
+nb_execution_mode = "off"  # the notebook shows its stored outputs; a test runs it
 default_role = "code"  # docstrings name code in single backticks
 myst_heading_anchors = 4
 autodoc_typehints = "signature"
