@@ -1,4 +1,4 @@
-"""The docs site (`make docs`): the Markdown pages and the notebook here, and a reference from docstrings of the public modules.
+"""The docs site (`make docs`): the pages and the notebook here, and a reference from docstrings of public modules.
 
 Tables that repeat what code says are in no page: a comment of a page, such as ``<!-- settings -->``, stands where the
 site has one of `TABLES`.

@@ -5,7 +5,8 @@ rows are united, each with a share per splat, zero if the splat has no such entr
 added to the sums of all four, as loading takes longer than adding. A zero share adds zero, so the result of a splat
 is bitwise independent of the others.
 
-float32 adds LONG terms one by one. A row of more entries is a group of its own, processed in pieces.
+float32 adds LONG terms one by one, and rows of more entries are summed in pieces. A row of more than MOST_COMPARED
+entries is compared as a group of its own, in pieces.
 """
 
 from collections.abc import Sequence
@@ -23,6 +24,7 @@ from liftcore.runtime.jit import kernel
 
 GROUP = 4  # rows; the code below is unrolled over them
 LONG = 256  # terms of a sum that float32 adds one by one
+MOST_COMPARED = 1024  # entries of a row that is compared at once: four levels of 256 views
 LANES = 32  # channels per LLVM vector; LLVM splits it into the machine's registers
 NO_REGION = np.int32(2**31 - 1)
 
@@ -178,32 +180,43 @@ def sum_of_lanes(typingctx, lanes):
 
 @kernel
 def group_end(rows, first, indptr):
-    """Return the end of the group that begins at row number ``first``."""
+    """Return the end of the group to compare that begins at row number ``first``."""
     last = first + 1
-    if indptr[rows[first] + 1] - indptr[rows[first]] > LONG:
+    if indptr[rows[first] + 1] - indptr[rows[first]] > MOST_COMPARED:
         return last
-    while last < min(first + GROUP, rows.size) and indptr[rows[last] + 1] - indptr[rows[last]] <= LONG:
+    while last < min(first + GROUP, rows.size) and indptr[rows[last] + 1] - indptr[rows[last]] <= MOST_COMPARED:
         last += 1
     return last
 
 
 @kernel
+def count_pieces(rows, indptr, length):
+    """Return the number of pieces of so many entries that the longest of some rows has, at least one."""
+    pieces = np.int64(1)
+    for row in rows:
+        pieces = max(pieces, (indptr[row + 1] - indptr[row] + length - 1) // length)
+    return pieces
+
+
+@kernel
 def unite_rows(
-    rows, first, last, piece, indptr, region, weight, factors, level, inverse, regions, shares, entries
+    rows, first, last, piece, length, indptr, region, weight, factors, level, inverse, regions, shares, entries
 ):  # fmt: skip
     """Write the regions of a group, ascending, with the share and the entry of each row; return their number.
 
     Args:
-        rows: of W; those numbered ``first..last`` are the group. piece: block of LONG entries of a long row.
+        rows: of W; those numbered ``first..last`` are the group.
+        piece: number of a piece of ``length`` entries of each row.
         factors: [nnz] f32 of entries, or [0] for none. level: [M] i32 of regions, or [0] for one level.
         inverse: [levels GROUP] f64, 1 / the row's sum of weights of a level.
-        regions: [GROUP LONG] i32. shares: [GROUP GROUP LONG] f32, zero for none. entries: i64 likewise, -1 for none.
+        regions: [GROUP length] i32. shares: [GROUP GROUP length] f32, zero for none.
+        entries: i64 likewise, -1 for none.
     """
     k, ends, heads = np.zeros(GROUP, np.int64), np.zeros(GROUP, np.int64), np.full(GROUP, NO_REGION, np.int32)
     for j in range(last - first):
         row = rows[first + j]
-        k[j] = indptr[row] + piece * LONG
-        ends[j] = min(indptr[row + 1], k[j] + LONG)
+        k[j] = indptr[row] + piece * length
+        ends[j] = min(indptr[row + 1], k[j] + length)
         if k[j] < ends[j]:
             heads[j] = region[k[j]]
     count = 0
@@ -254,19 +267,17 @@ def sum_rows(rows, indptr, region, weight, inverse, lengths, table, width, sums)
     entries, none = np.empty(GROUP * GROUP * LONG, np.int64), np.empty(0, np.float32)
     scales, no_level = np.zeros(GROUP), np.empty(0, np.int32)
     stride = width + LANES
-    group_sums, piece_totals = np.empty(GROUP * stride, np.float32), np.empty(width)
+    group_sums, piece_totals = np.empty(GROUP * stride, np.float32), np.empty((GROUP, width))
     first = 0
     while first < rows.size:
-        last = group_end(rows, first, indptr)
-        pieces = (
-            max((indptr[rows[first] + 1] - indptr[rows[first]] + LONG - 1) // LONG, 1) if last == first + 1 else 1
-        )
+        last = min(first + GROUP, rows.size)
+        pieces = count_pieces(rows[first:last], indptr, LONG)
         piece_totals[:] = 0.0
         for j in range(last - first):
             scales[j] = inverse[rows[first + j]]
         for piece in range(pieces):
             arrays = indptr, region, weight, none, no_level, scales
-            count = unite_rows(rows, first, last, piece, *arrays, regions, shares, entries)
+            count = unite_rows(rows, first, last, piece, LONG, *arrays, regions, shares, entries)
             if lengths.size > 0:
                 for place in range(GROUP * count):
                     shares[place] *= lengths[regions[place // GROUP]]
@@ -283,15 +294,12 @@ def sum_rows(rows, indptr, region, weight, inverse, lengths, table, width, sums)
                 store_lanes(group_sums, 2 * stride + c, d)
                 store_lanes(group_sums, 3 * stride + c, e)
             if pieces > 1:
-                for c in range(width):
-                    piece_totals[c] += group_sums[c]
-        if pieces > 1:
+                for j in range(last - first):
+                    for c in range(width):
+                        piece_totals[j, c] += group_sums[j * stride + c]
+        for j in range(last - first):
             for c in range(width):
-                sums[first, c] = piece_totals[c]
-        else:
-            for j in range(last - first):
-                for c in range(width):
-                    sums[first + j, c] = group_sums[j * stride + c]
+                sums[first + j, c] = piece_totals[j, c] if pieces > 1 else group_sums[j * stride + c]
         first = last
 
 
@@ -321,9 +329,9 @@ def compare_rows(
 @kernel
 def add_products(rows, indptr, region, weight, factors, view, level, table, width, products, squares):
     """Add the products of `compare_rows`."""
-    regions, shares = np.empty(GROUP * LONG, np.int32), np.empty(GROUP * GROUP * LONG, np.float32)
-    entries = np.empty(GROUP * GROUP * LONG, np.int64)
-    view_limit, levels = np.int64(GROUP * LONG), np.int64(0)
+    regions, shares = np.empty(GROUP * MOST_COMPARED, np.int32), np.empty(GROUP * GROUP * MOST_COMPARED, np.float32)
+    entries = np.empty(GROUP * GROUP * MOST_COMPARED, np.int64)
+    view_limit, levels = np.int64(GROUP * MOST_COMPARED), np.int64(0)
     for row in rows:
         view_limit = max(view_limit, indptr[row + 1] - indptr[row])
         for k in range(indptr[row], indptr[row + 1]):
@@ -341,12 +349,12 @@ def add_products(rows, indptr, region, weight, factors, view, level, table, widt
     inverse, starts, order = (
         np.empty(levels * GROUP),
         np.empty(levels + 1, np.int64),
-        np.empty(GROUP * LONG, np.int64),
+        np.empty(GROUP * MOST_COMPARED, np.int64),
     )
     first = 0
     while first < rows.size:
         last = group_end(rows, first, indptr)
-        pieces = max(-(-(indptr[rows[first] + 1] - indptr[rows[first]]) // LONG), 1)  # several for a long row
+        pieces = count_pieces(rows[first:last], indptr, MOST_COMPARED)  # several for a long row
         inverse[:] = 0.0
         for j in range(last - first):
             for k in range(indptr[rows[first + j]], indptr[rows[first + j] + 1]):
@@ -355,12 +363,14 @@ def add_products(rows, indptr, region, weight, factors, view, level, table, widt
             inverse[n] = 1.0 / inverse[n] if inverse[n] > 0.0 else 0.0
         arrays = indptr, region, weight, factors, level, inverse, regions, shares, entries
         if pieces == 1:
-            order_by_level(regions, unite_rows(rows, first, last, 0, *arrays), level, levels, starts, order)
+            order_by_level(
+                regions, unite_rows(rows, first, last, 0, MOST_COMPARED, *arrays), level, levels, starts, order
+            )
         for a in range(levels):
             number, v = np.int64(-1), -1
             for piece in range(pieces):  # sums of each view
                 if pieces > 1:
-                    count = unite_rows(rows, first, last, piece, *arrays)
+                    count = unite_rows(rows, first, last, piece, MOST_COMPARED, *arrays)
                     order_by_level(regions, count, level, levels, starts, order)
                 begin = starts[a]
                 while begin < starts[a + 1]:
@@ -416,7 +426,7 @@ def add_products(rows, indptr, region, weight, factors, view, level, table, widt
             number, v = np.int64(-1), -1
             for piece in range(pieces):  # each region against the other views
                 if pieces > 1:
-                    count = unite_rows(rows, first, last, piece, *arrays)
+                    count = unite_rows(rows, first, last, piece, MOST_COMPARED, *arrays)
                     order_by_level(regions, count, level, levels, starts, order)
                 for i in range(starts[a], starts[a + 1]):
                     n = order[i]

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from liftcore.lifting.files import lift_files
 from liftcore.solve.aggregate import cluster_consistency
-from liftcore.solve.closed_form import LONG
 from liftcore.solve.directions import RegionDirections
 from liftcore.solve.reweight import NO_CONSENSUS, reweighting_factors, scale_weights
+from liftcore.solve.shared_rows import MOST_COMPARED
 from liftcore.values.region_weights import RegionWeights, stacked
 from liftcore.values.settings import LiftSettings
 from tests.scenes import write_scene
@@ -225,12 +225,12 @@ def test_slices_of_channels_are_compared_as_one_vector(monkeypatch, on_card):
 
 @on_both
 def test_splats_of_many_views_and_of_many_regions_equal_the_definition(on_card):
-    scene = random_scene(4, count=3, views=2 * LONG, rows=3)
+    scene = random_scene(4, count=3, views=2 * MOST_COMPARED, rows=3)
     view_counts = np.sum([view.any(axis=1) for view in scene.weights], axis=0)
-    assert (view_counts > LONG).all()
+    assert (view_counts > MOST_COMPARED).all()
     rng = np.random.default_rng(5)
-    scene.weights.append(rng.random((3, 2 * LONG + 30)).astype(np.float32))
-    scene.books.append(torch.tensor(rng.normal(0, 1, (2 * LONG + 30, 150)), dtype=torch.float32))
+    scene.weights.append(rng.random((3, 2 * MOST_COMPARED + 30)).astype(np.float32))
+    scene.books.append(torch.tensor(rng.normal(0, 1, (2 * MOST_COMPARED + 30, 150)), dtype=torch.float32))
     D = scene.denominators[:, None]
     for actual, real in zip(scene.after(1, on_card=on_card), defined(scene, 1), strict=True):
         np.testing.assert_allclose(actual / D, real / D, atol=1e-6)
