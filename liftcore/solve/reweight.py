@@ -46,7 +46,7 @@ themselves, and geometry counts more the less they agree. This exponent leaves c
 views. **Feature consistency** of a splat is the same mean of ``(1 - p) c_jm + p c``: how well its own feature
 explains its views, where a splat of a single view has the scene's mean, not zero.
 
-**Blocks of splats.** Cosines, factors and scores are functions of a splat's own row of W (`ViewConsistency`, on any
+**Blocks of splats.** Cosines, factors and scores are functions of a splat's own row of W (`BlockReweighter`, on any
 block of splats). From the scene they need c, r and the r_m: sums over all splats, by pieces (`SceneConsistency`).
 """
 
@@ -148,12 +148,12 @@ def reweighting_factors(
         on_card: compute on W's device, by `liftcore.solve.reweight_on_card`.
     """
     if on_card:
-        from liftcore.solve.reweight_on_card import ViewConsistencyOnCard
+        from liftcore.solve.reweight_on_card import BlockReweighterOnCard
 
-        block: ViewConsistency | ViewConsistencyOnCard = ViewConsistencyOnCard(W, levels)
+        block: BlockReweighter | BlockReweighterOnCard = BlockReweighterOnCard(W, levels)
         directions = RegionDirections(codebook, block.totals(), W.region.shape[0], principal)
     else:
-        block = ViewConsistency(W, means, threads, levels)
+        block = BlockReweighter(W, means, threads, levels)
         directions = RegionDirections.of_weights(W, codebook, principal, threads)
     factors, scores, scene = None, torch.zeros(2, 0, dtype=torch.float32), None
     for step in range(steps):
@@ -194,7 +194,7 @@ class SceneConsistency:
 
     @classmethod
     def of(cls, sums: np.ndarray, mask: Tensor | None, level: np.ndarray) -> "SceneConsistency":
-        """Compute from the sums of `ViewConsistency.cosines` over all splats.
+        """Compute from the sums of `BlockReweighter.cosines` over all splats.
 
         Args:
             sums: [2, M + K] f64. mask: [M] bool, the regions with a reliability; None: none.
@@ -217,8 +217,8 @@ class SceneConsistency:
         return cls(mean_cosine, regions, power, float(reliable[has_sum].median()) if has_sum.any() else 0.0)
 
 
-class ViewConsistency:
-    """The steps for a block of splats that begins at a piece (`liftcore.solve.sums`), independent of other splats.
+class BlockReweighter:
+    """Cosines, factors and scores of a block of splats that begins at a piece (`liftcore.solve.sums`).
 
     Args:
         W: of all views by rows of codebooks, on the CPU; a row for each splat of the block.
@@ -311,7 +311,7 @@ def weigh_rows(
     rows, indptr, region, weight, factors, view, level, cosines, reliable, consensus, scores, mean_cosine, power,
     powers,
 ):  # fmt: skip
-    """Compute `ViewConsistency.weigh` of some rows; powers of consensus are interpolated in a table [K, n]."""
+    """Compute `BlockReweighter.weigh` of some rows; powers of consensus are interpolated in a table [K, n]."""
     levels = mean_cosine.size
     before, after, gain = np.empty(levels), np.empty(levels), np.empty(levels)
     cosine_sums, blended_sums, view_shares = np.empty(levels), np.empty(levels), np.empty(levels)

@@ -1,6 +1,6 @@
 """A step of `liftcore.solve.reweight` on a GPU, for a W in its memory: the same equations, by blocks of rows.
 
-Sums of `ViewConsistency` over entries are sums over segments here: the entries of one view and one level at one
+Sums of `BlockReweighter` over entries are sums over segments here: the entries of one view and one level at one
 splat. A **line** is the entries of one level at one splat, and a block has its entries line by line. The sum of the
 other views is that of all views minus the own view, in float64, as a float32 difference would lose digits. All sums
 have a fixed order: a lift is bitwise reproducible on the same GPU.
@@ -46,8 +46,8 @@ class _Block:
         return segment_sums(segment_sums(values, self.starts), self.line_starts)
 
 
-class ViewConsistencyOnCard:
-    """`liftcore.solve.reweight.ViewConsistency` on a device.
+class BlockReweighterOnCard:
+    """`liftcore.solve.reweight.BlockReweighter` on a device.
 
     Args:
         W: of all views by rows of codebooks, on the device; a row for each splat.
@@ -77,7 +77,7 @@ class ViewConsistencyOnCard:
         by_region: bool,
         add: Callable[[PieceSums], None],
     ) -> Tensor:
-        """Return ``c_jm`` of each entry, [nnz] f32 on the device; see `ViewConsistency.cosines`."""
+        """Return ``c_jm`` of each entry, [nnz] f32 on the device; see `BlockReweighter.cosines`."""
         products, squares = torch.zeros_like(self.W.weight), torch.zeros_like(self.W.weight)
         for columns in directions.slices():
             table = directions.table(columns).to(self.place)
@@ -105,7 +105,7 @@ class ViewConsistencyOnCard:
     def weigh(
         self, cosines: Tensor, factors: Tensor | None, scene: SceneConsistency, consensus: Tensor | None
     ) -> Tensor:
-        """Replace cosines by factors in place (`ViewConsistency.weigh`); return the scores [2, n] f32 on the CPU."""
+        """Replace cosines by factors in place (`BlockReweighter.weigh`); return the scores [2, n] f32 on the CPU."""
         scores = torch.zeros(2, self.W.indptr.shape[0] - 1, dtype=torch.float64, device=self.place)
         reliable, mean_cosine, power = (
             part.to(self.place) for part in (scene.regions, scene.mean_cosine, scene.power)

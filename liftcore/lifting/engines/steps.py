@@ -55,7 +55,7 @@ from liftcore.solve.objects import (
     view_shares,
 )
 from liftcore.solve.region_tree import RegionTree
-from liftcore.solve.reweight import SceneConsistency, ViewConsistency, scale_weights
+from liftcore.solve.reweight import BlockReweighter, SceneConsistency, scale_weights
 from liftcore.solve.rows import SomeRows, fill_rows, gather_rows, take_rows, values_of
 from liftcore.solve.sums import PieceSums, pack_sums
 from liftcore.values.region_weights import RegionWeights
@@ -371,8 +371,8 @@ def write_scene_consistency(job: Job, step: int, scene: SceneConsistency) -> Non
     write_tensors(job.folder / SCENE_CONSISTENCY.format(step), arrays, {})
 
 
-def _block_consistency(job: Job, block: SplatBlock, threads: int | None) -> ViewConsistency:
-    return ViewConsistency(block.W, block.means, threads, compared_levels(job))
+def _block_reweighter(job: Job, block: SplatBlock, threads: int | None) -> BlockReweighter:
+    return BlockReweighter(block.W, block.means, threads, compared_levels(job))
 
 
 def compared_levels(job: Job) -> np.ndarray | None:
@@ -381,13 +381,13 @@ def compared_levels(job: Job) -> np.ndarray | None:
 
 
 def _factors_after(
-    job: Job, piece: int, block: SplatBlock, consistency: ViewConsistency, step: int, threads: int | None
+    job: Job, piece: int, block: SplatBlock, reweighter: BlockReweighter, step: int, threads: int | None
 ) -> tuple[Tensor, Tensor]:
     """Compute the factors after ``step`` steps, at least one, and the scores of splats."""
     cosines = torch.from_numpy(map_tensors(job.piece_file(f"cosines-{step - 1}", piece))[0]["cosines"])
     before = _before(job, piece, step - 1)
     factors = values_of(cosines.shape[0], torch.float32).copy_(cosines)
-    scores = consistency.weigh(factors, before, scene_consistency(job, step - 1), _consensus(job, block, threads))
+    scores = reweighter.weigh(factors, before, scene_consistency(job, step - 1), _consensus(job, block, threads))
     return factors, scores
 
 
@@ -402,20 +402,20 @@ def _before(job: Job, piece: int, step: int) -> Tensor | None:
 def compare(job: Job, piece: int, threads: int | None) -> Piece:
     """Write the cosines of a step with their sums over the scene, and the factors of the step before."""
     block = _splat_block(job, piece)
-    consistency, sums, before = _block_consistency(job, block, threads), list[PieceSums](), None
+    reweighter, sums, before = _block_reweighter(job, block, threads), list[PieceSums](), None
     if job.step:
-        before, _ = _factors_after(job, piece, block, consistency, job.step, threads)
+        before, _ = _factors_after(job, piece, block, reweighter, job.step, threads)
         write_piece(job.piece_file(f"factors-{job.step}", piece), {"factors": before})
     directions = StoredDirections(job.folder)
-    return {"cosines": consistency.cosines(directions, before, job.by_region, sums.append)}, sums
+    return {"cosines": reweighter.cosines(directions, before, job.by_region, sums.append)}, sums
 
 
 def _reweighted(job: Job, piece: int, block: SplatBlock, threads: int | None) -> tuple[RegionWeights, Tensor | None]:
     """Compute W of a block after all robust steps, and the scores of splats [2, n]; None without a step."""
     if not job.settings.robust_steps:
         return block.W, None
-    consistency = _block_consistency(job, block, threads)
-    factors, scores = _factors_after(job, piece, block, consistency, job.settings.robust_steps, threads)
+    reweighter = _block_reweighter(job, block, threads)
+    factors, scores = _factors_after(job, piece, block, reweighter, job.settings.robust_steps, threads)
     return scale_weights(block.W, factors), scores
 
 

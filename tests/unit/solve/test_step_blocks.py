@@ -25,7 +25,7 @@ from liftcore.solve.directions import RegionDirections, region_totals
 from liftcore.solve.loss import RegionDistances, huber_factors, mean_distance
 from liftcore.solve.membership import RegionGroups, memberships
 from liftcore.solve.region_tree import region_tree
-from liftcore.solve.reweight import SceneConsistency, ViewConsistency, reweighting_factors
+from liftcore.solve.reweight import BlockReweighter, SceneConsistency, reweighting_factors
 from liftcore.solve.rows import SomeRows, gather_rows, take_rows
 from liftcore.solve.sums import PIECE, PieceSums, pack_sums, sum_pieces, unpack_sums
 from liftcore.values.region_weights import RegionWeights, one_view, stacked
@@ -96,7 +96,7 @@ def test_robust_steps_in_blocks_are_those_of_the_whole_scene(
     )
     parts = [W.of_splats(*ends) for ends in blocks]
     blocks_of_views = [
-        ViewConsistency(part, means[a:b], 1, LEVELS) for part, (a, b) in zip(parts, blocks, strict=True)
+        BlockReweighter(part, means[a:b], 1, LEVELS) for part, (a, b) in zip(parts, blocks, strict=True)
     ]
     sums = (sums for part in parts for sums in over_files(list(region_totals(part, 1))))
     totals = torch.from_numpy(sum_pieces(sums, (1, codebook.regions))[0])
