@@ -138,7 +138,7 @@ class OverLimit(ServiceError):
 class NoSpace(ServiceError):
     """Less free disk than the operator reserves."""
 
-    kind, status, title = "no-space", 507, "There is no room left"
+    kind, status, title = "no-space", 507, "There is no space left"
 
 
 class RetryLater(ServiceError):

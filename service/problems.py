@@ -38,7 +38,7 @@ UNUSABLE = (
 )  # fmt: skip
 # Errors of the disk: read-only, failing or removed.
 UNWRITABLE = (errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ENODEV, errno.ESTALE)
-NO_SPACE = "There is no room left"
+NO_SPACE = "There is no space left"
 BUSY = "The server is busy"
 MALFORMED = "The request is malformed"
 
@@ -55,7 +55,7 @@ TABLE: dict[type[SplatliftError], tuple[int, str]] = {
     core.InvalidLift: (422, "The lift is not usable"),
     core.InvalidSettings: (422, "A setting is unknown or out of range"),
     core.InvalidQuery: (422, "The query cannot be answered as asked"),
-    core.NotFound: (404, "There is no such thing here"),
+    core.NotFound: (404, "There is no such resource"),
     core.Unavailable: (422, "This server lacks what that needs"),
 }
 

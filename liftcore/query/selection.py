@@ -198,8 +198,8 @@ def correct_by_objects(
 
 def levels_disagree(scene: OpenedLift) -> bool:
     """Return True if masks of parts and of wholes differ in meaning: then a splat's feature, their sum, has both."""
-    agreement = (scene.metadata.diagnostics.get("objects") or {}).get("level_agreement")
-    return agreement is not None and agreement < LEVELS_AGREE
+    level_agreement = (scene.metadata.diagnostics.get("objects") or {}).get("level_agreement")
+    return level_agreement is not None and level_agreement < LEVELS_AGREE
 
 
 def part_nodes(scene: OpenedLift, competitors: CompetingWords) -> list[int]:

@@ -238,9 +238,9 @@ def test_phrase_that_a_table_has_as_a_word_is_asked_as_it_is(handles: Scene, tab
     assert ask(handles, "mug handle", words).wording == ()
 
 
-@pytest.mark.parametrize(("agreement", "by_node"), [(0.5, True), (0.95, False)])
+@pytest.mark.parametrize(("level_agreement", "by_node"), [(0.5, True), (0.95, False)])
 def test_word_of_a_part_takes_its_node_where_levels_disagree(
-    scene: Scene, table: TableEncoder, agreement: float, by_node: bool
+    scene: Scene, table: TableEncoder, level_agreement: float, by_node: bool
 ) -> None:
     rows = pictures(table, ["mug"] * 300 + ["cat"] * 300 + ["curtain"] * 900, 0.1)
     rows[:60] = 0.85 * rows[:60] + 0.15 * pictures(table, ["handle"] * 60, 0.1)  # the sum of both levels
@@ -252,7 +252,7 @@ def test_word_of_a_part_takes_its_node_where_levels_disagree(
     }  # fmt: skip
     fields: dict[str, Any] = {name: torch.from_numpy(values.astype(np.int32)) for name, values in tree.items()}
     fields |= {"node_confidence": torch.ones(5), "node_features": torch.from_numpy(node_features).half()}
-    facts = {"diagnostics": {"objects": {"level_agreement": agreement}}}
+    facts = {"diagnostics": {"objects": {"level_agreement": level_agreement}}}
     subject = lifted(scene, rows, metadata=scene.lift.metadata.model_copy(update=facts), **fields)
     answer = ask(subject, Query.of(("handle",), absent="keep"), table)
     assert (np.flatnonzero(answer.selected).tolist() == list(range(60))) == by_node
