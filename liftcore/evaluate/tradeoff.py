@@ -301,7 +301,6 @@ def measure_run(spec: RunSpec) -> dict[str, Any]:
     result = lift(splats, cameras, lifted, settings, threads=spec.threads)
     seconds = {"cpu": time.process_time() - cpu, "wall": time.perf_counter() - wall}
     result = result.cpu()
-    feature_share = float(result.has_feature.float().mean())
     figures = {
         "cpu_s": seconds["cpu"],
         "wall_s": seconds["wall"],
@@ -311,8 +310,7 @@ def measure_run(spec: RunSpec) -> dict[str, Any]:
         "load": None if sys.platform == "win32" else os.getloadavg()[0],
         "views": len(result.metadata.views),
         "settings": result.metadata.settings.model_dump(mode="json"),
-        "feature_share": feature_share,
-        "seen_share": feature_share,
+        "feature_share": float(result.has_feature.float().mean()),
         "timings": {name: value for name, value in result.metadata.timings.items() if name not in UNTIMED},
     }
     return figures | _accuracy_figures(spec, splats, cameras, features, result)

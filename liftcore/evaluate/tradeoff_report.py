@@ -15,6 +15,7 @@ from liftcore.errors import InvalidInput, InvalidSettings, Unavailable
 from liftcore.evaluate.hardware import machine_line
 from liftcore.evaluate.ranking import NAMES
 from liftcore.evaluate.tradeoff import SceneFiles, compare
+from liftcore.evaluate.tradeoff_document import OLD_KEYS, TradeoffDocument
 from liftcore.io.files import whole_file
 from liftcore.io.json_file import finite
 from liftcore.runtime.aliases import current_names
@@ -38,7 +39,6 @@ KEY = (
     "over draws of its views."
 )
 TITLE = "Speed against accuracy"
-OLD_KEYS = {"skipped": "over_budget", "refused": "invalid_runs"}  # of documents of 0.4: new names by old ones
 LOST_SHARE = 0.001  # of the splats, above which the verdict mentions them
 LEAST_SHARE = 0.02  # of any run's seconds, for a stage that the chart shows
 
@@ -96,7 +96,8 @@ def compare_speeds(
     _check_chart()
     with shown_progress(progress) as reporter:
         facts = compare(files, budget, run_settings, threads, reporter, kernel)
-    return SpeedComparison(finite({"title": TITLE, "scene": scene, "command": command} | facts))
+    document = finite({"title": TITLE, "scene": scene, "command": command} | facts)
+    return SpeedComparison(TradeoffDocument(document))
 
 
 def _check_chart() -> None:

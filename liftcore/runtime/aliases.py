@@ -32,6 +32,7 @@ def current_names(
     Raises:
         SplatliftError: of ``error_type``; an old and a new name have different values.
     """
+    values = dict(values)  # an `AliasedDict` has the values of new names by old ones
     for old, new in aliases.items():
         if old in values and new in values and not _equal(values[old], values[new]):
             got = " and ".join(f"{name}={values[name]!r}"[:VALUE_CHARACTERS] for name in (new, old))
@@ -124,7 +125,7 @@ def deprecated_keywords(**aliases: str) -> Callable[[F], F]:
 
 
 class AliasedDict(dict[str, Any]):
-    """A dictionary whose values are read by old keys too, each with a `DeprecationWarning`."""
+    """A dictionary whose values are read by old keys too, each with a `DeprecationWarning`; it lists the new ones."""
 
     aliases: ClassVar[Mapping[str, str]] = {}  # new keys by old ones
 
@@ -135,6 +136,20 @@ class AliasedDict(dict[str, Any]):
             raise KeyError(key)
         _warn(type(self).__name__, key, new)
         return self[new]
+
+    def __contains__(self, key: object) -> bool:
+        return super().__contains__(self.aliases.get(key, key) if isinstance(key, str) else key)
+
+    def get(self, key: str, default: Any = None) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Return the value of a key, by its old name too; the default if there is none."""
+        try:
+            return self[key]
+        except KeyError:
+            return default
+
+    def copy(self) -> Self:
+        """Return a dictionary of the same type with the same values."""
+        return type(self)(self)
 
     def __or__(self, other: Mapping[str, Any]) -> Self:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Return a dictionary of the same type with the values of both."""

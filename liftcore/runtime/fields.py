@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 from pydantic import (
     BaseModel,
@@ -77,6 +77,10 @@ class AliasedModel(BaseModel):
         if cls.old_values:
             values = {name: cls.current_value(cls.old_names.get(name, name), value) for name, value in values.items()}
         return current_names(values, cls.old_names, cls.error_type or InvalidInput) if cls.old_names else values
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """Return a copy with other values of some fields, by old names too; they are not validated."""
+        return super().model_copy(update=update and self.current_names(dict(update)), deep=deep)
 
     @classmethod
     def current_value(cls, name: str, value: Any) -> Any:

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -99,10 +100,12 @@ def test_old_attributes_and_keywords_of_a_lift_are_deprecated(lift: lc.LiftResul
 @pytest.mark.parametrize("old", OLD_DIAGNOSTICS)
 def test_old_names_of_diagnostics_are_deprecated_and_replied_beside_the_new(lift: lc.LiftResult, old: str) -> None:
     new, reply = OLD_DIAGNOSTICS[old], lift.diagnostics_of_reply(lift.diagnostics)
-    assert reply[old] == reply[new] and old not in lift.diagnostics
+    assert reply[old] == reply[new] and old not in list(lift.diagnostics)
     for diagnostics in (lift.diagnostics, lift[:2].diagnostics):
-        with pytest.deprecated_call(match=f"{old} is now {new}"):
-            assert diagnostics[old] == lift.diagnostics[new]
+        for read in (itemgetter(old), lambda values: values.get(old), lambda values: values.copy()[old]):
+            with pytest.deprecated_call(match=f"{old} is now {new}"):
+                assert read(diagnostics) == lift.diagnostics[new]
+        assert old in diagnostics and old not in list(diagnostics) and diagnostics.get("nothing", 5) == 5
     with pytest.raises(KeyError, match="nothing"):
         lift.diagnostics["nothing"]
     with pytest.raises(lc.InvalidLift, match=f"{old} is the old name of {new}"):
@@ -155,6 +158,7 @@ def test_settings_are_read_by_old_names_and_written_by_new_ones(old: str, way: s
     assert lc.LiftSettings.with_old_names(values)[old] == value
     with pytest.deprecated_call(match=f"{old} is now {new}"):
         assert getattr(settings, old) == value
+    assert getattr(settings.model_copy(update={old: 0}), new) == 0
 
 
 @pytest.mark.parametrize("old", lc.LiftSettings.old_names)
