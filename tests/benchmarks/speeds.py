@@ -1,6 +1,6 @@
 """The setting ``quality`` on one scene: processor seconds of whole lifts by turns, and how near to exact they come.
 
-    python -m tests.benchmarks.speeds FOLDER [--quality NAME...] [--rounds N] [--json]
+    python -m tests.benchmarks.speeds FOLDER [--quality NAME...] [--preset NAME] [--rounds N] [--json]
 
 All views are lifted, on one thread, in one process; seconds are the fewest of the rounds, with reading, without
 compiling. ``splatlift tradeoff`` measures more, with views held out. FOLDER as `tests.benchmarks.scenes` makes it.
@@ -23,6 +23,7 @@ def main() -> None:
         __doc__,
         ("folder", {"type": Path}),
         ("--quality", {"nargs": "+", "default": list(map(str, Quality)), "choices": list(map(str, Quality))}),
+        ("--preset", {"default": "default"}),
         ("--rounds", {"type": int, "default": 2}),
     )
     options = parser.parse_args()
@@ -32,7 +33,7 @@ def main() -> None:
     for number in range(1 + max(1, options.rounds)):  # the first round compiles
         for level in dict.fromkeys(["exact", *options.quality]):
             start = time.process_time()
-            settings = lc.LiftSettings.of(preset="tikhonov", quality=level, device="cpu")
+            settings = lc.LiftSettings.of(preset=options.preset, quality=level, device="cpu")
             lifts[level] = lift_files(splats, cameras, [pack], settings, threads=1)
             if number:
                 seconds[level] = min(seconds.get(level, float("inf")), time.process_time() - start)
