@@ -373,7 +373,7 @@ def _answer(scene: OpenedLift, request: ResolvedQuery, similarities: np.ndarray)
         # The part has no word, so the reason names the object that was selected.
         sentence = presence.reason.replace(repr(query.text[0]), repr(request.unknown_part.object_phrase))
         presence = presence.model_copy(
-            update={"reason": f"{sentence} {_without_word(request.unknown_part, len(nodes))}"}
+            update={"reason": f"{sentence} {_without_word(request.unknown_part, len(nodes))}", "comparison": None}
         )
     wording = tuple(WordMatch(**word._asdict()) for word in request.asked_as.values() if word.match)
     return Answer.of(
@@ -506,7 +506,7 @@ def _presence(scene: OpenedLift, request: ResolvedQuery, similarities: np.ndarra
     ]
     presence = any_present(presences)
     if presence.present is False and len(words) < positives:  # examples may be present
-        presence = presence.model_copy(update={"present": None})
+        presence = presence.model_copy(update={"present": None, "comparison": None})
     if presence.present is not False and request.query.absent == "drop":
         mask[[k for k, word in zip(words, presences, strict=True) if word.present is False]] = False
     return presence, mask

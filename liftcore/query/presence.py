@@ -37,7 +37,7 @@ import numpy as np
 
 from liftcore.errors import InvalidQuery, InvalidTable, Unavailable
 from liftcore.query.opened import OpenedLift, as_numpy
-from liftcore.query.question import Presence
+from liftcore.query.question import Presence, ReferenceComparison
 from liftcore.query.threshold import LEAST_SHARE
 from liftcore.runtime.folders import cache_folder
 from liftcore.text import LVIS_TABLE, CachingEncoder, TextEncoder
@@ -135,16 +135,19 @@ def estimate_presence(
     near = weights @ products(rows, norms, direction[None], references.vectors[reference_rows])[1]
     nearest = references.words[reference_rows[int(near.argmax())]].replace("_", " ")
     facts = f"its best splats are nearer to {middle} of {count} reference words, first of all to {nearest!r}"
+    comparison = ReferenceComparison(nearer=middle, limit=limit, count=count, nearest=nearest)
     first = float(weights[contrast == 0].sum() / weights.sum())
     if shares[0] < 0.5 and first < 0.5:
-        return Presence(present=False, presence=presence, reason=f"{name} is not there: {facts}.")
+        reason = f"{name} is not there: {facts}."
+        return Presence(present=False, presence=presence, reason=reason, comparison=comparison)
     if shares[0] < 0.5:
-        yet = "but to what sets them apart from the rest of the scene it is the nearest"
-        return Presence(
-            present=None, presence=presence, reason=f"Whether {name} is there is not sure: {facts}, {yet}."
+        facts += ", but to what sets them apart from the rest of the scene it is the nearest"
+    else:
+        facts = (
+            "hardly a reference word is nearer to its best splats, but many are to what sets them apart from the rest"
         )
-    facts = "hardly a reference word is nearer to its best splats, but many are to what sets them apart from the rest"
-    return Presence(present=None, presence=presence, reason=f"Whether {name} is there is not sure: {facts}.")
+    reason = f"Whether {name} is there is not sure: {facts}."
+    return Presence(present=None, presence=presence, reason=reason, comparison=comparison)
 
 
 def nearer_counts(
@@ -190,7 +193,9 @@ NOT_IN_WORDS = Presence(
 def any_present(words: Sequence[Presence]) -> Presence:
     """Combine the presences of one or more words: present if one of them is."""
     first = max(words, key=lambda word: (word.present is not False, word.present is True, word.presence or 0.0))
-    return Presence(present=first.present, presence=first.presence, reason=" ".join(word.reason for word in words))
+    reason = " ".join(word.reason for word in words)
+    comparison = first.comparison if len(words) == 1 else None
+    return Presence(present=first.present, presence=first.presence, reason=reason, comparison=comparison)
 
 
 def best_splats(scene: OpenedLift, scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

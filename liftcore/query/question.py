@@ -337,9 +337,21 @@ class Threshold(Value):
         PlainSerializer(_finite, return_type=float | None, when_used="json"),
         Field(description="null if no score is clearly higher, or the target is absent"),
     ]
-    method: str
+    method: str = Field(description="that of the query; `fixed` for a number, `set` for sets")
     explanation: str = Field(description="one sentence on how it was found")
     clear: bool = Field(default=True, exclude=True)  # True if the method has a clear result
+
+
+class ReferenceComparison(Value):
+    """Comparison of a word's best splats with the reference words (`liftcore.query.presence`)."""
+
+    nearer: int = Field(
+        description="the number of reference words that are nearer to a splat than the word is: the median, by total "
+        "weight"
+    )
+    limit: int = Field(description="the largest such number at which the word may be there")
+    count: int = Field(description="the number of reference words")
+    nearest: str = Field(description="the reference word with the highest mean cosine to these splats")
 
 
 class Presence(Value):
@@ -349,6 +361,10 @@ class Presence(Value):
     present: bool | None = Field(description="true if the target is in the scene; null if unknown or uncertain")
     presence: float | None = Field(description="its probability, 0..1, present from 0.5 on; null if unknown")
     reason: str = Field(description="one sentence on how it is known whether it is there, or why it is not")
+    comparison: ReferenceComparison | None = Field(
+        default=None,
+        description="numbers of `reason`, for one word that is absent or uncertain; null otherwise, and of a part",
+    )
     why = old_field("reason", str)
 
 

@@ -156,6 +156,31 @@ def test_answer_says_what_is_known_of_presence(client: TestClient, lift: dict[st
     assert (empty["clear"], empty["count"]) == (False, 0)
 
 
+def test_absent_word_is_compared_with_other_words_in_numbers(client: TestClient, lift: dict[str, Any]) -> None:
+    words = (*WORDS, "boat", "bulb", "light", *(f"word {number}" for number in range(194)))
+    rows = np.zeros((len(words), CHANNELS), np.float32)
+    rows[:3], rows[3, 2:4], rows[4:6, 2] = (
+        codebook(),
+        (0.4, 0.9),
+        1.0,
+    )  # bulb and light are lamps; a boat hardly is one
+    rows[4:6, 4:6] = 0.1 * np.eye(2)
+    rows[6:, 4:] = np.random.default_rng(3).normal(size=(194, CHANNELS - 4))
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    table = client.put("/assets/table", content=text_table(words=words, rows=rows)).json()["id"]
+    parameters = {"lift": lift["id"], "table": table}
+    for route in ("/query", "/query/objects"):
+        absent = client.get(route, params=parameters | {"text": "boat"}).json()
+        assert absent["present"] is False
+        assert absent["comparison"] == {"nearer": 3, "limit": 1, "count": 200, "nearest": "lamp"}
+        present = client.get(route, params=parameters | {"text": "apple"}).json()
+        assert present["present"] is True and present["comparison"] is None
+    for method in ("auto", "valley", "paper", "otsu", "stability", 0.5):
+        answer = client.get("/query", params=parameters | {"text": "apple", "threshold": method}).json()
+        assert answer["threshold"]["method"] == (method if isinstance(method, str) else "fixed")
+    assert client.delete(f"/assets/{table}").status_code == 204
+
+
 def test_words_of_a_pack_need_no_encoder_of_the_operator(
     client: TestClient, scene_assets: SceneAssets, tmp_path: Path
 ) -> None:

@@ -15,6 +15,7 @@ import pytest
 from safetensors import safe_open
 from safetensors.numpy import save
 
+from liftcore.query.question import METHODS
 from service.store.keys import Quota
 from service.store.owners import Scope
 from tests.api.tiny_scene import make_scene
@@ -64,13 +65,13 @@ def test_first_view_is_shown_in_3d_with_its_lists(page: Browser, server: PageSer
     assert "60 splats" in text_of(page, "#about")
 
 
-def test_word_lights_its_thing(page: Browser) -> None:
+def test_word_lights_its_object(page: Browser) -> None:
     before = columns(page)
     ask(page, "lamp")
     lit_columns = columns(page, AMBER)
     assert lit_columns and min(lit_columns) > 50  # the lamp is the right one of three
     assert "splats of 60" in text_of(page, "#answer") and "Automatic threshold" in text_of(page, "#why")
-    assert page.value("document.querySelectorAll('#things li').length") == 1
+    assert page.value("document.querySelectorAll('#objects li').length") == 1
     assert text_of(page, "#labels .label") == "lamp"
     page.press("#hide")
     assert min(columns(page)) > 50  # the rest is hidden
@@ -86,10 +87,10 @@ def test_slider_repaints_without_a_request(page: Browser) -> None:
     page.value("document.querySelector('#cut').value = 9")  # the most there is
     page.value("document.querySelector('#cut').dispatchEvent(new Event('input'))")
     assert len(page.requests) == requests and "You set this threshold." in text_of(page, "#why")
-    assert page.value("document.querySelectorAll('#things button').length") == 0  # those of the cut before
+    assert page.value("document.querySelectorAll('#objects button').length") == 0  # those of the cut before
     assert text_of(page, ".chip small") == str(page.value("splatlift.query.current.count"))
     assert len(columns(page, AMBER)) < lit_columns
-    page.until(FIND_COLOUR)  # the things follow
+    page.until(FIND_COLOUR)  # the objects follow
     page.press("#auto")
     page.until(FIND_COLOUR)
     assert len(columns(page, AMBER)) == lit_columns
@@ -125,7 +126,7 @@ def test_question_is_taken_back_or_narrowed_while_it_is_asked(page: Browser) -> 
 
 
 def test_box_completes_maps_and_suggests_words(page: Browser) -> None:
-    page.until("document.querySelectorAll('#here-words button').length === 3")  # the three things
+    page.until("document.querySelectorAll('#here-words button').length === 3")  # the three objects
     page.write("#words", "app")
     page.until("document.querySelector('#completions li')")
     assert text_of(page, "#completions") == "apple"
@@ -149,6 +150,38 @@ def test_box_completes_maps_and_suggests_words(page: Browser) -> None:
     assert page.value(WORDS) == ["book"]
 
 
+def test_reason_of_an_uncertain_word_and_of_a_method_is_that_of_the_fields(page: Browser) -> None:
+    ask(page, "lamp")
+    change = """(() => {{
+      const {{ current }} = splatlift.query;
+      Object.assign(current.answer, {{ presence: .5, reason: '', {} }});
+      splatlift.query.render();
+      return document.querySelector('#why').textContent;
+    }})()"""
+    nearer = page.value(
+        change.format("present: null, comparison: { nearer: 9, limit: 4, count: 200, nearest: 'cup' }")
+    )
+    assert nearer.startswith(
+        "Its best splats are nearer to 9 of 200 other words, first of all to \u201ccup\u201d, but"
+    )
+    hardly = page.value(
+        change.format("present: null, comparison: { nearer: 2, limit: 4, count: 200, nearest: 'cup' }")
+    )
+    assert hardly.startswith("Hardly any other word is nearer to its best splats, but many")
+    sentences = set[str]()
+    for method in METHODS:
+        threshold = f"{{ value: .5, method: '{method}', explanation: '' }}"
+        sentences.add(page.value(change.format(f"present: true, comparison: null, threshold: {threshold}")))
+    assert len(sentences) == len(METHODS) and all(
+        sentence.startswith("Automatic threshold: ") for sentence in sentences
+    )
+    threshold = "{ value: .5, method: 'valley', explanation: '' }"
+    fallback = page.value(
+        f"splatlift.query.current.threshold = 'valley', {change.format(f'clear: false, threshold: {threshold}')}"
+    )
+    assert fallback == "Automatic threshold: there is no clear gap, so it splits the scores into two groups."
+
+
 def test_not_sure_names_words_that_compete_as_buttons(page: Browser) -> None:
     ask(page, "lamp")
     page.value("(() => { splatlift.query.current.answer.rivals = ['book']; splatlift.query.render(); })()")
@@ -161,7 +194,7 @@ def test_not_sure_names_words_that_compete_as_buttons(page: Browser) -> None:
     assert "negatives" not in page.value("location.search")
 
 
-def test_click_takes_the_thing_and_another_its_patch(page: Browser) -> None:
+def test_click_takes_the_object_and_another_its_patch(page: Browser) -> None:
     page.until("splatlift.objects.items.length === 3")
     page.press("#scene", *splat_at(page, APPLE))
     page.until(f"{SETS}.length === 1")
@@ -202,7 +235,7 @@ def scene_with_parts(server: PageServer, tmp_path: Path) -> Iterator[str]:
     httpx.delete(f"{server.address}/jobs/{lifted}?with_lift=true").raise_for_status()
 
 
-def test_things_unfold_into_parts_by_keyboard_and_by_clicks(
+def test_objects_unfold_into_parts_by_keyboard_and_by_clicks(
     page: Browser, server: PageServer, scene_with_parts: str
 ) -> None:
     page.open(f"{server.address}/?lift={scene_with_parts}")
@@ -213,7 +246,7 @@ def test_things_unfold_into_parts_by_keyboard_and_by_clicks(
     page.key("Enter")
     page.until("document.querySelectorAll('#catalogue-list .parts li').length === 2")
     assert page.value(f"document.activeElement === {unfold} && {unfold}.getAttribute('aria-expanded')") == "true"
-    page.press("#catalogue-list .parts .thing")
+    page.press("#catalogue-list .parts .object")
     page.until(f"{SETS}.join() === 'object:3' && {FIND_COLOUR}")
     assert page.value("splatlift.query.current.count") == 10 and text_of(page, "#chips .chip").startswith("lamp: ")
     page.press("#clear")
@@ -235,8 +268,8 @@ def test_things_unfold_into_parts_by_keyboard_and_by_clicks(
     page.until(f"['object:3', 'object:4'].includes({SETS}.join()) && {FIND_COLOUR}")
 
 
-def test_thing_takes_a_name_and_is_hidden_for_good(page: Browser, server: PageServer) -> None:
-    first = "document.querySelector('#catalogue-list .thing span').firstChild.textContent"
+def test_object_takes_a_name_and_is_hidden_for_good(page: Browser, server: PageServer) -> None:
+    first = "document.querySelector('#catalogue-list .object span').firstChild.textContent"
     page.until("splatlift.objects.items.length === 3")
     page.press("#catalogue-list [title='Name this object']")
     page.write("#catalogue-list input", "the mug")
@@ -252,15 +285,14 @@ def test_thing_takes_a_name_and_is_hidden_for_good(page: Browser, server: PageSe
         httpx.patch(f"{server.address}/lifts/{server.lift}/objects/0", json=change).raise_for_status()
 
 
-def test_things_are_joined_split_and_taken_apart_again(page: Browser, server: PageServer) -> None:
-    names = (
-        "[...document.querySelectorAll('#catalogue-list .thing, #catalogue-own .thing')].map(one => one.textContent)"
-    )
+def test_objects_are_joined_split_and_taken_apart_again(page: Browser, server: PageServer) -> None:
+    buttons = "document.querySelectorAll('#catalogue-list .object, #catalogue-own .object')"
+    names = f"[...{buttons}].map(button => button.textContent)"
     count_is = f"splatlift.query.current?.answer && splatlift.query.current.count === {{}} && {FIND_COLOUR}"
     page.until(f"{names}.length === 3")
     before = page.value(names)
     for place, with_shift in ((1, False), (2, True)):
-        page.press(f"#catalogue-list li:nth-child({place}) .thing", shift=with_shift)
+        page.press(f"#catalogue-list li:nth-child({place}) .object", shift=with_shift)
         page.until(count_is.format(20 * place))
     page.press("#join")
     page.until(f"{SETS}.length === 1 && {SETS}[0].startsWith('selection:') && {count_is.format(40)}")
@@ -296,7 +328,7 @@ def test_things_are_joined_split_and_taken_apart_again(page: Browser, server: Pa
     for _ in ("Delete", "Really?"):
         page.press("#catalogue-own .danger")
     page.until(f"!splatlift.objects.selections.length && !{SETS}.length")
-    page.press("#catalogue-list li:last-child .thing")
+    page.press("#catalogue-list li:last-child .object")
     page.until(count_is.format(20))
     page.press("#by-hand")
     page.until(f"splatlift.editor.selection?.version && {count_is.format(20)}")
@@ -308,7 +340,7 @@ def test_things_are_joined_split_and_taken_apart_again(page: Browser, server: Pa
     page.until("splatlift.objects.selections.length === 2 && splatlift.objects.lastChange")
     assert sum(page.value("splatlift.objects.selections.map(one => one.count)")) == 20 and 0 < remaining_count < 20
     page.key("z", ctrl=True)
-    page.until("splatlift.objects.selections.length === 1 && !splatlift.objects.items.some(thing => thing.hidden)")
+    page.until("splatlift.objects.selections.length === 1 && !splatlift.objects.items.some(object => object.hidden)")
     object_id = page.value("splatlift.objects.selections[0].id")
     assert httpx.delete(f"{server.address}/lifts/{server.lift}/selections/{object_id}").status_code == 204
 
@@ -411,8 +443,15 @@ def test_what_is_not_there_is_said_plainly(page: Browser) -> None:
     page.value(f"(() => {{ {ABSENT}; {UPDATE}; }})()")
     assert text_of(page, "#answer") == "\u201clamp\u201d is not in this scene." and not columns(page, AMBER)
     assert text_of(page, "#why") == "No view shows one." and "absent" in text_of(page, "#chips")
+    page.value(
+        "(() => { splatlift.query.current.answer.comparison = "
+        "{ nearer: 57, limit: 4, count: 1203, nearest: 'bat (animal)' }; splatlift.query.render(); })()"
+    )
+    expected = "Its best splats are nearer to 57 of 1203 other words, first of all to \u201cbat\u201d."
+    assert text_of(page, "#why") == expected
     page.press("#nearest")
     page.until(FIND_COLOUR)
+    assert expected in text_of(page, "#why")
     assert columns(page, AMBER) and "not in this scene; these splats are the nearest" in text_of(page, "#why")
     requests = [address for address in page.requests if "/query/objects" in address][-1]
     assert (
@@ -474,9 +513,9 @@ def test_mask_under_a_click_is_an_example(page: Browser) -> None:
     assert text_of(page, "#chips .chip").startswith("like a mask of")
 
 
-def test_things_are_listed_without_a_question_and_shown(page: Browser) -> None:
+def test_objects_are_listed_without_a_question_and_shown(page: Browser) -> None:
     page.until("splatlift.objects.items.length === 3")
-    assert sorted(page.value("splatlift.objects.items.map(thing => thing.name)")) == ["apple", "book", "lamp"]
+    assert sorted(page.value("splatlift.objects.items.map(object => object.name)")) == ["apple", "book", "lamp"]
     before = page.value("splatlift.viewer.place3d")
     page.press("#catalogue-list button")
     page.until("splatlift.viewer.settled && document.querySelector('#labels .label')")

@@ -24,7 +24,7 @@ export class Chart {
     byId("chart-title").textContent = choice.recommended ? `Recommended: \u201c${choice.name}\u201d` : "No run is recommended";
     byId("chart-why").textContent = `${choice.why[0].toUpperCase()}${choice.why.slice(1)}. ${plural(views.lifted, "view")} of ${formatCount(views.of)} lifted, ${formatCount(views.held_out)} held out for evaluation.`;
     byId("chart-runs").replaceChildren(...[...runs].sort((a, b) => a.cpu_s - b.cpu_s).map(run => el("li", {},
-      el("button", { type: "button", className: "thing", on: { click: () => this.openRun(run) } },
+      el("button", { type: "button", className: "object", on: { click: () => this.openRun(run) } },
         el("span", {}, run.name, el("small", {}, `${run.cpu_s.toFixed(1)} s, ${run.cpu_ratio.toFixed(1)} times faster than exact`)),
         el("span", { className: "score" }, this.runs.includes(run) ? run[choice.accuracy].toFixed(3) : "not evaluated")))));
     byId("chart").showModal();

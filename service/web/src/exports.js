@@ -11,7 +11,7 @@ export class ExportPanel {
     Object.assign(this, { query, layers, labels, objects, takePicture });
     for (const button of document.querySelectorAll("[data-take]")) button.addEventListener("click", () => this.saveFile(button.dataset.take));
     byId("shot").addEventListener("click", async () => downloadBlob(await this.takePicture(), "splatlift.png"));
-    for (const [id, ofObjects] of [["take-everything", false], ["take-things", true]]) byId(id).addEventListener("click", () => this.saveZip(ofObjects));
+    for (const [id, ofObjects] of [["take-everything", false], ["take-objects", true]]) byId(id).addEventListener("click", () => this.saveZip(ofObjects));
     byId("copy-link").addEventListener("click", () => copyText(location.href));
     for (const name of ["curl", "python"]) byId(`copy-${name}`).addEventListener("click", () => copyText(byId(name).textContent));
   }
@@ -71,7 +71,7 @@ export class ExportPanel {
     byId("take-question").hidden = !isReady;
     byId("take-answer").hidden = isLabelled;
     byId("take-everything").hidden = !isReady;
-    byId("take-things").hidden = !lift?.links.objects;
+    byId("take-objects").hidden = !lift?.links.objects;
     byId("take-names").hidden = !isLabelled;
     if (!isReady) return;
     const key = storedKey() ? ' -H "Authorization: Bearer $KEY"' : "";

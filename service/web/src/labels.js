@@ -228,8 +228,8 @@ export function wordLayer(segmentation, values, isVisible) {
   return { colours, cover: COVER };
 }
 
-const legendItem = (entry, panel) => el("li", {}, el("button", { type: "button", className: "thing", style: { "--mine": hex(entry.colour) }, "aria-pressed": String(panel.selectedValues.has(entry.value)), on: { click: () => panel.toggleValue(entry.value) } },
+const legendItem = (entry, panel) => el("li", {}, el("button", { type: "button", className: "object", style: { "--mine": hex(entry.colour) }, "aria-pressed": String(panel.selectedValues.has(entry.value)), on: { click: () => panel.toggleValue(entry.value) } },
   el("span", { className: "swatch", "aria-hidden": "true" }), el("span", {}, entry.word), el("span", { className: "score" }, formatCount(entry.splats))));
-const unlabelledItem = segmentation => el("li", {}, el("span", { className: "thing rest", style: { "--mine": hex(NEUTRAL) } },
+const unlabelledItem = segmentation => el("li", {}, el("span", { className: "object rest", style: { "--mine": hex(NEUTRAL) } },
   el("span", { className: "swatch", "aria-hidden": "true" }), el("span", {}, "none"), el("span", { className: "score" }, formatCount(segmentation.none))));
 const hex = colour => `#${colour.map(value => value.toString(16).padStart(2, "0")).join("")}`;

@@ -68,13 +68,13 @@ export class ObjectList {
     byId("catalogue").hidden = !this.items.length && !this.selections.length;
     byId("join").hidden = selected.length < 2;
     byId("catalogue-own").replaceChildren(...this.selections.map(selection => el("li", {},
-      el("button", { type: "button", className: "thing", "aria-pressed": String(selected.includes(`selection:${selection.id}`)), on: { click: event => this.selectSelection(selection, event.shiftKey) } },
+      el("button", { type: "button", className: "object", "aria-pressed": String(selected.includes(`selection:${selection.id}`)), on: { click: event => this.selectSelection(selection, event.shiftKey) } },
         el("span", {}, selection.name, el("small", {}, `${plural(selection.count, "splat")}, selection`))),
       confirmButton("Delete", () => this.deleteSelection(selection.id)))));
     byId("catalogue-hidden").hidden = !hidden;
     byId("catalogue-hidden").textContent = this.showsHidden ? "Hide the hidden objects" : `Show ${plural(hidden, "hidden object")}`;
     const focusedId = document.activeElement?.dataset.unfolds; // the button is replaced
-    byId("catalogue-list").replaceChildren(...visible.map(object => el("li", { className: object.hidden ? "hidden-thing" : "" }, ...this.objectButtons(object, selected),
+    byId("catalogue-list").replaceChildren(...visible.map(object => el("li", { className: object.hidden ? "hidden-object" : "" }, ...this.objectButtons(object, selected),
       el("button", { type: "button", className: "plain edit", title: "Name this object", "aria-label": `Name ${object.title}`, on: { click: event => this.editName(object, event.target.closest("li")) } }, "\u270e"),
       el("button", { type: "button", className: "plain edit", "aria-label": `${object.hidden ? "Show" : "Hide"} ${object.title}`, on: { click: () => this.changeObject(object, { hidden: !object.hidden }) } }, object.hidden ? "Show" : "Hide"),
       ...this.partList(object, selected))));
@@ -88,7 +88,7 @@ export class ObjectList {
     const toggle = el("button", { type: "button", className: "plain unfold", "aria-expanded": String(isOpen), "aria-controls": `parts-${node.id}`,
       "aria-label": `${plural(parts.length, "part")} of ${this.namesByTerm.get(term(node))}`, data: { unfolds: node.id }, on: { click: () => this.toggleParts(node) } }, isOpen ? "\u25be" : "\u25b8");
     return [...(parts.length ? [toggle] : []),
-      el("button", { type: "button", className: "thing", "aria-pressed": String(selected.includes(term(node))), on: { click: event => this.selectObject(node, event.shiftKey) } },
+      el("button", { type: "button", className: "object", "aria-pressed": String(selected.includes(term(node))), on: { click: event => this.selectObject(node, event.shiftKey) } },
         el("span", {}, node.title, el("small", {}, plural(node.splats, "splat"), parts.length ? `, ${plural(parts.length, "part")}` : "")))];
   }
 

@@ -197,8 +197,8 @@ export class QueryPanel {
     } catch (problem) {
       if (turn !== this.requestNumber) return;
       question.problem = problem;
-      if (!String(problem.argument).includes("like")) return;
       const [kind, index] = String(problem.argument).split("."); // like.1 is the second value of the field like
+      if (!["like", "unlike"].includes(kind)) return;
       question[kind]?.splice(Number(index), 1); // such as a pixel without a splat
       if (!question.text.length && !question.like.length) this.questions = this.questions.filter(entry => entry !== question);
       this.activeIndex = Math.max(0, Math.min(this.activeIndex, this.questions.length - 1));
@@ -399,8 +399,8 @@ export class QueryPanel {
     const objects = question.objects || [];
     byId("stepping").hidden = !objects.length || (question.sets.length === 1 && objects.length === 1);
     byId("which").textContent = this.objectIndex < 0 ? plural(objects.length, "object") : `${this.objectIndex + 1} of ${objects.length}`;
-    byId("things").replaceChildren(...(question.sets.length ? [] : objects).map((object, index) => el("li", {},
-      el("button", { type: "button", className: "thing", "aria-pressed": String(index === this.objectIndex), on: { click: () => this.selectObject(question, index) } },
+    byId("objects").replaceChildren(...(question.sets.length ? [] : objects).map((object, index) => el("li", {},
+      el("button", { type: "button", className: "object", "aria-pressed": String(index === this.objectIndex), on: { click: () => this.selectObject(question, index) } },
         el("b", {}, String(index + 1)), el("span", {}, plural(object.splats, "splat"), el("small", {}, boxSize(object.box))),
         el("span", { className: "score", title: "mean score" }, object.score.toFixed(2))))));
     byId("apart").textContent = question.objectsProblem && !objects.length ? question.objectsProblem : "";
@@ -451,8 +451,14 @@ export const questionLabel = question => question.text.join(", ") || question.se
 const quoteWords = question => (question.text.length ? `\u201c${question.text.join(", ")}\u201d` : "Such an object");
 const boxSize = ({ low, high }) => ` ${low.map((value, axis) => (high[axis] - value).toPrecision(2)).join(" \u00d7 ")}`;
 
-const presenceReason = answer => answer.reason.replace(/^(?:Whether )?(?:'.*?'|".*?") is not (?:there|sure): (.)/, (_, first) => first.toUpperCase())
-  .replace(/^Whether (?:'.*?'|".*?") is there is not sure: (.)/, (_, first) => first.toUpperCase()).replace(/reference words?/g, "other words");
+// The reason why a word is absent or uncertain, by the numbers of its comparison; without one, the service's sentence.
+function presenceReason({ present, comparison, reason }) {
+  if (!comparison) return reason;
+  const { nearer, limit, count, nearest } = comparison;
+  if (nearer <= limit) return "Hardly any other word is nearer to its best splats, but many are to what sets them apart from the rest.";
+  const facts = `Its best splats are nearer to ${nearer} of ${count} other words, first of all to \u201c${plainWord(nearest)}\u201d`;
+  return present === false ? `${facts}.` : `${facts}, but to what sets them apart from the rest of the scene it is the nearest.`;
+}
 
 // The object may be there, or other words are nearer to the selection.
 const isUncertain = ({ text, answer }) => Boolean(text.length && answer && answer.present !== false
@@ -483,7 +489,17 @@ function thresholdReason({ answer, threshold, showsClosest, sets }) {
   if (answer.present === null && answer.presence !== null) return presenceReason(answer);
   if (!answer.clear && threshold === "auto" && showsClosest) return "These splats are the nearest; they hardly stand out from the others.";
   if (typeof threshold === "number") return "You set this threshold. The dashes mark the automatic one.";
-  const rule = /least, in log-odds/.test(answer.threshold.explanation)
-    ? "a small change of it changes the selection least" : "there is no clear gap, so it splits the scores into two groups";
-  return `Automatic threshold: ${rule}.`;
+  const { method, explanation } = answer.threshold;
+  const rule = method === "auto" || answer.clear ? THRESHOLD_RULES[method] : THRESHOLD_RULES.none;
+  return rule ? `Automatic threshold: ${rule}.` : explanation;
 }
+
+// How the methods find a threshold; where one finds no clear result, the scores are split into two groups.
+const THRESHOLD_RULES = {
+  auto: "a small change of it changes the selection least",
+  valley: "the first deep valley of the scores, from the top down",
+  paper: "the valley above the largest peak of the scores",
+  otsu: "it separates the scores best into two groups",
+  stability: "the middle of the range over which the selection changes least",
+  none: "there is no clear gap, so it splits the scores into two groups",
+};

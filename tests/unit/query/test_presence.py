@@ -64,6 +64,22 @@ def test_absent_words_select_nothing_and_present_ones_do(clip: Scene, table: Tab
     assert all((answer.present is False) == (answer.count == 0) for answer in answers)
 
 
+def test_comparison_has_the_numbers_of_the_reason(clip: Scene, table: TableEncoder) -> None:
+    other_words = [word for word in table.words if word not in PRESENT_WORDS]
+    for word in [*PRESENT_WORDS, *np.random.default_rng(1).choice(other_words, 60, replace=False).tolist()]:
+        answer = ask(clip, word, table)
+        comparison = answer.comparison
+        assert (comparison is None) == (answer.present is True)
+        if comparison is None:
+            continue
+        numbers = f"{comparison.nearer} of {comparison.count} reference words, first of all to {comparison.nearest!r}"
+        assert (comparison.nearer > comparison.limit) == (numbers in answer.reason)
+        assert answer.present is None or comparison.nearer > comparison.limit
+    several = ask(clip, Query.of(("sofa", "armchair")), table)
+    assert several.present is False and several.comparison is None
+    assert ask(clip, Query.of((SplatTerm(0), "sofa")), table).comparison is None  # the example may be there
+
+
 def test_absent_object_is_not_rendered_unless_kept(clip: Scene, table: TableEncoder) -> None:
     absent = ask(clip, "sofa", table)
     assert absent.threshold.value == np.inf and absent.threshold.explanation == absent.reason
