@@ -128,13 +128,13 @@ def estimate_presence(
     shares = [float(weights[counts <= limit].sum() / weights.sum()) for counts in (nearer, contrast)]
     presence = min(shares)
     if presence >= 0.5:
-        facts = f"at {presence:.0%} of its best splats at most {limit} of {count} reference words are nearer"
+        facts = f"at {presence:.0%} of its best splats at most {limit} of {count} other words are nearer"
         return Presence(present=True, presence=presence, reason=f"{name} is there: {facts}.")
     order = np.argsort(nearer, kind="stable")
     middle = int(nearer[order[np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2)]])
     near = weights @ products(rows, norms, direction[None], references.vectors[reference_rows])[1]
     nearest = references.words[reference_rows[int(near.argmax())]].replace("_", " ")
-    facts = f"its best splats are nearer to {middle} of {count} reference words, first of all to {nearest!r}"
+    facts = f"its best splats are nearer to {middle} of {count} other words, first of all to {nearest!r}"
     comparison = ReferenceComparison(nearer=middle, limit=limit, count=count, nearest=nearest)
     first = float(weights[contrast == 0].sum() / weights.sum())
     if shares[0] < 0.5 and first < 0.5:
@@ -144,7 +144,7 @@ def estimate_presence(
         facts += ", but to what sets them apart from the rest of the scene it is the nearest"
     else:
         facts = (
-            "hardly a reference word is nearer to its best splats, but many are to what sets them apart from the rest"
+            "hardly any other word is nearer to its best splats, but many are to what sets them apart from the rest"
         )
     reason = f"Whether {name} is there is not sure: {facts}."
     return Presence(present=None, presence=presence, reason=reason, comparison=comparison)

@@ -72,7 +72,7 @@ def test_comparison_has_the_numbers_of_the_reason(clip: Scene, table: TableEncod
         assert (comparison is None) == (answer.present is True)
         if comparison is None:
             continue
-        numbers = f"{comparison.nearer} of {comparison.count} reference words, first of all to {comparison.nearest!r}"
+        numbers = f"{comparison.nearer} of {comparison.count} other words, first of all to {comparison.nearest!r}"
         assert (comparison.nearer > comparison.limit) == (numbers in answer.reason)
         assert answer.present is None or comparison.nearer > comparison.limit
     several = ask(clip, Query.of(("sofa", "armchair")), table)
