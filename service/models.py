@@ -452,8 +452,15 @@ class Tradeoff(BaseModel):
     features: list[AssetId]
     labels: Labels | None = Field(description="the masks with the true labels")
     runs: list[dict[str, Any]] = Field(description="one for each preset and level of quality: seconds and accuracy")
-    over_budget: list[str] = Field(description="runs that did not fit the budget")
-    invalid_runs: list[str] = Field(default=[], description="runs that the settings do not allow")
+    over_budget: list[str] = Field(
+        description="runs that did not fit the budget",
+        validation_alias=AliasChoices("over_budget", "skipped"),  # stored ones may have the old name
+    )
+    invalid_runs: list[str] = Field(
+        default=[],
+        description="runs that the settings do not allow",
+        validation_alias=AliasChoices("invalid_runs", "refused"),
+    )
     choice: dict[str, Any] = Field(description="the recommended runs, with reasons")
     views: dict[str, int] = Field(description="number of lifted, all and held-out views")
     budget_s: float

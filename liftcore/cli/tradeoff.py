@@ -44,7 +44,7 @@ def _seconds(text: str) -> float:
 def run(options: argparse.Namespace) -> int:
     """Compare, write the chart, the table and the JSON, and print the recommendation."""
     settings = pairs_of(options.set)
-    from liftcore.evaluate import SceneFiles, compare_speeds, tradeoff_of_reply
+    from liftcore.evaluate import SceneFiles, compare_speeds
     from liftcore.files import check_output, writing
 
     check_output(options.out / "tradeoff.json", [], "json")
@@ -61,7 +61,7 @@ def run(options: argparse.Namespace) -> int:
         )
     with writing(options.out):
         files = comparison.save(options.out)
-    document = tradeoff_of_reply(comparison.document) | {"files": [str(file) for file in files]}
+    document = comparison.document_of_reply() | {"files": [str(file) for file in files]}
     reply(document, as_json=options.json, lines=[*comparison.lines(), "", *document["files"]])
     return 0
 

@@ -6,7 +6,6 @@ from liftcore.evaluate.check import check_scene as check_scene
 from liftcore.evaluate.inspect import inspect_file as inspect_file
 from liftcore.evaluate.lifts import evaluate_lifts as evaluate_lifts
 from liftcore.evaluate.tradeoff import SceneFiles as SceneFiles
-from liftcore.evaluate.tradeoff_document import tradeoff_of_reply as tradeoff_of_reply
 from liftcore.evaluate.tradeoff_report import compare_speeds as compare_speeds
 
 __all__: list[str]

@@ -15,12 +15,12 @@ from liftcore.errors import InvalidInput, InvalidSettings, Unavailable
 from liftcore.evaluate.hardware import machine_line
 from liftcore.evaluate.ranking import NAMES
 from liftcore.evaluate.tradeoff import SceneFiles, compare
-from liftcore.evaluate.tradeoff_document import OLD_KEYS, TradeoffDocument
 from liftcore.io.files import whole_file
 from liftcore.io.json_file import finite
-from liftcore.runtime.aliases import current_names
+from liftcore.runtime.aliases import AliasedDict, current_names, with_old_names
 from liftcore.runtime.progress import Progress, shown_progress
 from liftcore.scene.kernel import Kernel
+from liftcore.values.lift_file import OLD_DIAGNOSTICS
 from liftcore.values.settings import LiftSettings
 
 if TYPE_CHECKING:
@@ -39,8 +39,15 @@ KEY = (
     "over draws of its views."
 )
 TITLE = "Speed against accuracy"
+OLD_KEYS = {"skipped": "over_budget", "refused": "invalid_runs"}  # of documents of 0.4: new names by old ones
 LOST_SHARE = 0.001  # of the splats, above which the verdict mentions them
 LEAST_SHARE = 0.02  # of any run's seconds, for a stage that the chart shows
+
+
+class TradeoffDocument(AliasedDict):
+    """Figures of a comparison by their names, as plain numbers."""
+
+    aliases = OLD_KEYS
 
 
 @dataclass(frozen=True)
@@ -57,6 +64,16 @@ class SpeedComparison:
     def save(self, folder: Path) -> list[Path]:
         """Write ``tradeoff.json``, ``.png`` (a chart) and ``.md`` in a folder; return their paths."""
         return save(self.document, folder)
+
+    def document_of_reply(self) -> dict[str, Any]:
+        """Return the document with each old name behind its new one."""
+        document = with_old_names(self.document, OLD_KEYS)
+        return document | {"runs": [_run_of_reply(run) for run in document["runs"]]}
+
+
+def _run_of_reply(run: Mapping[str, Any]) -> dict[str, Any]:
+    settings = {name: LiftSettings.with_old_names(run[name]) for name in ("options", "settings")}
+    return with_old_names(run, OLD_DIAGNOSTICS) | settings
 
 
 def compare_speeds(

@@ -12,7 +12,6 @@ from fastapi.responses import JSONResponse, StreamingResponse
 
 from liftcore import LiftResult, LiftSettings
 from liftcore.errors import NotFound
-from liftcore.evaluate import tradeoff_of_reply
 from liftcore.files import in_camera_orientation
 from service import models
 from service.auth import bearer
@@ -372,4 +371,10 @@ def shape_tradeoff(tradeoff: TradeoffRecord) -> models.Tradeoff:
     links = {"self": path, "job": f"/jobs/{tradeoff.id}", "chart": f"{path}/chart", "table": f"{path}/table"}
     names = ("id", "splats", "cameras", "features", "labels", "created")
     fields = {name: getattr(tradeoff, name) for name in names}
-    return models.Tradeoff.model_validate({**tradeoff_of_reply(tradeoff.document), **fields, "links": links})
+    runs = [_run_with_old_names(run) for run in tradeoff.document["runs"]]
+    return models.Tradeoff.model_validate({**tradeoff.document, "runs": runs, **fields, "links": links})
+
+
+def _run_with_old_names(run: dict[str, Any]) -> dict[str, Any]:
+    settings = {name: LiftSettings.with_old_names(run[name]) for name in ("options", "settings") if name in run}
+    return LiftResult.diagnostics_of_reply(run) | settings

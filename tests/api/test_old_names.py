@@ -120,10 +120,12 @@ def test_settings_are_read_by_old_names_and_returned_by_both(quick: Quick) -> No
 
 
 def test_stored_tradeoffs_have_both_names_whichever_they_were_stored_by(store: Store) -> None:
-    for over_budget, invalid_runs, stride in (("skipped", "refused", "certificate_rays"),
-                                              ("over_budget", "invalid_runs", "diagnostic_rays")):  # fmt: skip
+    for over_budget, invalid_runs, stride, share in (
+        ("skipped", "refused", "certificate_rays", "seen_share"),
+        ("over_budget", "invalid_runs", "diagnostic_rays", "feature_share"),
+    ):
         job, _ = store.jobs.submit(SERVICE, replace(order(store), kind=models.JobKind.TRADEOFF))
-        runs = [{"name": "exact", "options": {}, "settings": {stride: 7}}]
+        runs = [{"name": "exact", "options": {}, "settings": {stride: 7}, share: 0.5}]
         names = {over_budget: ["mean"], invalid_runs: ["argmax"], "runs": runs}
         attempt = store.jobs.claim()
         assert attempt is not None and attempt.id == job
@@ -132,6 +134,7 @@ def test_stored_tradeoffs_have_both_names_whichever_they_were_stored_by(store: S
         reply = shape_tradeoff(store.tradeoffs.get(SERVICE, job)).model_dump(mode="json")
         assert reply["over_budget"] == reply["skipped"] == ["mean"]
         assert reply["invalid_runs"] == reply["refused"] == ["argmax"]
+        assert reply["runs"][0]["feature_share"] == reply["runs"][0]["seen_share"] == 0.5
         assert reply["runs"][0]["settings"] == {"diagnostic_rays": 7, "certificate_rays": 7}
 
 

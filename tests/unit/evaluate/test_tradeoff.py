@@ -23,8 +23,7 @@ from liftcore.evaluate import tradeoff_report as report
 from liftcore.evaluate.accuracy import centred_cosines, class_ious, cosine_figures, shared_pixels
 from liftcore.evaluate.ranking import accuracy_of, choose
 from liftcore.evaluate.tradeoff import RunSpec, SceneFiles, candidates_of, measure_run
-from liftcore.evaluate.tradeoff_document import TradeoffDocument
-from liftcore.evaluate.tradeoff_report import table_of
+from liftcore.evaluate.tradeoff_report import TradeoffDocument, table_of
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import dense_view, reading_matrix
 from liftcore.runtime.progress import silent
