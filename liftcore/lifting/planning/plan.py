@@ -329,25 +329,25 @@ def _entries(
     settings: LiftSettings,
     hit_share: float,
 ) -> np.ndarray:
-    """Estimate the entries of W of each view, [V] f64: one region or four cells a splat, tile and level.
+    """Estimate the entries of W of each view, [V] f64: the cells under the outline of each splat.
 
-    In a dense map, the cells under the outline of a splat count, times the share of pixels where rays reach it.
+    Regions count as square cells of the same number; long thin ones have more entries. In a dense map, only the share
+    of pixels where rays reach the splat counts.
 
     Args:
         hit_share: of `_hit_share`.
     """
-    parts = max(_parts_a_tile(features, name, settings) for name in names)
-    entries = _splat_counts(visible) * parts * _tiles(visible)
+    entries = np.zeros(len(cameras))
     for number, (name, camera) in enumerate(zip(names, cameras, strict=True)):
-        if _is_dense(features, name):
-            sides = np.sqrt(visible.areas[number][visible.in_view[number]], dtype=np.float64)
-            across, down = (
-                sides * min(cells, reads * -(-pixels // settings.stride)) / pixels + reads
-                for cells, pixels in zip(_cells(features, name, camera), (camera.width, camera.height), strict=True)
-                for reads in (1 if cells == pixels or features.is_regions(name) else 2,)  # of a pixel, in a line
-            )
-            levels = 1 if isinstance(settings.levels, int) else _levels(features, name)
-            entries[number] = hit_share * levels * float(across @ down) / visible.areas.shape[1] * visible.splats
+        sides = np.sqrt(visible.areas[number][visible.in_view[number]], dtype=np.float64)
+        across, down = (
+            sides * min(cells, reads * -(-pixels // settings.stride)) / pixels + reads
+            for cells, pixels in zip(_cells(features, name, camera), (camera.width, camera.height), strict=True)
+            for reads in (1 if cells == pixels or features.is_regions(name) else 2,)  # of a pixel, in a line
+        )
+        levels = 1 if isinstance(settings.levels, int) else _levels(features, name)
+        share = hit_share if _is_dense(features, name) else 1.0
+        entries[number] = share * levels * float(across @ down) / visible.areas.shape[1] * visible.splats
     return entries
 
 
@@ -434,12 +434,6 @@ def _tiles(visible: Visibility) -> float:
     """Estimate the mean number of tiles that a visible splat touches."""
     sides = np.sqrt(visible.areas[visible.in_view], dtype=np.float64)
     return float(np.mean((sides / TILE + 1.0) ** 2)) if sides.size else 1.0
-
-
-def _parts_a_tile(features: Views, view: str, settings: LiftSettings) -> int:
-    if not features.is_regions(view):
-        return 4  # of bilinear reading; nearest reads fewer, but fine cells are smaller than a tile
-    return 1 if isinstance(settings.levels, int) else _levels(features, view)
 
 
 def _levels(features: Views, view: str) -> int:
