@@ -24,6 +24,7 @@ from tests.crash.conftest import order
 from .following import wait_for_end
 from .test_jobs import Quick, quick
 from .test_problems import assert_problem
+from .tiny_scene import TinyScene
 
 __all__ = ["quick"]  # a fixture
 
@@ -140,23 +141,26 @@ def test_stored_tradeoffs_have_both_names_whichever_they_were_stored_by(store: S
 
 @pytest.mark.parametrize("old", OLD_DIAGNOSTICS)
 def test_diagnostics_of_a_lift_have_old_names_beside_the_new_ones(
-    client: TestClient, lift: dict[str, Any], old: str, tmp_path: Path
+    client: TestClient, lift: dict[str, Any], old: str, tmp_path: Path, start: Any, scene: TinyScene
 ) -> None:
     content = client.get(f"/lifts/{lift['id']}/features").content
     (tmp_path / "lift").write_bytes(content)
     with safe_open(tmp_path / "lift", "np") as file:
         metadata = json.loads(file.metadata()["splatlift"])
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    for name in (old, OLD_DIAGNOSTICS[old]):
-        diagnostics = {name: 0.25}
-        text = json.dumps(metadata | {"diagnostics": diagnostics})
-        reply = client.post("/lifts", content=save(tensors, {"splatlift": text}))
-        assert reply.status_code == 201
-        document = client.get(reply.json()["links"]["self"]).json()
-        assert document["diagnostics"] == document["certificate"] == {OLD_DIAGNOSTICS[old]: 0.25, old: 0.25}
-    text = json.dumps(metadata | {"diagnostics": {old: 0.25, OLD_DIAGNOSTICS[old]: 0.5}})
-    problem = assert_problem(client.post("/lifts", content=save(tensors, {"splatlift": text})))
-    assert problem["status"] == 422 and old in problem["expected"]
+    with start() as other:  # no other test sees these lifts
+        for kind in ("splats", "cameras"):
+            assert other.put(f"/assets/{kind}", content=getattr(scene, kind)).status_code == 201
+        for name in (old, OLD_DIAGNOSTICS[old]):
+            diagnostics = {name: 0.25}
+            text = json.dumps(metadata | {"diagnostics": diagnostics})
+            reply = other.post("/lifts", content=save(tensors, {"splatlift": text}))
+            assert reply.status_code == 201
+            document = other.get(reply.json()["links"]["self"]).json()
+            assert document["diagnostics"] == document["certificate"] == {OLD_DIAGNOSTICS[old]: 0.25, old: 0.25}
+        text = json.dumps(metadata | {"diagnostics": {old: 0.25, OLD_DIAGNOSTICS[old]: 0.5}})
+        problem = assert_problem(other.post("/lifts", content=save(tensors, {"splatlift": text})))
+        assert problem["status"] == 422 and old in problem["expected"]
 
 
 def test_a_zip_of_things_is_one_of_objects(client: TestClient, lift: dict[str, Any]) -> None:
