@@ -331,12 +331,15 @@ def _entries(
 ) -> np.ndarray:
     """Estimate the entries of W of each view, [V] f64: the cells under the outline of each splat.
 
-    Regions count as square cells of the same number; long thin ones have more entries. In a dense map, only the share
-    of pixels where rays reach the splat counts.
+    Regions count as square cells of the same number; long thin ones have more entries. Of cells that are smaller than
+    a tile, rays reach few: one region or four cells a splat, tile and level are counted. In a dense map, the share of
+    pixels where rays reach the splat counts.
 
     Args:
         hit_share: of `_hit_share`.
     """
+    parts = max(_parts_a_tile(features, name, settings) for name in names)
+    limits = _splat_counts(visible) * parts * _tiles(visible)
     entries = np.zeros(len(cameras))
     for number, (name, camera) in enumerate(zip(names, cameras, strict=True)):
         sides = np.sqrt(visible.areas[number][visible.in_view[number]], dtype=np.float64)
@@ -346,8 +349,9 @@ def _entries(
             for reads in (1 if cells == pixels or features.is_regions(name) else 2,)  # of a pixel, in a line
         )
         levels = 1 if isinstance(settings.levels, int) else _levels(features, name)
-        share = hit_share if _is_dense(features, name) else 1.0
-        entries[number] = share * levels * float(across @ down) / visible.areas.shape[1] * visible.splats
+        cells_under = levels * float(across @ down) / visible.areas.shape[1] * visible.splats
+        is_dense = _is_dense(features, name)
+        entries[number] = hit_share * cells_under if is_dense else min(cells_under, limits[number])
     return entries
 
 
@@ -434,6 +438,12 @@ def _tiles(visible: Visibility) -> float:
     """Estimate the mean number of tiles that a visible splat touches."""
     sides = np.sqrt(visible.areas[visible.in_view], dtype=np.float64)
     return float(np.mean((sides / TILE + 1.0) ** 2)) if sides.size else 1.0
+
+
+def _parts_a_tile(features: Views, view: str, settings: LiftSettings) -> int:
+    if not features.is_regions(view):
+        return 4  # of bilinear reading; nearest reads fewer, but fine cells are smaller than a tile
+    return 1 if isinstance(settings.levels, int) else _levels(features, view)
 
 
 def _levels(features: Views, view: str) -> int:
