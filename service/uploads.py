@@ -8,6 +8,7 @@ import logging
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Lock
 from typing import Any, BinaryIO, Generic, TypeVar
 
 from liftcore import errors
@@ -66,7 +67,7 @@ class Intake(ABC, Generic[Record]):
         self._limit = limit
         self._received_bytes = self._permitted_bytes = 0
         self._digest = hashlib.sha256()
-        self._open = contextlib.ExitStack()
+        self._open, self._is_closed, self._lock = contextlib.ExitStack(), False, Lock()
         self._draft: Path | None = None
         self._file: BinaryIO | None = None
 
@@ -78,12 +79,16 @@ class Intake(ABC, Generic[Record]):
         """
         self._store.files.require_room()
         self._store.assets.require_quota(self._owner)
-        self._draft = self._open.enter_context(self._store.files.draft(f".{self._kind}"))
-        self._file = self._open.enter_context(self._draft.open("wb"))
+        with self._lock:  # a cancelled request is closed while its thread may still be here
+            if not self._is_closed:
+                self._draft = self._open.enter_context(self._store.files.draft(f".{self._kind}"))
+                self._file = self._open.enter_context(self._draft.open("wb"))
 
     def close(self) -> None:
-        """Remove the draft."""
-        self._open.close()
+        """Remove the draft; `open` then makes none."""
+        with self._lock:
+            self._is_closed = True
+            self._open.close()
 
     def feed(self, chunk: bytes) -> None:
         """Take the next bytes of the body.

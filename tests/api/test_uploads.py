@@ -14,10 +14,11 @@ from starlette.types import Message, Receive, Scope, Send
 
 from liftcore.evaluate.inspect import inspect_file
 from liftcore.io import safetensors_file
+from service.models import AssetKind
 from service.routes import assets
 from service.store.files import DataDirectory
 from service.store.keys import Quota
-from service.store.owners import parse_scopes
+from service.store.owners import SERVICE, parse_scopes
 from service.store.store import Store
 from service.uploads import STEP, AssetIntake, Intake
 from tests.crash.server import standing_in
@@ -256,3 +257,10 @@ def test_key_with_little_room_writes_no_large_draft(
     assert assert_problem(reply)["type"] == "/problems/over-quota"
     assert largest_draft() <= remaining
     assert (largest_draft() > 0) == (remaining > STEP)
+
+
+def test_upload_that_is_closed_before_its_thread_opens_it_leaves_no_draft(store: Store) -> None:
+    intake = AssetIntake(store, SERVICE, AssetKind.SPLATS, 100)
+    intake.close()
+    intake.open()
+    assert not list((store.files.root / "tmp").iterdir())
