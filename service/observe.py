@@ -112,7 +112,7 @@ class _Line(logging.handlers.QueueHandler):
         record.request_id = current_id()
         return record
 
-    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's name
         """Ignore the error: the queue is full, and a message would go to the same queue."""
 
 

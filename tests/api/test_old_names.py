@@ -147,7 +147,7 @@ def test_diagnostics_of_a_lift_have_old_names_beside_the_new_ones(
     (tmp_path / "lift").write_bytes(content)
     with safe_open(tmp_path / "lift", "np") as file:
         metadata = json.loads(file.metadata()["splatlift"])
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
     with start() as other:  # no other test sees these lifts
         for kind in ("splats", "cameras"):
             assert other.put(f"/assets/{kind}", content=getattr(scene, kind)).status_code == 201

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from liftcore.runtime.device import CPU, Device
 from liftcore.solve import closed_form
-from liftcore.solve.closed_form import Solution, solve
+from liftcore.solve.closed_form import LONG, Solution, solve
 from liftcore.values.region_weights import RegionWeights, stacked
 from tests.unit.solve.sparse_views import codebook_of, defined, of_dense, random_view
 
@@ -173,3 +173,18 @@ def test_float16_codebooks_give_the_bits_of_their_float32_twins(seed, channels, 
     mixed_books = [book.float() if k else book for k, book in enumerate(books)]
     assert torch.equal(solution, solve(W, codebook_of(mixed_books), torch.float32).features)
     assert all(map(torch.equal, books, before))
+
+
+def test_splats_of_few_and_of_many_entries_in_one_group_have_the_bits_of_each_alone():
+    rng = np.random.default_rng(7)
+    lengths = np.array([10, 3 * LONG + 5, LONG, 2 * LONG - 1])
+    weights = rng.uniform(0.1, 1.0, (4, lengths.max())) * (np.arange(lengths.max()) < lengths[:, None])
+    book = torch.tensor(rng.normal(0, 1, (lengths.max(), 40)), dtype=torch.float32)
+    together = solve(stacked([of_dense(weights)], 4), codebook_of([book]), torch.float32).features
+    for row in range(4):
+        single = np.zeros_like(weights)
+        single[row] = weights[row]
+        alone = solve(stacked([of_dense(single)], 4), codebook_of([book]), torch.float32).features
+        assert torch.equal(together[row], alone[row])
+    expected = weights @ book.double().numpy() / weights.sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(together.numpy(), expected, atol=1e-6)

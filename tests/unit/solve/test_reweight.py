@@ -14,7 +14,7 @@ from liftcore.lifting.files import lift_files
 from liftcore.solve.aggregate import cluster_consistency
 from liftcore.solve.directions import RegionDirections
 from liftcore.solve.reweight import NO_CONSENSUS, reweighting_factors, scale_weights
-from liftcore.solve.shared_rows import MOST_COMPARED
+from liftcore.solve.shared_rows import LONG, MOST_COMPARED
 from liftcore.values.region_weights import RegionWeights, stacked
 from liftcore.values.settings import LiftSettings
 from tests.scenes import write_scene
@@ -221,6 +221,18 @@ def test_slices_of_channels_are_compared_as_one_vector(monkeypatch, on_card):
         monkeypatch.setattr(f"liftcore.solve.{module}.TABLE_BYTES", 1)
     for sliced, expected in zip(scene.after(2, on_card=on_card), matrix, strict=True):
         np.testing.assert_allclose(sliced, expected, rtol=1e-4, atol=1e-5)
+
+
+@on_both
+def test_splats_of_few_and_of_many_views_in_one_group_equal_the_definition(on_card):
+    scene = random_scene(6, count=9, views=MOST_COMPARED // 2, rows=3)
+    for number, view in enumerate(scene.weights):
+        view[::2] *= number % 8 == 0  # every other splat has an eighth of the views
+    entry_counts = np.sum([(view > 0).sum(axis=1) for view in scene.weights], axis=0)
+    assert entry_counts.min() < LONG < entry_counts.max() <= MOST_COMPARED
+    D = np.maximum(scene.denominators[:, None], 1e-30)
+    for actual, real in zip(scene.after(1, on_card=on_card), defined(scene, 1), strict=True):
+        np.testing.assert_allclose(actual / D, real / D, atol=1e-6)
 
 
 @on_both
