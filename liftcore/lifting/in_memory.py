@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -33,6 +33,7 @@ from liftcore.solve.least_squares import AllRays, reference, refine
 from liftcore.solve.loss import huber_factors
 from liftcore.solve.mask_edges import weaken_edges
 from liftcore.solve.membership import Memberships, RegionGroups, memberships
+from liftcore.solve.membership_on_card import MembershipsOnCard, memberships_on_card
 from liftcore.solve.objects import NodeVectors, RegionObjects, region_objects
 from liftcore.solve.reweight import Reweighting, reweighting_factors, scale_weights, whole_regions
 from liftcore.solve.smooth import smooth
@@ -42,6 +43,8 @@ from liftcore.values.lift_views import LiftViews
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import LiftSettings
 from liftcore.values.views import ViewFeatures
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -68,11 +71,32 @@ class SceneWeights:
         """W on the CPU, copied once."""
         return self.weights.cpu()
 
+    @property
+    def groups(self) -> RegionGroups:
+        """The views and groups of the regions."""
+        return RegionGroups.of(self.weights.offsets.numpy(), self.geometry.levels)
+
     @cached_property
     def members(self) -> Memberships:
-        """The memberships of W, which objects and consensus share."""
-        groups = RegionGroups.of(self.weights.offsets.numpy(), self.geometry.levels)
-        return memberships(self.on_processor, groups, self.threads)
+        """The memberships of W, which objects and consensus share, on the CPU."""
+        return memberships(self.on_processor, self.groups, self.threads)
+
+    @cached_property
+    def members_on_card(self) -> MembershipsOnCard:
+        """The memberships of W on its device."""
+        return memberships_on_card(self.weights, self.groups)
+
+    def where_it_fits(self, compute: Callable[[RegionWeights, bool], T]) -> T:
+        """Return ``compute(W, on_card)``, for W on the GPU if it lies and fits there, else on the CPU."""
+        if self.device.kind == "cpu" or self.weights.device != self.device.place:
+            return compute(self.on_processor, False)
+        try:
+            return compute(self.weights, True)
+        except RuntimeError as error:
+            if not out_of_memory(error):
+                raise
+        give_back_memory()  # after the except block, where the error no longer references tensors
+        return compute(self.on_processor, False)
 
     def row_sums(self) -> np.ndarray:
         """Return the sums of rows [P] f64 of W before reweighting."""
@@ -152,15 +176,7 @@ class InMemory(LiftSteps[SceneWeights]):
             result = replace(W.with_factors(weights, reweighting.factors), consensus=None, reweighting=reweighting)
             return result, reweighting.reliability
 
-        if W.device.kind == "cpu" or W.weights.device != W.device.place:
-            return apply_reweighting(W.on_processor, False)
-        try:
-            return apply_reweighting(W.weights, True)
-        except RuntimeError as error:
-            if not out_of_memory(error):
-                raise
-        give_back_memory()  # after the except block, where the error no longer references tensors
-        return apply_reweighting(W.on_processor, False)
+        return W.where_it_fits(apply_reweighting)
 
     def discount_distance(self, W: SceneWeights) -> SceneWeights:
         weights, keywords = W.on_processor, {"means": self.splats.means, "threads": self.threads}

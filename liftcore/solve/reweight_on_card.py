@@ -1,9 +1,9 @@
 """A step of `liftcore.solve.reweight` on a GPU, for a W in its memory: the same equations, by blocks of rows.
 
-Sums of `BlockReweighter` over entries are sums over segments here: the entries of one view and one level at one
-splat. A **line** is the entries of one level at one splat, and a block has its entries line by line. The sum of the
-other views is that of all views minus the own view, in float64, as a float32 difference would lose digits. All sums
-have a fixed order: a lift is bitwise reproducible on the same GPU.
+Sums of `BlockReweighter` over entries are sums over segments here (`liftcore.solve.membership_on_card`): the entries
+of one view and one level at one splat. The sum of the other views is that of all views minus the own view, in
+float64, as a float32 difference would lose digits. All sums have a fixed order: a lift is bitwise reproducible on the
+same GPU.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from torch import Tensor
 
 from liftcore.solve.closed_form import bag_sums
 from liftcore.solve.directions import RegionDirections
+from liftcore.solve.membership_on_card import BLOCK_ENTRIES, BLOCK_ROWS, Segments
 from liftcore.solve.reweight import NO_CONSENSUS, SceneConsistency, level_numbers
 from liftcore.solve.sums import PieceSums
 from liftcore.values.region_weights import RegionWeights, from_zero, segment_sums
 
-BLOCK_ROWS, BLOCK_ENTRIES = 1 << 18, 1 << 22
 TABLE_BYTES = 1 << 28  # of a table of entries by channels
 
 
@@ -138,29 +138,18 @@ class BlockReweighterOnCard:
 
     def _block(self, first: int, last: int, factors: Tensor | None) -> _Block:
         """Return rows of W with the factors of the step before."""
-        starts, lines = self.W.indptr[first : last + 1], (last - first) * self.levels
-        begin, end = starts[[0, -1]].tolist()
-        row = torch.repeat_interleave(starts.diff(), output_size=end - begin)
-        line = row * self.levels + self.region_level[self.W.region[begin:end].long()]
-        order = torch.argsort(line, stable=True)
-        line, entries = line[order], order + begin
-        region, weight = self.W.region[entries], self.W.weight[entries].double()
-        begins = torch.ones(len(region), dtype=torch.bool, device=self.place)
-        view = self.view[region]
-        begins[1:] = (view[1:] != view[:-1]) | (line[1:] != line[:-1])
-        segment = begins.cumsum(0) - 1
-        segment_starts = torch.nonzero(begins)[:, 0]
-        segment_line = line[segment_starts]
-        bounds = torch.cat([segment_starts, segment_starts.new_full((1,), len(region))])
+        block = Segments.of(self.W, first, last, self.region_level, self.levels, self.view)
+        entries, line, bounds, lines = block.entries, block.line, block.starts, (last - first) * self.levels
+        weight, segment_line = self.W.weight[entries].double(), line[bounds[:-1]]
         line_starts = torch.searchsorted(segment_line, torch.arange(lines + 1, device=self.place))
         totals = segment_sums(segment_sums(weight, bounds), line_starts)
         share = weight * torch.where(totals > 0, 1.0 / totals, 0.0)[line]
         share = share if factors is None else share * factors[entries]
-        view_share = segment_sums(share, bounds).clamp_max(1.0)[segment]
-        rows = slice(first, last)
+        view_share = segment_sums(share, bounds).clamp_max(1.0)[block.segment]
         return _Block(
-            rows, entries, region, weight, share, line, segment, bounds, line_starts, segment_line, view_share
-        )
+            slice(first, last), entries, block.region, weight, share, line, block.segment, bounds, line_starts,
+            segment_line, view_share,
+        )  # fmt: skip
 
     def _compare(self, block: _Block, table: Tensor, products: Tensor, squares: Tensor) -> None:
         """Add ``e_m . r_jv`` and ``|r_jv|^2`` of a block's entries, over the channels of the table [M, C] f32."""
