@@ -27,6 +27,7 @@ from liftcore.scene.splats import Splats
 from liftcore.solve.aggregate import Aggregation, aggregate, solve_from_kept_regions
 from liftcore.solve.closed_form import solve
 from liftcore.solve.consensus import mask_consensus
+from liftcore.solve.consensus_on_card import mask_consensus_on_card
 from liftcore.solve.diagnostics import ViewMeasures, measure_samples
 from liftcore.solve.directions import region_totals
 from liftcore.solve.least_squares import AllRays, reference, refine
@@ -58,7 +59,7 @@ class SceneWeights:
     geometry: Geometry  # its W is that of the solve
     sums: np.ndarray | None = None  # [P] f64, of the rows of W before reweighting; None: W is not reweighted
     threads: int | None = None  # None: the cores that this process may use
-    consensus: Tensor | None = None  # [nnz] f32, until W is reweighted
+    consensus: Tensor | None = None  # [nnz] f32, until W is reweighted; where it was computed
     reweighting: Reweighting | None = None
 
     @property
@@ -162,15 +163,21 @@ class InMemory(LiftSteps[SceneWeights]):
 
     def compare_masks(self, W: SceneWeights) -> SceneWeights:
         means, levels = self.splats.means, W.geometry.levels
-        shares = mask_consensus(W.on_processor, levels, self.threads, means=means, members=W.members)
-        return replace(W, consensus=torch.from_numpy(shares))
+
+        def compare(weights: RegionWeights, on_card: bool) -> Tensor:
+            if on_card:
+                return mask_consensus_on_card(weights, levels, means=means, members=W.members_on_card)
+            return torch.from_numpy(mask_consensus(weights, levels, self.threads, means=means, members=W.members))
+
+        return replace(W, consensus=W.where_it_fits(compare))
 
     def reweight(self, W: SceneWeights, levels_apart: bool) -> tuple[SceneWeights, float | None]:
         def apply_reweighting(weights: RegionWeights, on_card: bool) -> tuple[SceneWeights, float | None]:
+            consensus = W.consensus if on_card or W.consensus is None else W.consensus.cpu()
             reweighting = reweighting_factors(
                 weights, W.geometry.codebook, self.settings.robust_steps, self.timings.progress,
                 principal=self.settings.robust_directions, means=self.splats.means, threads=self.threads,
-                reliability=whole_regions(self.settings.reliability, W.geometry.levels), consensus=W.consensus,
+                reliability=whole_regions(self.settings.reliability, W.geometry.levels), consensus=consensus,
                 levels=W.geometry.levels if levels_apart else None, on_card=on_card,
             )  # fmt: skip
             result = replace(W.with_factors(weights, reweighting.factors), consensus=None, reweighting=reweighting)

@@ -252,7 +252,7 @@ def morton_codes(points: Tensor, bounds: Tensor | None = None) -> Tensor:
         points: [n, 3] f32, finite, any frame and unit; quantised to 2^21 cells per axis between the bounds.
         bounds: [2, 3], minimum and maximum; None: of the points.
     """
-    codes = torch.zeros(points.shape[0], dtype=torch.int64)
+    codes = torch.zeros(points.shape[0], dtype=torch.int64, device=points.device)
     for axis, values in enumerate(points.double().T if codes.numel() else ()):
         low, high = values.aminmax() if bounds is None else bounds[:, axis].double()
         cells = ((values - low) * ((2**21 - 1) / (high - low) if high > low else 0.0)).long()

@@ -119,12 +119,7 @@ class RegionWeights:
 
     def take(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Return the starts [B + 1] i64 of rows [B] i64 among their entries, and their indices in W [nnz'] i64."""
-        begins = self.indptr[rows]
-        starts = from_zero(self.indptr[rows + 1] - begins)
-        total = int(starts[-1])
-        entries = torch.repeat_interleave(begins - starts[:-1], starts.diff(), output_size=total)
-        entries += torch.arange(total, device=entries.device)
-        return starts, entries
+        return row_entries(self.indptr, rows)
 
     def of_splats(self, first: int, last: int) -> Self:
         """W and total weight of the splats ``first..last`` alone, counted from ``first`` on; a copy."""
@@ -315,6 +310,16 @@ def run_each(work: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], thr
     """
     with ThreadPoolExecutor(threads or cores()) as pool:
         list(pool.map(lambda call: work(*call), arguments))
+
+
+def row_entries(indptr: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the starts [B + 1] i64 of rows [B] i64 among their entries, and the indices of these [nnz'] i64."""
+    begins = indptr[rows]
+    starts = from_zero(indptr[rows + 1] - begins)
+    total = int(starts[-1])
+    entries = torch.repeat_interleave(begins - starts[:-1], starts.diff(), output_size=total)
+    entries += torch.arange(total, device=entries.device)
+    return starts, entries
 
 
 def from_zero(lengths: Tensor) -> Tensor:

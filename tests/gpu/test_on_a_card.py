@@ -10,6 +10,8 @@ import torch
 
 import liftcore as lc
 from liftcore.evaluate.tradeoff import RunSpec, SceneFiles, measure_run
+from liftcore.lifting import in_memory
+from liftcore.solve.consensus import mask_consensus
 from liftcore.values import region_weights as weights
 from liftcore.values.settings import Preset
 from tests import paper_card
@@ -131,6 +133,30 @@ def test_weights_that_no_card_can_stack_are_stacked_here(paths: list[Path], monk
 
     monkeypatch.setattr(weights, "_stacked", crowded)
     assert torch.allclose(lifted(paths, device="cuda").cpu().features.float(), expected.features.float(), atol=1e-3)
+
+
+def test_masks_are_compared_on_the_card(paths: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    expected, compare, places = lifted(paths, device="cpu"), in_memory.mask_consensus_on_card, list[str]()
+
+    def crowded(W: Any, *rest: Any, **keywords: Any) -> Any:
+        raise torch.OutOfMemoryError
+
+    def compare_there(W: Any, *rest: Any, **keywords: Any) -> Any:
+        shares = compare(W, *rest, **keywords)
+        places.extend([W.device.type, shares.device.type])
+        return shares
+
+    def compare_here(W: Any, *rest: Any, **keywords: Any) -> Any:
+        places.append(W.device.type)
+        return mask_consensus(W, *rest, **keywords)
+
+    monkeypatch.setattr(in_memory, "mask_consensus", compare_here)
+    for work, at in ((compare_there, ["cuda", "cuda"]), (crowded, ["cpu"])):
+        places.clear()
+        monkeypatch.setattr(in_memory, "mask_consensus_on_card", work)
+        features = lifted(paths, device="cuda").cpu().features
+        assert places == at
+        assert torch.allclose(features.float(), expected.features.float(), atol=1e-3)
 
 
 def test_a_run_of_a_tradeoff_is_judged_off_the_card(paths: list[Path], tmp_path: Path) -> None:
