@@ -48,11 +48,11 @@ LARGE = RoomSpec(1_000_000, 300, (986, 728), 512)  # docs/results.md has it on a
 SMALL = RoomSpec(200_000, 8, (640, 480), 512)  # to compare both devices on: the processor lifts it in seconds
 
 
-def whole_lift(size: RoomSpec, device: Device) -> tuple[list[dict[str, Any]], list[str]]:
+def whole_lift(size: RoomSpec, device: Device, preset: str) -> tuple[list[dict[str, Any]], list[str]]:
     """Seconds of a lift from files to a file by stage, the second of two; the tensors that differ between the two."""
     with tempfile.TemporaryDirectory(prefix="splatlift-room-") as folder:
         files = write_bench_room(Path(folder), size)
-        settings, lifts = lc.LiftSettings.of(preset="tikhonov", device=device.kind), []
+        settings, lifts = lc.LiftSettings.of(preset=preset, device=device.kind), []
         start = 0.0
         for _ in range(2):  # the first compiles kernels, and leaves the files in the memory of the machine
             if device.place.type == "cuda":
@@ -171,8 +171,12 @@ def main() -> int:
     print(f"{device.name}, {(device.free_bytes() or 0) / 2**30:.1f} GiB free; {machine_line(hardware())}")
     if options.look:
         return 0
-    rows, broken = whole_lift(LARGE, device)
-    _section(f"A whole lift, files to file ({LARGE}); tensors that differ when repeated: {broken or 'none'}", rows)
+    broken = list[str]()
+    for preset in ("tikhonov", "default"):  # the latter has the stages of masks: objects, consensus, robust
+        rows, differences = whole_lift(LARGE, device, preset)
+        broken += differences
+        title = f"A whole lift by {preset}, files to file ({LARGE}); tensors that differ when repeated"
+        _section(f"{title}: {differences or 'none'}", rows)
     _section("A view", views_of(device, options.shared))
     with tempfile.TemporaryDirectory(prefix="splatlift-room-") as folder:
         near = [{"scene": "room", **beside_processor(write_bench_room(Path(folder), SMALL), device)}]
