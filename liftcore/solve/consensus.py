@@ -108,7 +108,7 @@ def mask_consensus(
     rows = np.flatnonzero(np.diff(W.indptr.numpy()))
     if means is not None:
         rows = rows[along_curve(means[torch.from_numpy(rows)])]
-    tuples = splat_tuples(W, members.own_region, groups, rows, threads)
+    tuples = splat_tuples(W, members.own_region, groups, rows)
     shares = region_shares(W, members.own_region, groups, rows, members.totals[rows], tuples, threads=threads)
     return with_mean(shares.sums, shares.views, mean_share(shares.share_sum, shares.share_count), threads)
 
@@ -135,21 +135,13 @@ def with_mean(sums: np.ndarray, views: np.ndarray, mean: float, threads: int | N
     return sums
 
 
-def splat_tuples(
-    W: RegionWeights, own_region: np.ndarray, groups: RegionGroups, rows: np.ndarray, threads: int | None = None
-) -> SplatTuples:
+def splat_tuples(W: RegionWeights, own_region: np.ndarray, groups: RegionGroups, rows: np.ndarray) -> SplatTuples:
     """Return the tuples of some rows of W [n] i64, in their order.
 
     Args:
         W, own_region: as `memberships` has them, of any views.
     """
-    indptr, region = W.indptr.numpy(), W.region.numpy()
-    counts = np.zeros(rows.size + 1, np.int64)
-    pieces = _edges(np.diff(indptr)[rows], max(region.size // PIECES, 1))
-    arrays = rows, indptr, region, own_region, groups.view, counts
-    run_each(lambda *ends: count_views(*[*ends, *arrays]), pieces, threads)
-    starts = np.cumsum(counts)
-    return SplatTuples(starts, *number_tuples(rows, indptr, region, own_region, groups.view, starts))
+    return SplatTuples(*number_tuples(rows, W.indptr.numpy(), W.region.numpy(), own_region, groups.view))
 
 
 def region_shares(
@@ -207,17 +199,6 @@ def _edges(lengths: np.ndarray, entries: int) -> list[tuple[int, int]]:
 
 
 @kernel
-def count_views(first, last, rows, indptr, region, own_region, view, counts):
-    """Count the views in which rows ``first..last`` belong to a region, at index row + 1."""
-    for j in range(first, last):
-        before = -1
-        for k in range(indptr[rows[j]], indptr[rows[j] + 1]):
-            if own_region[k] and view[region[k]] != before:
-                before = view[region[k]]
-                counts[j + 1] += 1
-
-
-@kernel
 def count_splats(piece, first, last, rows, indptr, region, base, sizes):
     """Count the entries of each region in rows ``first..last``."""
     for j in range(first, last):
@@ -226,13 +207,13 @@ def count_splats(piece, first, last, rows, indptr, region, base, sizes):
 
 
 @kernel
-def number_tuples(rows, indptr, region, own_region, view, starts):
-    """Number the tuples of some rows, whose tuples begin at ``starts``: return tuples, parents and members.
+def number_tuples(rows, indptr, region, own_region, view):
+    """Number the tuples of some rows: return the arrays of `SplatTuples`.
 
     A splat mostly has the tuples of the splat before, so the last successor of a tuple is tried before the hash
     table.
     """
-    tuples = np.empty(starts[-1], np.int32)
+    starts, tuples = np.zeros(rows.size + 1, np.int64), np.empty(region.size, np.int32)  # of which few are written
     parents, members = np.empty(1 << 10, np.int32), np.empty(1 << 10, np.int32)
     followers, first_tuples = np.full(1 << 10, -1, np.int32), np.full(view[-1] + 1 if view.size else 0, -1, np.int32)
     table, count = np.full(1 << 12, -1, np.int32), 0
@@ -269,7 +250,9 @@ def number_tuples(rows, indptr, region, own_region, view, starts):
             tuple_ = near
         if last >= 0:
             tuples[at] = tuple_
-    return tuples, parents[:count].copy(), members[:count].copy()
+            at += 1
+        starts[j + 1] = at
+    return starts, tuples[: starts[-1]].copy(), parents[:count].copy(), members[:count].copy()
 
 
 @kernel

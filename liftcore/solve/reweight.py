@@ -286,7 +286,8 @@ class BlockReweighter:
         parts = cosines, scene.regions, _or_ones(consensus), scores, scene.mean_cosine, scene.power
         powers = ((np.arange(POWERS + 2) / POWERS) ** scene.power.numpy()[:, None]).astype(np.float32)
         arrays = [*self._arrays(_or_ones(factors)), *(part.numpy() for part in parts), powers]
-        blocks = [(self.rows[first:last].numpy(), *arrays) for first, last in self.blocks]
+        # In the order of memory: nothing is shared by neighbours, unlike in `cosines`.
+        blocks = [(first, last, *arrays) for first, last in self.W.blocks(BLOCK_ROWS, BLOCK_ENTRIES)]
         run_each(weigh_rows, blocks, self.threads)
         return scores
 
@@ -308,15 +309,17 @@ def _or_ones(factors: Tensor | None) -> Tensor:
 
 @kernel
 def weigh_rows(
-    rows, indptr, region, weight, factors, view, level, cosines, reliable, consensus, scores, mean_cosine, power,
-    powers,
+    first_row, last_row, indptr, region, weight, factors, view, level, cosines, reliable, consensus, scores,
+    mean_cosine, power, powers,
 ):  # fmt: skip
-    """Compute `BlockReweighter.weigh` of some rows; powers of consensus are interpolated in a table [K, n]."""
+    """Compute `BlockReweighter.weigh` of rows; powers of consensus are interpolated in a table [K, n]."""
     levels = mean_cosine.size
     before, after, gain = np.empty(levels), np.empty(levels), np.empty(levels)
     cosine_sums, blended_sums, view_shares = np.empty(levels), np.empty(levels), np.empty(levels)
-    for row in rows:
+    for row in range(first_row, last_row):
         first, last = indptr[row], indptr[row + 1]
+        if first == last:
+            continue
         before[:] = after[:] = cosine_sums[:] = blended_sums[:] = 0.0
         for k in range(first, last):
             before[level[region[k]]] += weight[k]

@@ -339,12 +339,11 @@ def add_products(rows, indptr, region, weight, factors, view, level, table, widt
     view_limit = min(view_limit, np.int64(view[-1]) + 1)
     stride = (width + LANES - 1) // LANES * LANES
     size = GROUP * stride
-    view_sums, total, other_views = (
-        np.empty(view_limit * size, np.float32),
-        np.empty(size, np.float32),
-        np.empty(size, np.float32),
-    )
-    other_sums, view_shares = np.empty(size, np.float32), np.empty(view_limit * GROUP)
+    # Sums of each view, of all views, of all but a heavy one, and zeros, each of the rows of a group.
+    sums, other_views = np.zeros((view_limit + 3) * size, np.float32), np.empty(size, np.float32)
+    total_at, others_at, zeros_at = view_limit * size, (view_limit + 1) * size, (view_limit + 2) * size
+    minuends, subtrahends = np.empty(GROUP, np.int64), np.empty(GROUP, np.int64)
+    view_shares = np.empty(view_limit * GROUP)
     heavy, square = np.empty(GROUP, np.int64), np.empty(GROUP, np.float32)
     inverse, starts, order = (
         np.empty(levels * GROUP),
@@ -368,6 +367,7 @@ def add_products(rows, indptr, region, weight, factors, view, level, table, widt
             )
         for a in range(levels):
             number, v = np.int64(-1), -1
+            sums[total_at : total_at + size] = 0.0
             for piece in range(pieces):  # sums of each view
                 if pieces > 1:
                     count = unite_rows(rows, first, last, piece, MOST_COMPARED, *arrays)
@@ -396,21 +396,29 @@ def add_products(rows, indptr, region, weight, factors, view, level, table, widt
                             s, t = first_lanes(s, width - c), first_lanes(t, width - c)
                         at = number * size + c
                         if not new:
-                            p, q = plus(p, lanes_at(view_sums, at)), plus(q, lanes_at(view_sums, at + stride))
+                            p, q = plus(p, lanes_at(sums, at)), plus(q, lanes_at(sums, at + stride))
                             s, t = (
-                                plus(s, lanes_at(view_sums, at + 2 * stride)),
-                                plus(t, lanes_at(view_sums, at + 3 * stride)),
+                                plus(s, lanes_at(sums, at + 2 * stride)),
+                                plus(t, lanes_at(sums, at + 3 * stride)),
                             )
-                        store_lanes(view_sums, at, p)
-                        store_lanes(view_sums, at + stride, q)
-                        store_lanes(view_sums, at + 2 * stride, s)
-                        store_lanes(view_sums, at + 3 * stride, t)
+                        store_lanes(sums, at, p)
+                        store_lanes(sums, at + stride, q)
+                        store_lanes(sums, at + 2 * stride, s)
+                        store_lanes(sums, at + 3 * stride, t)
+                        if pieces == 1:  # the sums are complete, and in registers
+                            store_lanes(sums, total_at + c, plus(lanes_at(sums, total_at + c), p))
+                            at = total_at + stride + c
+                            store_lanes(sums, at, plus(lanes_at(sums, at), q))
+                            at += stride
+                            store_lanes(sums, at, plus(lanes_at(sums, at), s))
+                            at += stride
+                            store_lanes(sums, at, plus(lanes_at(sums, at), t))
                     begin = end
-            for c in range(0, size, LANES):
+            for c in range(0, size if pieces > 1 else 0, LANES):
                 p = no_lanes()
                 for n in range(number + 1):
-                    p = plus(p, lanes_at(view_sums, n * size + c))
-                store_lanes(total, c, p)
+                    p = plus(p, lanes_at(sums, n * size + c))
+                store_lanes(sums, total_at + c, p)
             for j in range(GROUP):
                 heavy[j] = -1
                 for n in range(number + 1):
@@ -421,8 +429,8 @@ def add_products(rows, indptr, region, weight, factors, view, level, table, widt
                         p = no_lanes()
                         for n in range(number + 1):
                             if n != heavy[j]:
-                                p = plus(p, lanes_at(view_sums, n * size + c))
-                        store_lanes(other_sums, c, p)
+                                p = plus(p, lanes_at(sums, n * size + c))
+                        store_lanes(sums, others_at + c, p)
             number, v = np.int64(-1), -1
             for piece in range(pieces):  # each region against the other views
                 if pieces > 1:
@@ -430,25 +438,37 @@ def add_products(rows, indptr, region, weight, factors, view, level, table, widt
                     order_by_level(regions, count, level, levels, starts, order)
                 for i in range(starts[a], starts[a + 1]):
                     n = order[i]
+                    p = q = s = t = no_lanes()
                     if view[regions[n]] != v:
                         v, number = view[regions[n]], number + 1
                         for j in range(GROUP):
-                            p = no_lanes()
-                            for c in range(j * stride, (j + 1) * stride, LANES):
-                                if number == heavy[j]:
-                                    q = lanes_at(other_sums, c)
-                                else:
-                                    q = minus(lanes_at(total, c), lanes_at(view_sums, number * size + c))
-                                store_lanes(other_views, c, q)
-                                p = plus_product(p, q, q)
-                            square[j] = sum_of_lanes(p)
-                    p = q = s = t = no_lanes()
-                    for c in range(0, width, LANES):
-                        vector = lanes_at(table, np.int64(regions[n]) * width + c)
-                        p = plus_product(p, vector, lanes_at(other_views, c))
-                        q = plus_product(q, vector, lanes_at(other_views, stride + c))
-                        s = plus_product(s, vector, lanes_at(other_views, 2 * stride + c))
-                        t = plus_product(t, vector, lanes_at(other_views, 3 * stride + c))
+                            is_heavy = heavy[j] == number
+                            minuends[j] = (others_at if is_heavy else total_at) + j * stride
+                            subtrahends[j] = (zeros_at if is_heavy else number * size) + j * stride
+                        b = d = e = f = no_lanes()
+                        for c in range(0, width, LANES):
+                            vector = lanes_at(table, np.int64(regions[n]) * width + c)
+                            others = minus(lanes_at(sums, minuends[0] + c), lanes_at(sums, subtrahends[0] + c))
+                            p, b = plus_product(p, vector, others), plus_product(b, others, others)
+                            store_lanes(other_views, c, others)
+                            others = minus(lanes_at(sums, minuends[1] + c), lanes_at(sums, subtrahends[1] + c))
+                            q, d = plus_product(q, vector, others), plus_product(d, others, others)
+                            store_lanes(other_views, stride + c, others)
+                            others = minus(lanes_at(sums, minuends[2] + c), lanes_at(sums, subtrahends[2] + c))
+                            s, e = plus_product(s, vector, others), plus_product(e, others, others)
+                            store_lanes(other_views, 2 * stride + c, others)
+                            others = minus(lanes_at(sums, minuends[3] + c), lanes_at(sums, subtrahends[3] + c))
+                            t, f = plus_product(t, vector, others), plus_product(f, others, others)
+                            store_lanes(other_views, 3 * stride + c, others)
+                        square[0], square[1] = sum_of_lanes(b), sum_of_lanes(d)
+                        square[2], square[3] = sum_of_lanes(e), sum_of_lanes(f)
+                    else:
+                        for c in range(0, width, LANES):
+                            vector = lanes_at(table, np.int64(regions[n]) * width + c)
+                            p = plus_product(p, vector, lanes_at(other_views, c))
+                            q = plus_product(q, vector, lanes_at(other_views, stride + c))
+                            s = plus_product(s, vector, lanes_at(other_views, 2 * stride + c))
+                            t = plus_product(t, vector, lanes_at(other_views, 3 * stride + c))
                     at = GROUP * n
                     if entries[at] >= 0:
                         products[entries[at]] += sum_of_lanes(p)

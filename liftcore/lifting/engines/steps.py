@@ -173,7 +173,7 @@ def relate(job: Job, piece: int, threads: int | None) -> Piece:
     """Write the tuples of the splats of some views, and the count of splats in each of their regions."""
     block, groups = _view_block(job, piece), groups_of(job)
     own_region = memberships(block.W, groups, threads).own_region
-    tuples = splat_tuples(block.W, own_region, groups, np.arange(block.splats.size), threads)
+    tuples = splat_tuples(block.W, own_region, groups, np.arange(block.splats.size))
     sizes = np.bincount(block.W.region.numpy()[own_region] - block.base, minlength=int(block.W.offsets[-1]))
     arrays = {"splats": block.splats, "sizes": sizes}
     arrays |= {name: getattr(tuples, name) for name in ("starts", "tuples", "parents", "members")}

@@ -143,7 +143,7 @@ def view_blocks(views: list[RegionWeights], groups: RegionGroups, size: int) -> 
         indptr = torch.cat([view_weights.indptr[:1], view_weights.indptr[1:][torch.from_numpy(splats)]])
         W = replace(view_weights, indptr=indptr, region=view_weights.region + base)
         own_region = memberships(W, groups, 1).own_region
-        tuples = splat_tuples(W, own_region, groups, np.arange(splats.size), 1)
+        tuples = splat_tuples(W, own_region, groups, np.arange(splats.size))
         blocks.append(ViewBlock(base, splats, W, own_region, tuples))
     return blocks
 
