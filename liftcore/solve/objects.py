@@ -34,6 +34,7 @@ from liftcore.runtime.jit import kernel
 from liftcore.solve.codebook import Codebook
 from liftcore.solve.consensus import SplatTuples
 from liftcore.solve.membership import Memberships, RegionGroups, memberships
+from liftcore.solve.membership_on_card import MembershipsOnCard
 from liftcore.solve.region_tree import NO_NODE, SPLIT, UNSEEN, RegionTree, node_groups, region_tree
 from liftcore.solve.sums import PieceSums, in_order, piece_sums, pieces, sum_pieces
 from liftcore.values.region_weights import RegionWeights, row_blocks, run_each
@@ -93,33 +94,69 @@ def region_objects(
     total_weight: np.ndarray,
     threads: int | None = None,
     *,
-    members: Memberships | None = None,
+    members: Memberships | MembershipsOnCard | None = None,
 ) -> RegionObjects:
     """Return the objects and parts of a scene whose W is in one piece.
 
     Args:
-        W: of all views, by rows of codebooks, on the CPU.
+        W: of all views, by rows of codebooks, on the CPU, or on the device of its memberships.
         levels: [M] i8, the level of each region in its view; -1 for cells of grids, which are ignored.
         total_weight: [P], sums of unscaled weights; objects are numbered by it.
         threads: None uses the cores that this process may use. The result is bitwise identical for any number.
-        members: of W, if computed before.
+        members: of W, if computed before; those on a GPU have all of W read there
+            (`liftcore.solve.objects_on_card`).
     """
     groups = RegionGroups.of(W.offsets.numpy(), levels)
-    members = members or memberships(W, groups, threads)
-    sizes = np.zeros(levels.size, np.int64)
-    count_members(W.region.numpy(), members.own_region, sizes)
-    nodes, other_masks = choose_nodes(groups, sizes)
-    table = node_splats(W, members, nodes, threads)
-    tree = region_tree(nodes, groups, node_containers(table, nodes, groups, threads), threads)
+    if isinstance(members, MembershipsOnCard):
+        from liftcore.solve.objects_on_card import TreeInputsOnCard
+
+        inputs: TreeInputs | TreeInputsOnCard = TreeInputsOnCard(W, groups, members)
+    else:
+        inputs = TreeInputs(W, groups, members or memberships(W, groups, threads), threads)
+    nodes, other_masks = choose_nodes(groups, inputs.region_sizes())
+    tree = region_tree(nodes, groups, inputs.containers(nodes), threads)
     number = tree.parents.size
-    labels = node_labels(W, groups, tree, threads)
+    labels = inputs.labels(tree)
     if number and other_masks.size:
-        tree = add_regions(tree, other_masks, node_shares(W, labels, number, other_masks, threads))
-        labels = node_labels(W, groups, tree, threads)
-    view_weights = sum_pieces(view_shares(W, groups, labels, number, threads), (1, number * groups.views))
+        tree = add_regions(tree, other_masks, inputs.node_shares(labels, number, other_masks))
+        labels = inputs.labels(tree)
     return number_objects(
-        labels, tree, node_numbering(labels, total_weight, tree), view_weights.reshape(number, groups.views)
+        labels, tree, node_numbering(labels, total_weight, tree), inputs.view_weights(labels, number)
     )
+
+
+@dataclass(frozen=True)
+class TreeInputs:
+    """The inputs of the tree and of its numbering that are read from a W on the CPU."""
+
+    W: RegionWeights  # of all views and splats
+    groups: RegionGroups
+    members: Memberships
+    threads: int | None
+
+    def region_sizes(self) -> np.ndarray:
+        """Return the number of splats of each region, [M] i64."""
+        sizes = np.zeros(self.groups.view.size, np.int64)
+        count_members(self.W.region.numpy(), self.members.own_region, sizes)
+        return sizes
+
+    def containers(self, nodes: np.ndarray) -> np.ndarray:
+        """See `node_containers`."""
+        table = node_splats(self.W, self.members, nodes, self.threads)
+        return node_containers(table, nodes, self.groups, self.threads)
+
+    def labels(self, tree: RegionTree) -> np.ndarray:
+        """See `node_labels`."""
+        return node_labels(self.W, self.groups, tree, self.threads)
+
+    def node_shares(self, labels: np.ndarray, number: int, regions: np.ndarray) -> Iterator[PieceSums]:
+        """See `node_shares`."""
+        return node_shares(self.W, labels, number, regions, self.threads)
+
+    def view_weights(self, labels: np.ndarray, number: int) -> np.ndarray:
+        """Return the weight of each label in each view, [number, V] f64."""
+        shares = view_shares(self.W, self.groups, labels, number, self.threads)
+        return sum_pieces(shares, (1, number * self.groups.views)).reshape(number, self.groups.views)
 
 
 def choose_nodes(groups: RegionGroups, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -247,12 +284,7 @@ def node_labels(W: RegionWeights, groups: RegionGroups, tree: RegionTree, thread
     """
     labels = np.full(W.indptr.shape[0] - 1, NO_NODE, np.int32)
     indptr, region, weight = (part.numpy() for part in (W.indptr, W.region, W.weight))
-    shows = np.zeros((tree.parents.size, groups.views * groups.levels), np.bool_)
-    place, node = groups.group[tree.region >= 0], tree.region[tree.region >= 0]
-    while node.size:
-        shows[node, place] = True
-        node = tree.parents[node]
-        place, node = place[node >= 0], node[node >= 0]
+    shows = nodes_by_level(tree, groups)
     run_each(
         lambda a, b: assign_splats(
             a, b, indptr, region, weight, groups.group, tree.region, tree.parents, shows, labels
@@ -261,6 +293,17 @@ def node_labels(W: RegionWeights, groups: RegionGroups, tree: RegionTree, thread
         threads,
     )
     return labels
+
+
+def nodes_by_level(tree: RegionTree, groups: RegionGroups) -> np.ndarray:
+    """Return the mask [N, views * levels] bool of the levels that show each node or a part of it."""
+    shows = np.zeros((tree.parents.size, groups.views * groups.levels), np.bool_)
+    place, node = groups.group[tree.region >= 0], tree.region[tree.region >= 0]
+    while node.size:
+        shows[node, place] = True
+        node = tree.parents[node]
+        place, node = place[node >= 0], node[node >= 0]
+    return shows
 
 
 def node_shares(

@@ -20,7 +20,8 @@ from liftcore.solve.directions import RegionDirections
 from liftcore.solve.membership_on_card import BLOCK_ENTRIES, BLOCK_ROWS, Segments
 from liftcore.solve.reweight import NO_CONSENSUS, SceneConsistency, level_numbers
 from liftcore.solve.sums import PieceSums
-from liftcore.values.region_weights import RegionWeights, from_zero, segment_sums
+from liftcore.solve.sums_on_card import region_totals_on_card, sums_by_number
+from liftcore.values.region_weights import RegionWeights, segment_sums
 
 TABLE_BYTES = 1 << 28  # of a table of entries by channels
 
@@ -64,11 +65,7 @@ class BlockReweighterOnCard:
 
     def totals(self) -> Tensor:
         """Return the weight of each region, [M] f64 on the CPU."""
-        totals = torch.zeros(len(self.view), dtype=torch.float64, device=self.place)
-        for first, last in self.blocks:
-            entries = slice(*self.W.indptr[[first, last]].tolist())
-            totals += sums_by_region(self.W.region[entries], self.W.weight[entries].double()[None], len(self.view))[0]
-        return totals.cpu()
+        return region_totals_on_card(self.W)
 
     def cosines(
         self,
@@ -96,7 +93,7 @@ class BlockReweighterOnCard:
             if by_region:
                 scale = factors[block.entries].double() if factors is not None else 1.0
                 other_weight = block.weight * scale * (1.0 - block.view_share)
-                sums[:, :count] += sums_by_region(
+                sums[:, :count] += sums_by_number(
                     block.region, torch.stack([other_weight * wide, other_weight]), count
                 )
         add(PieceSums.of(sums.cpu().numpy()))
@@ -176,10 +173,3 @@ class BlockReweighterOnCard:
                 place = block.entries[begin + few.start : begin + few.stop]
                 products[place] += (table[region[few]] * other_views[segment[few]]).sum(dim=1)
                 squares[place] += lengths[segment[few]]
-
-
-def sums_by_region(region: Tensor, values: Tensor, count: int) -> Tensor:
-    """Return sums [k, M] f64 of values [k, n] f64 of entries by their regions [n] i32, in the entries' order."""
-    starts = from_zero(torch.bincount(region, minlength=count))
-    order = torch.argsort(region, stable=True)
-    return torch.stack([segment_sums(part[order], starts) for part in values])
