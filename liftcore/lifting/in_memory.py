@@ -40,6 +40,7 @@ from liftcore.solve.reweight import Reweighting, reweighting_factors, scale_weig
 from liftcore.solve.smooth import smooth
 from liftcore.solve.smooth_by_halves import choose_smoothness
 from liftcore.solve.sums import sum_pieces
+from liftcore.solve.sums_on_card import region_totals_on_card
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import LiftSettings
@@ -153,13 +154,20 @@ class InMemory(LiftSteps[SceneWeights]):
         return W, WeightStatistics(plans[-1], geometry.levels, W.weights.region.shape[0], geometry.blind)
 
     def find_objects(self, W: SceneWeights) -> RegionObjects:
-        total_weight = W.geometry.total_weight().numpy()
-        return region_objects(W.on_processor, W.geometry.levels, total_weight, self.threads, members=W.members)
+        levels, total_weight = W.geometry.levels, W.geometry.total_weight().numpy()
+        return W.where_it_fits(
+            lambda weights, on_card: region_objects(
+                weights, levels, total_weight, self.threads, members=W.members_on_card if on_card else W.members
+            )
+        )
 
     def node_vectors(self, W: SceneWeights, objects: RegionObjects) -> NodeVectors:
-        codebook = W.geometry.codebook
-        totals = sum_pieces(region_totals(W.on_processor, self.threads), (1, codebook.regions))[0]
-        return NodeVectors.of(codebook, totals, objects)
+        def sum_by_region(weights: RegionWeights, on_card: bool) -> np.ndarray:
+            if on_card:
+                return region_totals_on_card(weights).numpy()
+            return sum_pieces(region_totals(weights, self.threads), (1, int(weights.offsets[-1])))[0]
+
+        return NodeVectors.of(W.geometry.codebook, W.where_it_fits(sum_by_region), objects)
 
     def compare_masks(self, W: SceneWeights) -> SceneWeights:
         means, levels = self.splats.means, W.geometry.levels

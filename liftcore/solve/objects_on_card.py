@@ -3,16 +3,15 @@
 W stays there: the tree and its numbering receive sizes of regions, containers of nodes, labels of splats and sums.
 
 **Containers.** Weights of splats, ``sqrt(t_j)``, are rounded to integers; the unit is 2^-50 of the largest or less.
-Sums of integers do not depend on their order. Of equally large overlaps, the node with the smallest number contains,
-as on the CPU.
+Sums of integers do not depend on their order.
 
 **Paths.** A block's entries are sorted by splat and by node, so that a node and its parts are neighbours at each
 depth of the tree, and all splats of a block descend together. Of equally heavy parts, the one first among a splat's
 entries is chosen, as on the CPU. Sums are float64 and in a fixed order: objects are bitwise reproducible on the same
 GPU, and differ from those of the CPU only where a share meets its bound within rounding.
 
-**Memory** beside W and its memberships: 2 bytes for each entry whose splat belongs to a node, 8 for each splat, and
-the temporary tensors of BLOCK_ENTRIES entries, about 0.5 GB.
+**Memory** beside W and its memberships: 2 bytes for each entry whose splat belongs to a node, 24 for each splat, and
+about 0.5 GB for BLOCK_ENTRIES entries or the chosen splats of MOST_REGIONS nodes at a time.
 """
 
 from __future__ import annotations
@@ -235,17 +234,15 @@ def _containing_nodes(overlaps: Tensor, first: int, group: Tensor, groups: int) 
     Args:
         overlaps: [n, N] i64, the weight of node ``first + i``'s splats in each node. group: [N] i64.
     """
-    rows, number = overlaps.shape
-    group = group.expand(rows, -1)
-    sums = overlaps.new_zeros(rows, groups)
-    weights = sums.scatter_add(1, group, overlaps)
-    best = sums.scatter_reduce(1, group, overlaps, "amax")
-    node = torch.arange(number, device=overlaps.device).expand(rows, -1)
-    nodes = torch.where(overlaps == best.gather(1, group), node, number)
-    best_nodes = sums.fill_(number).scatter_reduce(1, group, nodes, "amin")
-    sizes = overlaps.gather(1, torch.arange(first, first + rows, device=overlaps.device)[:, None]).double()
-    contained = torch.where(best.double() >= CONTAINS * weights.double(), best_nodes, SPLIT)
-    return torch.where((weights > 0) & (weights.double() >= OBSERVES * sizes), contained, UNSEEN).int().cpu().numpy()
+    group = group.expand(len(overlaps), -1)
+    weights = overlaps.new_zeros(len(overlaps), groups).scatter_add_(1, group, overlaps).double()
+    sizes = overlaps.diagonal(first).double()[:, None]  # all of a node's own splats belong to it
+    observed = (weights > 0) & (weights >= OBSERVES * sizes)
+    contains = observed.gather(1, group) & (overlaps.double() >= CONTAINS * weights.gather(1, group))
+    row, node = torch.nonzero(contains).T  # at most one in a group: a splat belongs to one of its regions
+    containers = torch.where(observed, SPLIT, UNSEEN)
+    containers[row, group[0][node]] = node
+    return containers.int().cpu().numpy()
 
 
 def _heaviest_parts(row: Tensor, part: Tensor, weight: Tensor, index: Tensor, rows: int) -> tuple[Tensor, Tensor]:

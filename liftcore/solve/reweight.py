@@ -149,9 +149,10 @@ def reweighting_factors(
     """
     if on_card:
         from liftcore.solve.reweight_on_card import BlockReweighterOnCard
+        from liftcore.solve.sums_on_card import region_totals_on_card
 
         block: BlockReweighter | BlockReweighterOnCard = BlockReweighterOnCard(W, levels)
-        directions = RegionDirections(codebook, block.totals(), W.region.shape[0], principal)
+        directions = RegionDirections(codebook, region_totals_on_card(W), W.region.shape[0], principal)
     else:
         block = BlockReweighter(W, means, threads, levels)
         directions = RegionDirections.of_weights(W, codebook, principal, threads)

@@ -20,7 +20,7 @@ from liftcore.solve.directions import RegionDirections
 from liftcore.solve.membership_on_card import BLOCK_ENTRIES, BLOCK_ROWS, Segments
 from liftcore.solve.reweight import NO_CONSENSUS, SceneConsistency, level_numbers
 from liftcore.solve.sums import PieceSums
-from liftcore.solve.sums_on_card import region_totals_on_card, sums_by_number
+from liftcore.solve.sums_on_card import sums_by_number
 from liftcore.values.region_weights import RegionWeights, segment_sums
 
 TABLE_BYTES = 1 << 28  # of a table of entries by channels
@@ -62,10 +62,6 @@ class BlockReweighterOnCard:
         self.region_level = torch.from_numpy(self.level).long().to(self.place)
         self.view = torch.repeat_interleave(W.offsets.diff()).to(self.place)
         self.blocks = W.blocks(BLOCK_ROWS, BLOCK_ENTRIES)
-
-    def totals(self) -> Tensor:
-        """Return the weight of each region, [M] f64 on the CPU."""
-        return region_totals_on_card(self.W)
 
     def cosines(
         self,

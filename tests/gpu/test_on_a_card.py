@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 import liftcore as lc
 from liftcore.evaluate.tradeoff import RunSpec, SceneFiles, measure_run
 from liftcore.lifting import in_memory
+from liftcore.lifting.in_memory import InMemory, SceneWeights
 from liftcore.solve.consensus import mask_consensus
+from liftcore.solve.directions import region_totals
+from liftcore.solve.membership import RegionGroups
+from liftcore.solve.membership_on_card import memberships_on_card
+from liftcore.solve.objects import region_objects
+from liftcore.solve.objects_on_card import TreeInputsOnCard
+from liftcore.solve.sums import sum_pieces
+from liftcore.solve.sums_on_card import region_totals_on_card
 from liftcore.values import region_weights as weights
 from liftcore.values.settings import Preset
 from tests import paper_card
 from tests.api.tiny_scene import WORDS, make_scene
 from tests.backends import needs_triton
+from tests.unit.solve.test_objects_on_card import nested_scene
 
 pytestmark = needs_triton
 FEW: dict[str, Any] = {"diagnostic_rays": 6}  # as the interpreter traces one in a thirtieth of a second
@@ -67,7 +78,54 @@ def test_a_lift_on_a_card_is_the_processors(paths: list[Path], grids: bool, opti
     for name in ("features", "total_weight", "view_consistency"):
         left, right = getattr(on_cpu, name).float(), getattr(on_gpu, name).float()
         assert torch.allclose(left, right, rtol=2e-3, atol=2e-3), name
+    for name in ("object", "node", "node_parents"):
+        left, right = getattr(on_cpu, name), getattr(on_gpu, name)
+        assert (left is None) == (right is None) and (left is None or torch.equal(left, right)), name
     assert torch.equal(on_cpu.has_feature, on_gpu.has_feature)
+
+
+def test_objects_leave_the_weights_on_the_card(paths: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    copies, steps = list[bool](), InMemory
+
+    def watched(name: str) -> None:
+        step = getattr(steps, name)
+
+        def run_step(self: InMemory, W: SceneWeights, *rest: Any) -> Any:
+            output = step(self, W, *rest)
+            copies.append("on_processor" in vars(W))
+            return output
+
+        monkeypatch.setattr(steps, name, run_step)
+
+    watched("find_objects")
+    watched("node_vectors")
+    lifted(paths, objects=True, device="cuda")
+    assert copies == [False, False]
+
+
+def test_objects_with_parts_are_the_processors() -> None:
+    W, levels = nested_scene(0, 270, equal_weights=False)
+    on_card = replace(W, **{name: part.to("cuda") for name, part in W.tensors().items() if name != "offsets"})
+    groups, total_weight = RegionGroups.of(W.offsets.numpy(), levels), np.ones(270)
+    expected = region_objects(W, levels, total_weight)
+    got = region_objects(on_card, levels, total_weight, members=memberships_on_card(on_card, groups))
+    assert (expected.tree.parents >= 0).any()
+    for name in ("labels", "node", "node_views"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(expected, name))
+    totals = torch.from_numpy(sum_pieces(region_totals(W), (1, levels.size))[0])
+    assert torch.allclose(region_totals_on_card(on_card), totals, rtol=1e-12)
+
+
+def test_objects_that_no_card_has_memory_for_are_found_here(paths: list[Path], monkeypatch) -> None:
+    expected = lifted(paths, objects=True, device="cpu")
+
+    def crowded(*_: Any) -> Any:
+        raise torch.OutOfMemoryError
+
+    monkeypatch.setattr(TreeInputsOnCard, "labels", crowded)
+    result = lifted(paths, objects=True, device="cuda").cpu()
+    assert expected.object is not None and result.object is not None
+    assert torch.equal(result.object, expected.object) and result.object.max() == 2
 
 
 def test_what_follows_a_lift_takes_it_from_the_card(paths: list[Path], tmp_path: Path) -> None:
