@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from math import frexp
 
 import numpy as np
 import torch
@@ -26,6 +25,7 @@ from liftcore.solve.closed_form import morton_codes
 from liftcore.solve.consensus import MOST_SPLATS, MOST_WITNESSES, OBSERVES, ONE_VIEW, PRIOR, STEPS, mean_share
 from liftcore.solve.membership import RegionGroups
 from liftcore.solve.membership_on_card import MembershipsOnCard, memberships_on_card
+from liftcore.solve.sums_on_card import integer_weights
 from liftcore.values.region_weights import RegionWeights, from_zero, row_blocks, row_entries
 
 BLOCK_ENTRIES = 1 << 24  # of some regions; each block reads all regions of W
@@ -109,7 +109,6 @@ class _Splats:
     @classmethod
     def of(cls, W: RegionWeights, own: MembershipsOnCard, masks: _Masks) -> _Splats:
         """Build from the memberships of W."""
-        unit = 2.0 ** (62 - MOST_SPLATS.bit_length() - frexp(float(own.totals.max()))[1]) if len(own.totals) else 1.0
         blocks, counts = W.blocks(CHUNK, CHUNK >> 1), torch.zeros_like(W.indptr)
         views, members = counts[1:].clone(), []
         for first, last in blocks:
@@ -128,7 +127,7 @@ class _Splats:
             row, member, slot = row[chosen], member[chosen], (view // stride)[chosen]
             witnesses[row + first, slot, masks.group[member] % masks.levels] = member
         members = torch.cat(members) if members else W.region[:0]
-        return cls(counts.cumsum(0), members, witnesses.flatten(1), (own.totals * unit).round().long())
+        return cls(counts.cumsum(0), members, witnesses.flatten(1), integer_weights(own.totals, MOST_SPLATS))
 
 
 def _members(

@@ -2,7 +2,7 @@
 
 W stays there: the tree and its numbering receive sizes of regions, containers of nodes, labels of splats and sums.
 
-**Containers.** Weights of splats, ``sqrt(t_j)``, are rounded to integers; the unit is 2^-50 of the largest or less.
+**Containers.** Weights of splats, ``sqrt(t_j)``, are rounded to integers; the unit is 2^-49 of the largest or less.
 Sums of integers do not depend on their order.
 
 **Paths.** A block's entries are sorted by splat and by node, so that a node and its parts are neighbours at each
@@ -16,7 +16,6 @@ about 0.5 GB for BLOCK_ENTRIES entries or the chosen splats of MOST_REGIONS node
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -30,10 +29,9 @@ from liftcore.solve.membership_on_card import BLOCK_ENTRIES, BLOCK_ROWS, Members
 from liftcore.solve.objects import CONTAINS, MOST_SPLATS, OBSERVES, node_numbers, nodes_by_level
 from liftcore.solve.region_tree import NO_NODE, SPLIT, UNSEEN, RegionTree, node_groups
 from liftcore.solve.sums import PieceSums
-from liftcore.solve.sums_on_card import run_starts, sums_by_number
+from liftcore.solve.sums_on_card import integer_weights, run_starts, sums_by_number
 from liftcore.values.region_weights import RegionWeights, from_zero, row_blocks, row_entries, segment_sums
 
-SUM_BITS = 62  # of the weight of a node's splats, in units
 TABLE_ENTRIES = 1 << 22  # of a table of nodes by nodes
 
 
@@ -100,7 +98,7 @@ class TreeInputsOnCard:
         if not number:
             return containers
         table, node_group = self._node_table(nodes), torch.from_numpy(group).long().to(device)
-        weight, lengths = _in_units(self.members.totals.sqrt()), table.starts.diff()
+        weight, lengths = integer_weights(self.members.totals.sqrt(), MOST_SPLATS), table.starts.diff()
         visits = from_zero(lengths[table.splats])[table.begins].diff()
         for first, last in row_blocks(visits.cpu().numpy(), max(TABLE_ENTRIES // number, 1), BLOCK_ENTRIES):
             begins = table.begins[first : last + 1]
@@ -220,12 +218,6 @@ class TreeInputsOnCard:
                 choice = torch.where(2.0 * chosen_weight < shown, NO_NODE, choice)
             labels = torch.where(choice >= 0, choice, labels)
         return labels
-
-
-def _in_units(weight: Tensor) -> Tensor:
-    """Round weights [P] f64 to multiples [P] i64 of a unit, so that MOST_SPLATS of the largest have SUM_BITS."""
-    largest = math.frexp(float(weight.max()))[1] + (MOST_SPLATS - 1).bit_length()
-    return torch.round(weight * 2.0 ** (SUM_BITS - largest)).long()
 
 
 def _containing_nodes(overlaps: Tensor, first: int, group: Tensor, groups: int) -> np.ndarray:

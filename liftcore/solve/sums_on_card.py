@@ -1,13 +1,27 @@
 """Sums over entries of a W in a GPU's memory, each in the entries' order, for all regions or all pairs of numbers.
 
-Entries are sorted by number, and segments summed: atomic additions of floats would have no order.
+Entries are sorted by number, and segments summed: atomic additions of floats would have no order. Integers may be
+added in any.
 """
+
+from math import frexp
 
 import torch
 from torch import Tensor
 
 from liftcore.solve.membership_on_card import BLOCK_ENTRIES, BLOCK_ROWS
 from liftcore.values.region_weights import RegionWeights, from_zero, segment_sums
+
+SUM_BITS = 62  # of the largest sum of integer weights
+
+
+def integer_weights(weights: Tensor, count: int) -> Tensor:
+    """Round weights [n] f64, none negative, to multiples [n] i64 of a unit: ``count`` of the largest do not overflow.
+
+    The unit is a power of two, so that sums of such multiples compare as those of the weights.
+    """
+    largest = frexp(float(weights.max()) if len(weights) else 0.0)[1] + count.bit_length()
+    return (weights * 2.0 ** (SUM_BITS - largest)).round().long()
 
 
 def region_totals_on_card(W: RegionWeights) -> Tensor:

@@ -13,7 +13,7 @@ import torch
 import liftcore as lc
 from liftcore.evaluate.tradeoff import RunSpec, SceneFiles, measure_run
 from liftcore.lifting import in_memory
-from liftcore.lifting.in_memory import InMemory, SceneWeights
+from liftcore.lifting.in_memory import SceneWeights
 from liftcore.solve.consensus import mask_consensus
 from liftcore.solve.directions import region_totals
 from liftcore.solve.membership import RegionGroups
@@ -23,6 +23,7 @@ from liftcore.solve.objects_on_card import TreeInputsOnCard
 from liftcore.solve.sums import sum_pieces
 from liftcore.solve.sums_on_card import region_totals_on_card
 from liftcore.values import region_weights as weights
+from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import Preset
 from tests import paper_card
 from tests.api.tiny_scene import WORDS, make_scene
@@ -84,23 +85,12 @@ def test_a_lift_on_a_card_is_the_processors(paths: list[Path], grids: bool, opti
     assert torch.equal(on_cpu.has_feature, on_gpu.has_feature)
 
 
-def test_objects_leave_the_weights_on_the_card(paths: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    copies, steps = list[bool](), InMemory
-
-    def watched(name: str) -> None:
-        step = getattr(steps, name)
-
-        def run_step(self: InMemory, W: SceneWeights, *rest: Any) -> Any:
-            output = step(self, W, *rest)
-            copies.append("on_processor" in vars(W))
-            return output
-
-        monkeypatch.setattr(steps, name, run_step)
-
-    watched("find_objects")
-    watched("node_vectors")
-    lifted(paths, objects=True, device="cuda")
-    assert copies == [False, False]
+@pytest.mark.parametrize("objects", ["auto", True])
+def test_a_lift_by_default_leaves_the_weights_on_the_card(paths: list[Path], monkeypatch, objects: Any) -> None:
+    copies = list[RegionWeights]()
+    monkeypatch.setattr(SceneWeights, "on_processor", property(lambda W: copies.append(W.weights) or W.weights.cpu()))
+    result = lifted(paths, objects=objects, device="cuda")
+    assert result.metadata.timings["objects"] > 0 and not copies
 
 
 def test_objects_with_parts_are_the_processors() -> None:
