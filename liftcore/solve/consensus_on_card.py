@@ -103,7 +103,8 @@ class _Splats:
 
     starts: Tensor  # [P + 1] i64, of members
     members: Tensor  # i32
-    witnesses: Tensor  # [P, slots * levels] i32, M for none
+    witnesses: Tensor  # [P, most slots, levels] i32, M for none
+    slots: Tensor  # [P] i64, chosen views of each splat
     weights: Tensor  # [P] i64, t_j in units of which MOST_SPLATS times the largest do not overflow
 
     @classmethod
@@ -117,8 +118,8 @@ class _Splats:
             counts[first + 1 : last + 1] = torch.bincount(row, minlength=last - first)
             views[first:last].scatter_reduce_(0, row, view + 1, "amax")
         strides = ((views + MOST_WITNESSES - 1) // MOST_WITNESSES).clamp_min(1)
-        slots = int(((views + strides - 1) // strides).max()) if len(views) else 0
-        shape = len(views), max(slots, 1), masks.levels
+        slots = (views + strides - 1) // strides
+        shape = len(views), int(slots.max()) if len(views) else 0, masks.levels
         witnesses = torch.full(shape, masks.count, dtype=torch.int32, device=W.device)
         for first, last in blocks:
             row, member, view = _members(W, own, masks, first, last)
@@ -127,7 +128,7 @@ class _Splats:
             row, member, slot = row[chosen], member[chosen], (view // stride)[chosen]
             witnesses[row + first, slot, masks.group[member] % masks.levels] = member
         members = torch.cat(members) if members else W.region[:0]
-        return cls(counts.cumsum(0), members, witnesses.flatten(1), integer_weights(own.totals, MOST_SPLATS))
+        return cls(counts.cumsum(0), members, witnesses, slots, integer_weights(own.totals, MOST_SPLATS))
 
 
 def _members(
@@ -188,13 +189,17 @@ def _compare(splats: _Splats, masks: _Masks, first: int, sizes: np.ndarray, row:
     steps = ((lengths + MOST_SPLATS - 1) // MOST_SPLATS).clamp_min(1)
     sampled = torch.nonzero(is_own & (place % steps[mask] == 0))[:, 0]
     table = _shares(splats, masks, first, len(sizes), row[sampled], mask[sampled])
-    width, packed = splats.witnesses.shape[1], torch.empty_like(row)
-    for begin in range(0, len(row), max(CHUNK // width, 1)):
-        part = slice(begin, begin + max(CHUNK // width, 1))
-        cells = splats.witnesses.index_select(0, row[part])
-        cells += (mask[part] * table.shape[1]).int()[:, None]
-        answers = table.view(-1).index_select(0, cells.view(-1))
-        packed[part] = answers.view(len(cells), -1, masks.levels).amax(dim=2).sum(dim=1)
+    packed, slots = torch.zeros_like(row), splats.slots[row]
+    order = torch.argsort(slots, descending=True)  # so that a chunk has splats of about as many slots
+    counts = torch.bincount(slots).flip(0).cumsum(0).cpu().numpy()  # of entries, from the most slots down
+    begin, width = 0, len(counts) - 1
+    while begin < len(row) and width > 0:
+        part = order[begin : begin + max(CHUNK // (width * masks.levels), 1)]
+        cells = splats.witnesses[:, :width].index_select(0, row[part])
+        cells += (mask[part] * table.shape[1]).int()[:, None, None]
+        packed[part] = table.view(-1).index_select(0, cells.view(-1)).view_as(cells).amax(dim=2).sum(dim=1)
+        begin += len(part)
+        width = len(counts) - 1 - int(np.searchsorted(counts, begin, side="right"))
     return packed
 
 
@@ -210,9 +215,9 @@ def _shares(splats: _Splats, masks: _Masks, first: int, count: int, row: Tensor,
     cuts = torch.searchsorted(ends, CHUNK * torch.arange(1, chunks + 1, device=row.device)).tolist()
     for begin, end in pairwise([0, *cuts, len(row)]):
         starts, places = row_entries(splats.starts, row[begin:end])
-        pair = torch.repeat_interleave(starts.diff(), output_size=len(places)) + begin
-        cells = mask[pair] * table.shape[1] + splats.members[places]
-        table.view(-1).scatter_add_(0, cells, splats.weights[row[pair]])
+        pair = torch.repeat_interleave(starts.diff(), output_size=len(places))
+        cells, weights = table.shape[1] * mask[begin:end], splats.weights[row[begin:end]]
+        table.view(-1).scatter_add_(0, cells[pair] + splats.members[places], weights[pair])
     R, own = table[:, :-1], torch.arange(first, first + count, device=row.device)
     vis = R.new_zeros(count, len(masks.group_view)).index_add_(1, masks.group, R)
     observed = vis >= OBSERVES * R.gather(1, own[:, None]).double()
