@@ -5,8 +5,8 @@ table [b, M] of integers, in units that cannot overflow: integer sums are the sa
 is bitwise reproducible. Sampled splats add to it, and dividing by vis makes it the table of q.
 
 The processor computes the best level of a tuple once. Here each splat has a row of **witnesses**, the members of its
-evenly chosen views by slot and level, and every entry reads the q of all of them: a fixed number of reads, which
-needs neither tuples nor sorting. A missing member is the region after the last, whose q is that of no view.
+evenly chosen views by slot and level, and every entry reads the q of them all: this needs no tuples. Entries are
+read by their number of slots. A missing member is the region after the last, whose q is that of no view.
 
 Beside W, the device holds a result of 5 bytes per entry, 4 bytes per membership, 4 per witness of a splat (up to
 MOST_WITNESSES views by the number of levels), and less than 2 GiB of blocks.
