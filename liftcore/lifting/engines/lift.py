@@ -108,10 +108,13 @@ def plan_of_a_worker(plan: Plan) -> Plan:
     """Replace the memory of a plan by the estimate for one worker: bytes of each part at its peak."""
     splats = min(1.0, ROWS / plan.splats)
     splat_share = min(1.0, max(SELECTED, plan.splats_a_view) / plan.splats)
-    shares = {"splats": splat_share, "scene": splat_share, "weights": min(1.0, PIECE_VIEWS / len(plan.views))}
-    shares |= {"gathered": splats, "features": splats}
-    memory = {name: int(size * shares.get(name, 1.0)) for name, size in plan.memory.items()}
-    return replace(plan, memory=memory, weight_bytes=0)
+    shares = {"splats": splat_share, "scene": splat_share, "gathered": splats, "features": splats}
+    views = min(1.0, PIECE_VIEWS / len(plan.views))
+    phases = dict[str, dict[str, int]]()
+    for phase, parts in plan.memory_phases.items():
+        shares["weights"] = views if phase in ("geometry", "gather") else splats
+        phases[phase] = {name: int(size * shares.get(name, 1.0)) for name, size in parts.items()}
+    return replace(plan, memory_phases=phases, weight_bytes=0)
 
 
 @contextmanager
@@ -127,7 +130,7 @@ def _folder(folder: Path | None, *, permanent: bool) -> Iterator[Path]:
 
 def _lack_of_disk(folder: Path, plan: Plan) -> list[str]:
     """Return a warning if the disk is too small for W by views, W by splats and X, else none."""
-    size, free = 2 * plan.weight_bytes + plan.memory["features"], shutil.disk_usage(folder).free
+    size, free = 2 * plan.weight_bytes + plan.memory_phases["solve"]["features"], shutil.disk_usage(folder).free
     if free >= size:
         return []
     shortage = f"blocks of about {size / 2**30:.1f} GiB go to {folder}, and there is {free / 2**30:.1f} GiB of disk"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,6 +39,7 @@ from liftcore.scene.splats import Splats
 from liftcore.solve.codebook import LEAST_CHANNELS, TABLE_BYTES
 from liftcore.solve.consensus import BLOCK_ENTRIES
 from liftcore.solve.diagnostics import shape_warnings
+from liftcore.solve.objects import MOST_REGIONS
 from liftcore.solve.rays import sample_pixels
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.pack import Views
@@ -60,11 +61,12 @@ DENSE_BYTES = 27  # of an entry of a dense map: by tiles, and gathered by splat
 REWEIGHT_BYTES = 12  # of an entry: factors, and the products and squares behind them
 CONSENSUS_BYTES = 10  # of an entry: its share, the count of views, its membership; the tuple of its view
 BLOCK_BYTES = 9  # of an entry that lies by region
+OBJECT_BYTES = 12  # of an entry: the membership of its splat, the node, its place in the node's list
 CG_VECTORS, CG_CHANNELS = 14, 32  # [P, 32] f32 of conjugate gradients, with the images of a view
 CLUSTERING = 80_000_000  # of hdbscan and its dependencies
 TOUCHING_BYTES = 1_000  # of a splat, for the graph of splats that touch
 MEMBER_BYTES = 5  # of an entry: the membership of its splat in its region
-SMOOTHING_BYTES = 1_300  # of a splat: the graph while it is built, or with a block of channels
+SMOOTHING_BYTES = 2_100  # of a splat: the graph while it is built, or with a block of channels
 SPARE = 0.9  # of the free memory: 10 % are left to other processes
 DEVICE_SPARE = 0.8  # of a GPU's free memory, which is fragmented
 DEVICE_SPLAT_BYTES = 400  # of a splat on a GPU, with the smallest batches of tiles
@@ -116,7 +118,7 @@ class Plan(PlannedScene):
     levels: tuple[int, int] | None  # the single level of the setting, and the number of levels in maps; None: all
     channels: int  # F
     dtype: str  # of X, if it can represent the codebooks
-    memory: Mapping[str, int]  # bytes a part at the peak, about
+    memory_phases: Mapping[str, Mapping[str, int]]  # bytes a part in each phase, about; what a phase frees is gone
     weight_bytes: int  # of W of all views, about
     device: Device  # of rasterization and solve
     gpu_weight_bytes: int  # bytes of W that may stay on a GPU between the phases
@@ -130,6 +132,11 @@ class Plan(PlannedScene):
         memory = f"{self.memory_bytes / 2**30:.1f} GiB"
         warnings = f"{len(self.warnings) + len(self.input_warnings)} warnings"
         return one_line(self, f"{self.splats} of {self.kernel}", views, f"{self.channels} channels", memory, warnings)
+
+    @property
+    def memory(self) -> Mapping[str, int]:
+        """Bytes a part at the peak, about: in the phase that takes the most."""
+        return max(self.memory_phases.values(), key=lambda parts: sum(parts.values()))
 
     @property
     def memory_bytes(self) -> int:
@@ -240,7 +247,7 @@ def plan_lift(
     hit_share = _hit_share(raster, views.only(dense), settings, visible) if dense and raster is not None else 1.0
     entries = _entries(visible, cameras, features, names, settings, hit_share)
     weights = weight_bytes(visible, entries, settings)
-    parts = memory_parts(splats, visible, cameras, features, names, settings, entries)
+    phases = memory_phases(splats, visible, cameras, features, names, settings, entries)
     free, gpu_bytes = (None, None) if in_workers else (free_memory(), None if short else device.free_bytes())
     device_weights = 0 if gpu_bytes is None else min(weights, int(DEVICE_SPARE * gpu_bytes) // 4)
     in_files = 0 if in_workers else max(0, weights - MEMORY_LIMIT - device_weights)
@@ -257,13 +264,13 @@ def plan_lift(
         levels=_single_level(features, names, settings),
         channels=features.channels,
         dtype=settings.dtype,
-        memory=parts,
+        memory_phases=phases,
         weight_bytes=weights,
         device=device,
         gpu_weight_bytes=device_weights,
-        features_room=features_room(parts, free),
+        features_room=features_room(phases, free),
         seconds=seconds,
-        warnings=(*short, *check_memory(parts, free), *check_weights(in_files)),
+        warnings=(*short, *check_memory(phases, free), *check_weights(in_files)),
         input_warnings=(
             *scene_warnings(splats, views.cameras, cameras, settings),
             *shape_warnings(features, cameras),
@@ -385,7 +392,7 @@ def _hit_share(raster: Raster, views: LiftViews, settings: LiftSettings, visible
     return min(1.0, float(np.mean(counts)) / max(area, 1.0))
 
 
-def memory_parts(
+def memory_phases(
     splats: Splats,
     visible: Visibility,
     cameras: Sequence[Camera],
@@ -393,15 +400,16 @@ def memory_parts(
     names: Sequence[str],
     settings: LiftSettings,
     entries: np.ndarray,
-) -> dict[str, int]:
-    """Estimate the bytes of each part of a lift at its peak.
+) -> dict[str, dict[str, int]]:
+    """Estimate the bytes of each part of a lift in each of its phases.
 
     Args:
         entries: [V], of W of each view.
     """
     inputs = sum(t.nbytes for t in (splats.means, splats.quats, splats.log_scales, splats.opacity_logits))
     largest, channels = max(camera.width * camera.height for camera in cameras), features.channels
-    weights, of_all = weight_bytes(visible, entries, settings), float(entries.sum())
+    of_all, masks = float(entries.sum()), any(features.is_regions(name) for name in names)
+    in_memory = min(weight_bytes(visible, entries, settings), MEMORY_LIMIT)
     view = int(_splat_counts(visible).max(initial=0) * (RECORD_BYTES + TILE_BYTES * _tiles(visible))) + 16 * largest
     dense = max(
         (int(count) for count, name in zip(entries, names, strict=True) if _is_dense(features, name)), default=0
@@ -409,29 +417,38 @@ def memory_parts(
     books = [math.prod(_codebook(features, name)) for name in names]
     regions = sum(books) // max(channels, 1)
     size = 2 if settings.dtype == "float16" else 4
-    parts = {
+    always = {
         "libraries": LIBRARIES,
         "splats": inputs,
         "scene": splats.count * SCENE_BYTES,
-        "view": 2 * view + DENSE_BYTES * dense,  # two are in work, or one and what is made of it; of dense ones one
-        "weights": min(weights, MEMORY_LIMIT),  # a view at a time
-        "gathered": min(weights, MEMORY_LIMIT),  # of all views, a row a splat
         "codebooks": size * sum(books) + min(8 * sum(books), 2 * max(TABLE_BYTES, 4 * LEAST_CHANNELS * regions)),
-        "features": splats.count * channels * size,
     }
+    weighed = always | {"weights": in_memory}  # W by views, then of all views
+    solved = weighed | {"features": splats.count * channels * size}
+    phases = {
+        # Two views are in work, or one and what is made of it; of dense ones one.
+        "geometry": weighed | {"view": 2 * view + DENSE_BYTES * dense},
+        "gather": weighed | {"gathered": in_memory},
+        "solve": solved,
+    }
+    if settings.finds_objects(masks):
+        phases["objects"] = weighed | {"objects": int(OBJECT_BYTES * of_all) + 8 * min(MOST_REGIONS, regions) ** 2}
     if settings.robust_steps or settings.loss == "huber":
-        parts["reweighting"] = int(REWEIGHT_BYTES * min(of_all, MEMORY_LIMIT / ENTRY_BYTES))  # more lies in files
-        if settings.consensus and any(features.is_regions(name) for name in names):
-            parts["reweighting"] += int(CONSENSUS_BYTES * of_all + BLOCK_BYTES * min(of_all, BLOCK_ENTRIES))
+        factors = int(REWEIGHT_BYTES * min(of_all, MEMORY_LIMIT / ENTRY_BYTES))  # more lies in files
+        if settings.consensus and masks:
+            factors += int(CONSENSUS_BYTES * of_all + BLOCK_BYTES * min(of_all, BLOCK_ENTRIES))
+        phases["reweighting"] = weighed | {"reweighting": factors}
     if settings.cg_steps or settings.reference_channels:
-        parts["refinement"] = 4 * (splats.count * (CG_VECTORS * CG_CHANNELS) + 3 * largest * CG_CHANNELS)
+        vectors = 4 * (splats.count * (CG_VECTORS * CG_CHANNELS) + 3 * largest * CG_CHANNELS)
+        phases["refinement"] = solved | {"refinement": vectors, "view": view}
     if settings.smoothness:
-        parts["smoothing"] = SMOOTHING_BYTES * splats.count + int(MEMBER_BYTES * of_all)
+        phases["smoothing"] = solved | {"smoothing": SMOOTHING_BYTES * splats.count + int(MEMBER_BYTES * of_all)}
     if settings.aggregation:
-        parts["aggregation"] = CLUSTERING + 24 * channels * min(splats.count, settings.aggregation_sample)
+        clusters = CLUSTERING + 24 * channels * min(splats.count, settings.aggregation_sample)
         if settings.aggregation_clusters in ("auto", "touching"):  # afterwards, and of one cluster at a time
-            parts["aggregation"] = max(parts["aggregation"], TOUCHING_BYTES * splats.count)
-    return parts
+            clusters = max(clusters, TOUCHING_BYTES * splats.count)
+        phases["aggregation"] = solved | {"aggregation": clusters}
+    return phases
 
 
 def _tiles(visible: Visibility) -> float:
@@ -482,14 +499,19 @@ def check_device_memory(device: Device, splats: int, requested: str) -> list[str
     return [f"{device.name} has {available} free and the lift needs {required}: the lift runs on the CPU"]
 
 
-def features_room(parts: Mapping[str, int], free: int | None) -> int | None:
+def features_room(phases: Mapping[str, Mapping[str, int]], free: int | None) -> int | None:
     """Return the bytes that X may take beside the rest, beyond which it is a mapped file; None for no limit."""
     if free is None:
         return None
-    return max(0, int(SPARE * free) - sum(parts.values()) + parts["features"])
+    return max(0, int(SPARE * free) - _rest([parts for parts in phases.values() if "features" in parts]))
 
 
-def check_memory(parts: Mapping[str, int], free: int | None) -> list[str]:
+def _rest(phases: Iterable[Mapping[str, int]]) -> int:
+    """Return the bytes of all parts but X, at the peak of some phases."""
+    return max(sum(parts.values()) - parts.get("features", 0) for parts in phases)
+
+
+def check_memory(phases: Mapping[str, Mapping[str, int]], free: int | None) -> list[str]:
     """Return warnings about the free memory, if it is too small.
 
     Raises:
@@ -497,16 +519,16 @@ def check_memory(parts: Mapping[str, int], free: int | None) -> list[str]:
     """
     if free is None:
         return []
-    capacity = features_room(parts, free)
-    available, rest = f"{free / GIB:.1f} GiB", sum(parts.values()) - parts["features"]
+    capacity, solve = features_room(phases, free), phases["solve"]
+    available, rest = f"{free / GIB:.1f} GiB", _rest(phases.values())
     hint = "try fewer views (coverage) or fewer channels"
-    if parts["codebooks"] > free:
-        got = f"{parts['codebooks'] / GIB:.1f} GiB for codebooks"
+    if solve["codebooks"] > free:
+        got = f"{solve['codebooks'] / GIB:.1f} GiB for codebooks"
         raise Unavailable("memory", expected=f"at most the {available} that are free", got=got, hint=hint)
     warnings = []
-    if capacity is not None and parts["features"] > capacity:
-        check_disk(parts["features"], "features")
-        size = f"{parts['features'] / GIB:.1f} GiB"
+    if capacity is not None and solve["features"] > capacity:
+        check_disk(solve["features"], "features")
+        size = f"{solve['features'] / GIB:.1f} GiB"
         warnings.append(
             f"the features, {size}, do not fit into the {available} that are free: they go through a mapped file"
         )

@@ -7,6 +7,7 @@ import torch
 
 import liftcore as lc
 from liftcore.evaluate.synthetic import room_cameras, room_splats
+from liftcore.lifting.planning.plan import check_memory, features_room
 from liftcore.raster.cpu import weights
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.compositing import CompositingParams, Weighting
@@ -36,6 +37,27 @@ def test_plan_says_what_region_weights_of_dense_maps_take(map_of: str, stride: i
     result = lc.lift(room_splats(300), {camera.name: camera}, views, "row-sum", stride=stride, diagnostic_rays=0)
     entry_bytes = 8 * result.diagnostics["weights_entries"]  # four bytes each for the region and the weight
     assert 0.7 < result.metadata.diagnostics["plan"]["memory"]["weights"] / entry_bytes < 2.0
+
+
+def test_what_one_phase_frees_is_free_for_the_features_of_another() -> None:
+    GB = 10**9
+    phases = {"geometry": {"libraries": GB, "view": 6 * GB}, "solve": {"libraries": GB, "codebooks": GB}}
+    phases["solve"]["features"] = 6 * GB
+    assert check_memory(phases, 10 * GB) == [] and features_room(phases, 10 * GB) == 7 * GB
+    (features,) = check_memory(phases, 88 * GB // 10)
+    assert features.startswith("the features, 5.6 GiB, do not fit")
+    (rest,) = check_memory(phases | {"solve": phases["solve"] | {"features": 1}}, 77 * GB // 10)
+    assert rest.startswith("the rest of the lift may take 6.5 GiB")
+
+
+def test_the_peak_of_a_plan_is_that_of_one_phase() -> None:
+    (camera,) = room_cameras(1, WIDTH, HEIGHT)
+    views = {camera.name: DENSE["a region a pixel"]}
+    plan = lc.plan(room_splats(300), {camera.name: camera}, views, aggregation=True)
+    totals = {phase: sum(parts.values()) for phase, parts in plan.memory_phases.items()}
+    assert plan.memory_bytes == max(totals.values()) == sum(plan.memory.values())
+    assert {"geometry", "gather", "objects", "reweighting", "solve", "aggregation"} == totals.keys()
+    assert "view" not in plan.memory_phases["solve"] and "features" not in plan.memory_phases["geometry"]
 
 
 @pytest.mark.parametrize("threads", [1, 3])
