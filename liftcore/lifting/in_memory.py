@@ -27,7 +27,7 @@ from liftcore.scene.splats import Splats
 from liftcore.solve.aggregate import Aggregation, aggregate, solve_from_kept_regions
 from liftcore.solve.closed_form import solve
 from liftcore.solve.consensus import mask_consensus
-from liftcore.solve.consensus_on_card import mask_consensus_on_card
+from liftcore.solve.consensus_on_card import MOST_MASKS, mask_consensus_on_card
 from liftcore.solve.diagnostics import ViewMeasures, measure_samples
 from liftcore.solve.directions import region_totals
 from liftcore.solve.least_squares import AllRays, reference, refine
@@ -177,7 +177,8 @@ class InMemory(LiftSteps[SceneWeights]):
                 return mask_consensus_on_card(weights, levels, means=means, members=W.members_on_card)
             return torch.from_numpy(mask_consensus(weights, levels, self.threads, means=means, members=W.members))
 
-        return replace(W, consensus=W.where_it_fits(compare))
+        is_few = np.count_nonzero(levels >= 0) <= MOST_MASKS
+        return replace(W, consensus=W.where_it_fits(compare) if is_few else compare(W.on_processor, False))
 
     def reweight(self, W: SceneWeights, levels_apart: bool) -> tuple[SceneWeights, float | None]:
         def apply_reweighting(weights: RegionWeights, on_card: bool) -> tuple[SceneWeights, float | None]:

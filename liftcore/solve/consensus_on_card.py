@@ -8,6 +8,9 @@ The processor computes the best level of a tuple once. Here each splat has a row
 evenly chosen views by slot and level, and every entry reads the q of them all: this needs no tuples. Entries are
 read by their number of slots. A missing member is the region after the last, whose q is that of no view.
 
+Time grows with the square of M, while the R of the processor is sparse, and faster for more than MOST_MASKS regions,
+as of maps with a region a pixel.
+
 Beside W, the device holds a result of 5 bytes per entry, 4 bytes per membership, 4 per witness of a splat (up to
 MOST_WITNESSES views by the number of levels), and less than 2 GiB of blocks.
 """
@@ -30,6 +33,7 @@ from liftcore.values.region_weights import RegionWeights, from_zero, row_blocks,
 
 BLOCK_ENTRIES = 1 << 24  # of some regions; each block reads all regions of W
 TABLE_CELLS = 1 << 24  # of R
+MOST_MASKS = 1 << 17  # M, of whose R all cells are computed
 CHUNK = 1 << 23  # entries of W, members or witnesses of splats that are read at a time
 
 

@@ -93,6 +93,21 @@ def test_a_lift_by_default_leaves_the_weights_on_the_card(paths: list[Path], mon
     assert result.metadata.timings["objects"] > 0 and not copies
 
 
+def test_more_masks_than_a_card_compares_are_compared_here(paths: list[Path], monkeypatch) -> None:
+    places, compare = list[bool](), in_memory.mask_consensus
+
+    def compare_here(W: RegionWeights, *arguments: Any, **keywords: Any) -> np.ndarray:
+        places.append(W.region.is_cuda)
+        return compare(W, *arguments, **keywords)
+
+    on_card = lifted(paths, device="cuda").cpu()
+    monkeypatch.setattr(in_memory, "mask_consensus", compare_here)
+    monkeypatch.setattr(in_memory, "MOST_MASKS", 8)
+    result = lifted(paths, device="cuda").cpu()
+    assert places == [False]
+    assert torch.allclose(result.features.float(), on_card.features.float(), rtol=2e-3, atol=2e-3)
+
+
 def test_objects_with_parts_are_the_processors() -> None:
     W, levels = nested_scene(0, 270, equal_weights=False)
     on_card = replace(W, **{name: part.to("cuda") for name, part in W.tensors().items() if name != "offsets"})
