@@ -10,13 +10,14 @@ import torch
 
 from liftcore.lifting import in_memory
 from liftcore.lifting.files import lift_files
-from liftcore.lifting.planning.plan import ENTRY_BYTES
+from liftcore.lifting.planning.plan import ENTRY_BYTES, Plan
 from liftcore.solve import reweight
 from liftcore.values.pack import read_features, write_pack
 from liftcore.values.settings import LiftSettings
 from liftcore.values.views import FeatureGrid
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
 FINE = (120, 160)  # cells: four pixels of tabletop each
@@ -32,10 +33,13 @@ def fine_maps(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return path
 
 
-def certified(scene: Path, pack: Path, options: dict[str, Any]) -> dict[str, Any]:
+def certified(
+    scene: Path, pack: Path, options: dict[str, Any], on_plan: Callable[[Plan], None] | None = None
+) -> dict[str, Any]:
     """The diagnostics of a lift."""
     settings = LiftSettings.of(**{"preset": "row-sum"} | options, diagnostic_rays=100, device="cpu")
-    return lift_files(scene / "point_cloud.ply", scene / "cameras.json", [pack], settings).metadata.diagnostics
+    paths = scene / "point_cloud.ply", scene / "cameras.json", [pack]
+    return lift_files(*paths, settings, on_plan=on_plan).metadata.diagnostics
 
 
 def planned_and_measured(scene: Path, pack: Path, options: dict[str, Any]) -> tuple[float, float]:
@@ -86,5 +90,6 @@ def test_plan_has_room_for_what_reweighting_holds(shared_data: Path, monkeypatch
     monkeypatch.setattr(reweight, "zeros", array)
     monkeypatch.setattr(in_memory, "mask_consensus", consensus)
     scene, options = shared_data / "tabletop", {"view_stride": 6, "preset": "default"}
-    planned = certified(scene, scene / "features_hard.safetensors", options)["plan"]["memory"]["reweighting"]
-    assert sum(part.nbytes for part in arrays) < planned
+    plans = list[Plan]()
+    certified(scene, scene / "features_hard.safetensors", options, plans.append)
+    assert 0 < sum(part.nbytes for part in arrays) < plans[0].memory_phases["reweighting"]["reweighting"]
