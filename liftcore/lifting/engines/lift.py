@@ -110,6 +110,7 @@ def plan_of_a_worker(plan: Plan) -> Plan:
     splat_share = min(1.0, max(SELECTED, plan.splats_a_view) / plan.splats)
     shares = {"splats": splat_share, "scene": splat_share, "gathered": splats, "features": splats}
     views = min(1.0, PIECE_VIEWS / len(plan.views))
+    shares["objects"] = max(views, splats)  # `contain` and `label`
     phases = dict[str, dict[str, int]]()
     for phase, parts in plan.memory_phases.items():
         shares["weights"] = views if phase in ("geometry", "gather") else splats

@@ -58,6 +58,7 @@ RECORD_BYTES = 240  # of a visible splat: projected, with its row of W
 TILE_BYTES = 100  # of a splat in a tile: its index in the tile's list, and its weights there
 ENTRY_BYTES, ROW_BYTES = 8, 20  # of W: region and weight; a splat's number, row start and total weight
 DENSE_BYTES = 27  # of an entry of a dense map: by tiles, and gathered by splat
+FACTOR_BYTES = 4  # of an entry: a factor, or its weight times the factor
 REWEIGHT_BYTES = 12  # of an entry: factors, and the products and squares behind them
 CONSENSUS_BYTES = 10  # of an entry: its share, the count of views, its membership; the tuple of its view
 BLOCK_BYTES = 9  # of an entry that lies by region
@@ -319,7 +320,7 @@ def _seconds(raster: Raster, views: LiftViews, names: Sequence[str], settings: L
 
 def weight_bytes(visible: Visibility, entries: np.ndarray, settings: LiftSettings) -> int:
     """Estimate the bytes of W of all views from the number of entries of each [V]."""
-    factor_bytes = 4 if settings.robust_steps or settings.loss == "huber" else 0
+    factor_bytes = FACTOR_BYTES if settings.robust_steps or settings.loss == "huber" else 0
     return int(ROW_BYTES * _splat_counts(visible).sum() + (ENTRY_BYTES + factor_bytes) * entries.sum())
 
 
@@ -447,7 +448,11 @@ def memory_phases(
         clusters = CLUSTERING + 24 * channels * min(splats.count, settings.aggregation_sample)
         if settings.aggregation_clusters in ("auto", "touching"):  # afterwards, and of one cluster at a time
             clusters = max(clusters, TOUCHING_BYTES * splats.count)
+        if settings.aggregation_resolve:
+            clusters += int(FACTOR_BYTES * of_all)  # W of kept regions alone
         phases["aggregation"] = solved | {"aggregation": clusters}
+        if masks and not settings.clusters_by_masks:  # regions are compared with rendered clusters
+            phases["aggregation"]["view"] = view
     return phases
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import pytest
 import torch
 
@@ -58,6 +61,28 @@ def test_the_peak_of_a_plan_is_that_of_one_phase() -> None:
     assert plan.memory_bytes == max(totals.values()) == sum(plan.memory.values())
     assert {"geometry", "gather", "objects", "reweighting", "solve", "aggregation"} == totals.keys()
     assert "view" not in plan.memory_phases["solve"] and "features" not in plan.memory_phases["geometry"]
+
+
+def test_clusters_that_are_rendered_are_planned_with_a_view() -> None:
+    (camera,) = room_cameras(1, WIDTH, HEIGHT)
+    views = {camera.name: DENSE["a region a pixel"]}
+
+    def aggregation(**settings: Any) -> Mapping[str, int]:
+        plan = lc.plan(room_splats(300), {camera.name: camera}, views, aggregation=True, **settings)
+        return plan.memory_phases["aggregation"]
+
+    by_masks, by_features = aggregation(), aggregation(aggregation_clusters="hdbscan")
+    assert "view" not in by_masks and by_features["view"] > 16 * WIDTH * HEIGHT
+    resolved = aggregation(aggregation_clusters="hdbscan", aggregation_resolve=True)
+    assert resolved["aggregation"] > by_features["aggregation"]
+
+
+def test_a_worker_finds_objects_of_some_views_or_splats() -> None:
+    cameras = {camera.name: camera for camera in room_cameras(24, WIDTH, HEIGHT)}
+    views = dict(zip(cameras, [DENSE["a region a pixel"]] * 24, strict=True))
+    inputs = room_splats(300_000), cameras, views
+    whole, worker = (lc.plan(*inputs, in_blocks=in_blocks).memory_phases["objects"] for in_blocks in (False, True))
+    assert worker["objects"] < 0.5 * whole["objects"]
 
 
 @pytest.mark.parametrize("threads", [1, 3])
