@@ -1,4 +1,4 @@
-"""Sums over entries of a W in a GPU's memory, each in the entries' order, for all regions or all pairs of numbers.
+"""Sums over entries of a W in a GPU's memory, each in a fixed order, for all regions or all pairs of numbers.
 
 Entries are sorted by number, and segments summed: atomic additions of floats would have no order. Integers may be
 added in any.
@@ -34,7 +34,7 @@ def region_totals_on_card(W: RegionWeights) -> Tensor:
 
 
 def sums_by_number(number: Tensor, values: Tensor, count: int) -> Tensor:
-    """Return sums [k, count] f64 of values [k, n] f64 of entries by their numbers [n] int, in the entries' order."""
+    """Return sums [k, count] f64 of values [k, n] f64 of entries by their numbers [n] int, in a fixed order."""
     starts = from_zero(torch.bincount(number, minlength=count))
     order = torch.argsort(number, stable=True)
     return torch.stack([segment_sums(part[order], starts) for part in values])

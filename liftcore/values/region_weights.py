@@ -328,7 +328,7 @@ def from_zero(lengths: Tensor) -> Tensor:
 
 
 def segment_sums(values: Tensor, starts: Tensor) -> Tensor:
-    """Return sums [n] f64 of values between ``starts`` [n + 1] i64, each in its order."""
+    """Return sums [n] f64 of values between ``starts`` [n + 1] i64, each in its order; in a fixed tree on a GPU."""
     if values.numel() == 0:
         return torch.zeros(starts.shape[0] - 1, dtype=torch.float64, device=values.device)
     return torch.segment_reduce(values.double(), "sum", offsets=starts, initial=0)
