@@ -58,7 +58,7 @@ from liftcore.solve.reweight import SceneConsistency, level_numbers, whole_regio
 from liftcore.solve.sums import sum_pieces, unpack_sums
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.pack import NO_ROOM, Views, write_pack
-from liftcore.values.region_weights import MOST_REGIONS
+from liftcore.values.region_weights import MEMORY_LIMIT, MOST_REGIONS
 
 if TYPE_CHECKING:
     from liftcore.lifting.engines.base import Work
@@ -106,15 +106,17 @@ def steps_in_blocks(
 
 def plan_of_a_worker(plan: Plan) -> Plan:
     """Replace the memory of a plan by the estimate for one worker: bytes of each part at its peak."""
-    splats = min(1.0, ROWS / plan.splats)
+    splats, views = min(1.0, ROWS / plan.splats), min(1.0, PIECE_VIEWS / len(plan.views))
     splat_share = min(1.0, max(SELECTED, plan.splats_a_view) / plan.splats)
-    shares = {"splats": splat_share, "scene": splat_share, "gathered": splats, "features": splats}
-    views = min(1.0, PIECE_VIEWS / len(plan.views))
-    shares["objects"] = max(views, splats)  # `contain` and `label`
+    shares = {"splats": splat_share, "scene": splat_share, "features": splats}
+    # Some of their steps work on blocks of views, some on blocks of splats.
+    shares |= dict.fromkeys(("objects", "reweighting"), max(views, splats))
+    weights = {share: min(int(share * plan.weight_bytes), MEMORY_LIMIT) for share in (views, splats)}
     phases = dict[str, dict[str, int]]()
     for phase, parts in plan.memory_phases.items():
-        shares["weights"] = views if phase in ("geometry", "gather") else splats
         phases[phase] = {name: int(size * shares.get(name, 1.0)) for name, size in parts.items()}
+        phases[phase]["weights"] = weights[views if phase in ("geometry", "gather") else splats]
+    phases["gather"]["gathered"] = weights[splats]
     return replace(plan, memory_phases=phases, weight_bytes=0)
 
 

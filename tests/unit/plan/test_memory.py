@@ -14,6 +14,7 @@ from liftcore.lifting.planning.plan import check_memory, features_room
 from liftcore.raster.cpu import weights
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.compositing import CompositingParams, Weighting
+from liftcore.values.region_weights import MEMORY_LIMIT
 from tests.scenes import random_camera, random_regions, random_splats
 
 WIDTH, HEIGHT, CHANNELS = 416, 320, 2  # 133,120 pixels
@@ -77,12 +78,16 @@ def test_clusters_that_are_rendered_are_planned_with_a_view() -> None:
     assert resolved["aggregation"] > by_features["aggregation"]
 
 
-def test_a_worker_finds_objects_of_some_views_or_splats() -> None:
+def test_a_worker_holds_some_views_or_splats() -> None:
     cameras = {camera.name: camera for camera in room_cameras(24, WIDTH, HEIGHT)}
     views = dict(zip(cameras, [DENSE["a region a pixel"]] * 24, strict=True))
     inputs = room_splats(300_000), cameras, views
-    whole, worker = (lc.plan(*inputs, in_blocks=in_blocks).memory_phases["objects"] for in_blocks in (False, True))
-    assert worker["objects"] < 0.5 * whole["objects"]
+    whole, worker = (lc.plan(*inputs, in_blocks=in_blocks) for in_blocks in (False, True))
+    for name in ("objects", "reweighting"):
+        assert worker.memory_phases[name][name] < 0.5 * whole.memory_phases[name][name]
+    # W of all views is capped, as more lies in files; of eight views it is not a third of that.
+    assert whole.weight_bytes > 3 * MEMORY_LIMIT
+    assert worker.memory_phases["geometry"]["weights"] == MEMORY_LIMIT
 
 
 @pytest.mark.parametrize("threads", [1, 3])
