@@ -313,7 +313,10 @@ def weigh_rows(
     first_row, last_row, indptr, region, weight, factors, view, level, cosines, reliable, consensus, scores,
     mean_cosine, power, powers,
 ):  # fmt: skip
-    """Compute `BlockReweighter.weigh` of rows; powers of consensus are interpolated in a table [K, n]."""
+    """Compute `BlockReweighter.weigh` of rows ``first_row..last_row``.
+
+    Powers of consensus are interpolated in a table [K, n].
+    """
     levels = mean_cosine.size
     before, after, gain = np.empty(levels), np.empty(levels), np.empty(levels)
     cosine_sums, blended_sums, view_shares = np.empty(levels), np.empty(levels), np.empty(levels)
