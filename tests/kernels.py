@@ -14,7 +14,7 @@ from liftcore.lifting.files import lift_files
 from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.splats import Kernel
 from liftcore.values.settings import LiftSettings
-from tests.api.tiny_scene import make_scene
+from tests.tiny_scene import make_scene
 
 
 def main() -> None:

@@ -9,7 +9,7 @@ import zipfile
 import zlib
 from typing import Any
 
-from .tiny_scene import cameras_document, cameras_json
+from tests.tiny_scene import cameras_document, cameras_json
 
 PLY = b"ply\nformat binary_little_endian 1.0\n"
 CAMERA = "1 PINHOLE 32 24 30 30 16 12\n"

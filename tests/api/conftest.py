@@ -21,9 +21,8 @@ from service.state import AppState
 from service.store.assets import CheckedUpload
 from service.store.owners import SERVICE
 from service.store.store import Store
-
-from .following import wait_for_end
-from .tiny_scene import CHANNELS, TinyScene, make_scene, text_table
+from tests.server import wait_for_end
+from tests.tiny_scene import CHANNELS, TinyScene, make_scene, text_table
 
 LIFT_REQUEST = "the-request-of-the-lift"
 ADDRESS = "http://127.0.0.1"

@@ -22,10 +22,7 @@ from service import tasks
 from service.child import error_of
 from service.models import AssetKind
 from service.problems import problem_of
-
-from .bombs import camera_documents, features
-from .test_problems import assert_problem
-from .tiny_scene import (
+from tests.tiny_scene import (
     TinyScene,
     cameras_document,
     codebook,
@@ -37,6 +34,9 @@ from .tiny_scene import (
     ply,
     splat_rows,
 )
+
+from .bombs import camera_documents, features
+from .test_problems import assert_problem
 
 
 def files_below(data: Path) -> set[str]:

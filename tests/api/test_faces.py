@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 import liftcore as lc
 from liftcore import cli, models
 from service.store.owners import SERVICE
+from tests.tiny_scene import HEIGHT, WORDS
 
 from .conftest import parts_of
-from .tiny_scene import HEIGHT, WORDS
 
 EXAMPLES = (
     "middle:6,12", f"middle:26,{HEIGHT // 2}", "splat:0", "splat:47", "region:left:0:1", "middle:box:3,4,10,20",

@@ -41,12 +41,12 @@ from service.store.store import Store
 from service.tasks import plan_document
 from tests.crash.conftest import asset_of, order, until
 from tests.crash.server import standing_in
+from tests.server import wait_for_end
+from tests.tiny_scene import CHANNELS, SPLATS_A_CLUSTER, VIEWS, TinyScene, cameras_document
 
 from .conftest import LIFT_REQUEST, SceneAssets, parts_of, put
-from .following import wait_for_end
 from .guarded import finish
 from .test_problems import assert_problem
-from .tiny_scene import CHANNELS, SPLATS_A_CLUSTER, VIEWS, TinyScene, cameras_document
 
 Quick = Callable[..., AbstractContextManager[tuple[TestClient, dict[str, Any]]]]
 

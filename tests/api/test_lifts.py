@@ -24,10 +24,7 @@ from liftcore.lifting.files import lift_files
 from liftcore.query.scene import Scene
 from liftcore.values.settings import LiftSettings
 from service.store.database import DATABASE
-
-from .conftest import serving
-from .test_problems import NO_ASSET, assert_problem
-from .tiny_scene import (
+from tests.tiny_scene import (
     FOCAL,
     HEIGHT,
     SPLATS_A_CLUSTER,
@@ -39,6 +36,9 @@ from .tiny_scene import (
     colmap_zip,
     splat_rows,
 )
+
+from .conftest import serving
+from .test_problems import NO_ASSET, assert_problem
 
 
 def photos(**names: bytes) -> bytes:

@@ -20,11 +20,11 @@ from service.store.lifts import FinishedTradeoff
 from service.store.owners import SERVICE
 from service.store.store import Store
 from tests.crash.conftest import order
+from tests.server import wait_for_end
+from tests.tiny_scene import TinyScene
 
-from .following import wait_for_end
 from .test_jobs import Quick, quick
 from .test_problems import assert_problem
-from .tiny_scene import TinyScene
 
 __all__ = ["quick"]  # a fixture
 

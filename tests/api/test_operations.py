@@ -44,11 +44,11 @@ from service.uploads import check
 from tests.crash.conftest import order, until
 from tests.crash.server import NoQueries
 from tests.crash.service_process import ServiceProcess, processes_of, template_of
+from tests.tiny_scene import TinyScene, cameras_document
 
 from .conftest import SceneAssets, app_of, parts_of, put
 from .guarded import address, every_route, keyed_server
 from .test_problems import assert_problem
-from .tiny_scene import TinyScene, cameras_document
 
 Start = Callable[..., Any]
 REQUEST_ID = re.compile(r"[0-9a-f]{32}")

@@ -17,11 +17,8 @@ from plyfile import PlyData
 from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.splats import Kernel
 from service.models import AssetKind
-
-from .conftest import SceneAssets, put
-from .following import wait_for_end
-from .test_problems import assert_problem
-from .tiny_scene import (
+from tests.server import wait_for_end
+from tests.tiny_scene import (
     PROPERTIES,
     SPLATS_A_CLUSTER,
     cameras_document,
@@ -30,6 +27,9 @@ from .tiny_scene import (
     ply,
     splat_rows,
 )
+
+from .conftest import SceneAssets, put
+from .test_problems import assert_problem
 
 FILES = Path(__file__).parents[1] / "data" / "splats"
 

@@ -25,11 +25,8 @@ from service.errors import NoSpace
 from service.models import AssetKind
 from service.query_client import Frame
 from service.store.files import DataDirectory
-
-from .conftest import SceneAssets, parts_of, put
-from .following import wait_for_end
-from .test_problems import assert_problem
-from .tiny_scene import (
+from tests.server import wait_for_end
+from tests.tiny_scene import (
     CHANNELS,
     DISTANCE,
     FOCAL,
@@ -44,6 +41,9 @@ from .tiny_scene import (
     splat_rows,
     text_table,
 )
+
+from .conftest import SceneAssets, parts_of, put
+from .test_problems import assert_problem
 
 LAMP = {"like": f"middle:26,{HEIGHT // 2}", "threshold": 0.5}
 PLACES: dict[str, int] = dict(zip(WORDS, (6, 16, 26), strict=True))  # columns of view "middle" that show them

@@ -35,11 +35,11 @@ from service.query_worker import Answers, bytes_of, reply_to
 from service.routes.queries import query_request
 from tests.crash.conftest import address_of, until
 from tests.crash.server import NoQueries
+from tests.tiny_scene import CHANNELS, WORDS
 
 from .conftest import parts_of
 from .guarded import keyed_server
 from .test_slow_clients import running
-from .tiny_scene import CHANNELS, WORDS
 
 # Answers a request once the file that it names is there, and writes down which it answers and what waits behind it.
 STAND_IN = """

@@ -24,12 +24,12 @@ from service.store import selections as module
 from service.store.database import DATABASE, OF_0_4, TABLES_OF_0_4
 from service.store.owners import SERVICE, stored_bytes
 from service.store.store import Store
+from tests.tiny_scene import SPLATS_A_CLUSTER, WORDS
 
 from .conftest import parts_of
 from .guarded import KeyedServer, keyed_server
 from .test_problems import assert_problem
 from .test_queries import array
-from .tiny_scene import SPLATS_A_CLUSTER, WORDS
 
 LAMP = {"query": {"text": [WORDS[2]], "threshold": 0.5}}
 ALL = 3 * SPLATS_A_CLUSTER

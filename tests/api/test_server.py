@@ -32,10 +32,10 @@ from service.errors import InvalidRequest
 from service.routes.operations import WEB
 from service.settings import ServiceSettings, encoder_label, encoder_spec
 from tests.crash.conftest import until
+from tests.server import wait_for_end
+from tests.tiny_scene import TinyScene, colmap_zip, make_scene
 
 from .conftest import SceneAssets
-from .following import wait_for_end
-from .tiny_scene import TinyScene, colmap_zip, make_scene
 
 ROOT = Path(__file__).parents[2]
 

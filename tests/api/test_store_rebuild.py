@@ -21,11 +21,11 @@ from service.store.database import DATABASE
 from service.store.owners import SERVICE
 from service.store.recovery import back_up
 from service.store.store import Store, collect
+from tests.server import wait_for_end
+from tests.tiny_scene import TinyScene, colmap_zip, labels, masks
 
 from .conftest import SceneAssets, app_of, serving
-from .following import wait_for_end
 from .guarded import KeyedServer, address, bearer, every_route, keyed_server, make_key
-from .tiny_scene import TinyScene, colmap_zip, labels, masks
 
 StoredData = tuple[Path, dict[str, Any]]  # a data directory, and its contents over HTTP
 

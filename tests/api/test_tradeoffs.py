@@ -18,12 +18,12 @@ from service.store.store import Store
 from tests.crash.conftest import labels as stored_labels
 from tests.crash.conftest import until
 from tests.crash.service_process import processes_of
+from tests.server import wait_for_end
+from tests.tiny_scene import TinyScene, labels, masks, text_table
 
 from .conftest import SceneAssets, parts_of, put
-from .following import wait_for_end
 from .test_jobs import Quick, quick
 from .test_problems import NO_ASSET, assert_problem
-from .tiny_scene import TinyScene, labels, masks, text_table
 
 __all__ = ["quick"]  # a fixture
 

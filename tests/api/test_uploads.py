@@ -22,15 +22,15 @@ from service.store.owners import SERVICE, parse_scopes
 from service.store.store import Store
 from service.uploads import STEP, AssetIntake, Intake
 from tests.crash.server import standing_in
-
-from .conftest import SceneAssets, parts_of
-from .test_problems import assert_problem
-from .tiny_scene import (
+from tests.tiny_scene import (
     TinyScene,
     ply,
     splat_rows,
     text_table,
 )
+
+from .conftest import SceneAssets, parts_of
+from .test_problems import assert_problem
 
 
 def test_same_bytes_are_the_same_asset_however_they_come(

@@ -29,7 +29,7 @@ from urllib.parse import quote, urlencode
 import httpx
 import numpy as np
 
-from tests.api import tiny_scene
+from tests import tiny_scene
 from tests.api.test_photo_zips import photos_zip
 from tests.benchmarks.base import machine
 from tests.benchmarks.soak import scene_files

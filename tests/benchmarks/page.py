@@ -19,10 +19,10 @@ import httpx
 import numpy as np
 from safetensors.numpy import save
 
-from tests.api.following import wait_for_end
-from tests.api.tiny_scene import PROPERTIES, cameras_json, make_scene, ply
 from tests.browser.conftest import browsing, serving
 from tests.browser.looking import READY
+from tests.server import wait_for_end
+from tests.tiny_scene import PROPERTIES, cameras_json, make_scene, ply
 
 ROOM_SPLATS = 180_000  # splats
 OPENINGS = 3  # of each scene: the first meets a service that just began

@@ -14,9 +14,9 @@ import pytest
 from service.app import assemble
 from service.settings import ServiceSettings
 from service.store.store import Store
-from tests.api.following import wait_for_end
-from tests.api.tiny_scene import make_scene
 from tests.crash.conftest import address_of, listening
+from tests.server import wait_for_end
+from tests.tiny_scene import make_scene
 
 from .browser import Browser, chromium
 

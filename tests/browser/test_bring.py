@@ -18,9 +18,9 @@ from liftcore.io.inria import write_inria_cameras
 from liftcore.io.splats import read_splats
 from liftcore.lifting.files import lift_files
 from liftcore.values.settings import LiftSettings
-from tests.api.tiny_scene import cameras_document, colmap_zip, make_scene, ply, splat_rows
 from tests.still_life.files import write_still_life
 from tests.still_life.scene import still_life
+from tests.tiny_scene import cameras_document, colmap_zip, make_scene, ply, splat_rows
 from tests.unit.scene.camera_files import binary_files, text_files, write_files
 
 from .browser import Browser

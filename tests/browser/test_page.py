@@ -18,7 +18,7 @@ from safetensors.numpy import save
 from liftcore.query.question import METHODS
 from service.store.keys import Quota
 from service.store.owners import Scope
-from tests.api.tiny_scene import make_scene
+from tests.tiny_scene import make_scene
 
 from .browser import Browser
 from .conftest import PageServer, browsing

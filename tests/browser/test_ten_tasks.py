@@ -16,7 +16,7 @@ import pytest
 import zstandard
 
 from service.routes import operations
-from tests.api.tiny_scene import make_scene
+from tests.tiny_scene import make_scene
 
 from .browser import Browser
 from .conftest import PageServer, serving

@@ -12,7 +12,7 @@ from PIL import Image
 import liftcore as lc
 from liftcore.text.table import TableEncoder
 from liftcore.values.pack import write_pack
-from tests.api import tiny_scene
+from tests import tiny_scene
 from tests.scenes import write_scene
 
 from .readme import ROOT

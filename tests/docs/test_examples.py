@@ -40,8 +40,8 @@ from service import models
 from service.auth import OPEN
 from service.commands.demo import find_scene
 from service.routes import assets, jobs, lifts, operations, queries, selections
-from tests.api.tiny_scene import HEIGHT, WIDTH, WORDS, cameras_document, codebook, colmap_zip, labels, make_scene
 from tests.run_lengths import sam_records
+from tests.tiny_scene import HEIGHT, WIDTH, WORDS, cameras_document, codebook, colmap_zip, labels, make_scene
 
 from .readme import FOR_USERS, GUIDE, PYTHON, ROOT, SERVICE, SETTINGS, blocks, site_text, text
 

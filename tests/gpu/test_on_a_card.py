@@ -26,8 +26,8 @@ from liftcore.values import region_weights as weights
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import Preset
 from tests import paper_card
-from tests.api.tiny_scene import WORDS, make_scene
 from tests.backends import needs_triton
+from tests.tiny_scene import WORDS, make_scene
 from tests.unit.solve.test_objects_on_card import nested_scene
 
 pytestmark = needs_triton

@@ -13,7 +13,7 @@ from PIL import Image
 import liftcore as lc
 from liftcore import evaluate, files
 from liftcore.features.encoders.encode import find_images
-from tests.api import tiny_scene
+from tests import tiny_scene
 
 Call = Callable[..., Any]
 

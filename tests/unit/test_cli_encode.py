@@ -13,7 +13,7 @@ from PIL import ExifTags, Image, ImageOps
 
 from liftcore.values.pack import read_features
 from liftcore.values.views import FeatureGrid
-from tests.api.tiny_scene import make_scene
+from tests.tiny_scene import make_scene
 
 from .command_line import assert_one_line, run
 

@@ -20,8 +20,8 @@ from liftcore.errors import InvalidFeatures, InvalidQuery
 from liftcore.features.prompts import prompt_views
 from liftcore.values.pack import read_features, write_pack
 from liftcore.values.views import Regions
-from tests.api.tiny_scene import labels, make_scene
 from tests.run_lengths import sam_records
+from tests.tiny_scene import labels, make_scene
 from tests.unit.command_line import assert_one_line, run
 
 PHRASES = {0: "red_apple", 2: "Lamp"}  # the cluster between them has no phrase

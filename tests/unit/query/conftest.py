@@ -9,7 +9,7 @@ from liftcore.lifting.files import lift_files
 from liftcore.query.scene import Scene
 from liftcore.values.lift_file import save_lift
 from liftcore.values.settings import LiftSettings
-from tests.api.tiny_scene import make_scene
+from tests.tiny_scene import make_scene
 
 
 @pytest.fixture(scope="session")

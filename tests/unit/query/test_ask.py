@@ -31,7 +31,7 @@ from liftcore.query.threshold import find_threshold
 from liftcore.scene.cameras import Cameras
 from liftcore.values.lift_file import save_lift
 from service.query_worker import open_scene
-from tests.api.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH
+from tests.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH
 
 COUNT = 3 * SPLATS_A_CLUSTER
 NAMES = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=12)

@@ -20,7 +20,7 @@ from liftcore.query.result import LiftResult, load_lift
 from liftcore.query.scene import Scene
 from liftcore.values.lift_file import save_lift
 from liftcore.values.settings import LiftSettings
-from tests.api.tiny_scene import CHANNELS, SPLATS_A_CLUSTER, VIEWS, WORDS, text_table
+from tests.tiny_scene import CHANNELS, SPLATS_A_CLUSTER, VIEWS, WORDS, text_table
 
 EYE = np.eye(3, CHANNELS, dtype=np.float32)
 

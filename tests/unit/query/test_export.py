@@ -17,7 +17,7 @@ from liftcore.query.scene import Scene
 from liftcore.query.terms import Region
 from liftcore.scene.harmonics import SH_C0
 from liftcore.values.settings import LiftSettings
-from tests.api.tiny_scene import SPLATS_A_CLUSTER, ply, splat_rows
+from tests.tiny_scene import SPLATS_A_CLUSTER, ply, splat_rows
 
 
 @pytest.fixture

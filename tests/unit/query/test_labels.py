@@ -16,7 +16,7 @@ from liftcore.query.coco import run_lengths
 from liftcore.query.question import Query
 from liftcore.query.scene import Scene
 from liftcore.query.terms import Region, Vector
-from tests.api.tiny_scene import CHANNELS, SPLATS_A_CLUSTER, VIEWS, WORDS, text_table
+from tests.tiny_scene import CHANNELS, SPLATS_A_CLUSTER, VIEWS, WORDS, text_table
 from tests.unit.query.test_catalogue import with_parts
 from tests.unit.scene.test_usd import needs_usd
 

@@ -14,7 +14,7 @@ from liftcore.query.objects import objects
 from liftcore.query.question import Answer, Query
 from liftcore.query.scene import Scene
 from liftcore.query.terms import Region
-from tests.api.tiny_scene import SPLATS_A_CLUSTER, ply, splat_rows
+from tests.tiny_scene import SPLATS_A_CLUSTER, ply, splat_rows
 
 from .made_up import answer_with
 

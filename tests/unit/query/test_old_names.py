@@ -13,7 +13,7 @@ import pytest
 import liftcore as lc
 from liftcore import cli, models
 from liftcore.text.table import TableEncoder
-from tests.api.tiny_scene import CHANNELS, text_table
+from tests.tiny_scene import CHANNELS, text_table
 
 AXES = TableEncoder("axes", ("x", "y", "z"), np.eye(3, CHANNELS, dtype=np.float32))
 

@@ -22,7 +22,7 @@ from liftcore.query.segment import segment
 from liftcore.query.terms import SplatTerm
 from liftcore.text import LVIS_TABLE, CachingEncoder
 from liftcore.text.table import TableEncoder
-from tests.api.tiny_scene import SPLATS_A_CLUSTER
+from tests.tiny_scene import SPLATS_A_CLUSTER
 
 COUNT = 3 * SPLATS_A_CLUSTER
 PRESENT_WORDS = ("cat", "boat", "pizza")

@@ -11,7 +11,7 @@ from liftcore.query.scene import Scene
 from liftcore.query.terms import Region
 from liftcore.values.pack import as_views
 from liftcore.values.views import FeatureGrid, Regions
-from tests.api.tiny_scene import CHANNELS, HEIGHT, WIDTH, codebook
+from tests.tiny_scene import CHANNELS, HEIGHT, WIDTH, codebook
 
 
 @pytest.fixture

@@ -38,8 +38,8 @@ from liftcore.scene.distortion import Brown, Distortion, Fisheye, photo_places
 from liftcore.scene.drawing import in_photo
 from liftcore.scene.harmonics import SH_C0
 from liftcore.scene.splats import Kernel, Splats
-from tests.api.tiny_scene import HEIGHT, SPLATS_A_CLUSTER, WIDTH
 from tests.scenes import look_at, random_camera, random_splats
+from tests.tiny_scene import HEIGHT, SPLATS_A_CLUSTER, WIDTH
 
 from .made_up import answer_with
 

@@ -9,7 +9,7 @@ import pytest
 
 import liftcore as lc
 from liftcore.text.table import TableEncoder
-from tests.api.tiny_scene import CHANNELS
+from tests.tiny_scene import CHANNELS
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -25,7 +25,7 @@ from liftcore.query.segment import best_words, map_png, named_ply, picture_png, 
 from liftcore.query.splat_colours import view_colours
 from liftcore.query.terms import Pixel, SplatTerm, Vector
 from liftcore.scene.cameras import Cameras
-from tests.api.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH, text_table
+from tests.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH, text_table
 
 EYE = np.eye(CHANNELS, dtype=np.float32)
 COUNT = 3 * SPLATS_A_CLUSTER

@@ -17,7 +17,7 @@ from liftcore.query.terms import Stroke
 from liftcore.raster.reference import ReferenceRaster
 from liftcore.scene.cameras import Camera
 from liftcore.scene.touching import touching_pairs
-from tests.api.tiny_scene import SPLATS_A_CLUSTER as OF_A_CLUSTER
+from tests.tiny_scene import SPLATS_A_CLUSTER as OF_A_CLUSTER
 
 ALL = np.arange(3 * OF_A_CLUSTER)
 

@@ -20,7 +20,7 @@ from liftcore.query.scene import Scene
 from liftcore.query.terms import SplatTerm
 from liftcore.scene.registration import find_similarity
 from liftcore.scene.splats import Splats
-from tests.api.tiny_scene import SPLATS_A_CLUSTER
+from tests.tiny_scene import SPLATS_A_CLUSTER
 
 MOVE = {"scale": 2.5, "rotation": (0.8, 0.2, -0.4, 0.3), "translation": (10.0, -4.0, 7.0)}
 CLUSTER = np.repeat(np.arange(3), SPLATS_A_CLUSTER)

@@ -43,8 +43,8 @@ from liftcore.scene.splats import Splats
 from liftcore.values.lift import LiftMetadata
 from liftcore.values.lift_file import open_lift, save_lift
 from liftcore.values.settings import LiftSettings
-from tests.api.tiny_scene import cameras_document, make_scene, ply, splat_rows
 from tests.scenes import look_at, random_camera, random_regions, random_splats, splats_at
+from tests.tiny_scene import cameras_document, make_scene, ply, splat_rows
 from tests.unit.command_line import run
 
 UTM = np.array([500_000.25, 5_400_000.5, 300.125])
