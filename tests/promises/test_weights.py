@@ -1,0 +1,165 @@
+"""A lift is its definition: ``X = D^-1 A^T B`` of the weights that `liftcore.render` composites, in float64."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import liftcore as lc
+import numpy as np
+import pytest
+
+from tests.promises.scenes import CHANNELS, HEIGHT, KERNELS, WIDTH, RandomScene, random_scene
+
+GAIN = 1.2  # on opacity logits, of Tikhonov guidance
+
+
+def weights_of(scene: RandomScene, name: str, gain: float = 1.0) -> np.ndarray:
+    """Return A [H W, P] of a view: renders of one splat each."""
+    params = lc.CompositingParams(gain)
+    image = lc.render(scene.splats, scene.cameras[name], np.eye(scene.splats.count, dtype=np.float32), params)
+    assert not isinstance(image, dict)
+    return image.double().numpy().reshape(-1, scene.splats.count)
+
+
+def read_grid(grid: np.ndarray) -> np.ndarray:
+    """Return what each pixel reads of a map [h, w, F]: four cells by distance, and the edge's beyond the edge."""
+    h, w, _ = grid.shape
+    y = np.clip((np.arange(HEIGHT) + 0.5) * h / HEIGHT - 0.5, 0, h - 1)
+    x = np.clip((np.arange(WIDTH) + 0.5) * w / WIDTH - 0.5, 0, w - 1)
+    top, left = np.floor(y).astype(int), np.floor(x).astype(int)
+    low, right = np.minimum(top + 1, h - 1), np.minimum(left + 1, w - 1)
+    dy, dx = (y - top)[:, None, None], (x - left)[None, :, None]
+    upper = grid[top][:, left] * (1 - dx) + grid[top][:, right] * dx
+    lower = grid[low][:, left] * (1 - dx) + grid[low][:, right] * dx
+    return (upper * (1 - dy) + lower * dy).reshape(-1, grid.shape[2])
+
+
+def dense_lift(scene: RandomScene, preset: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return X [P, F] and the weights D [P] that it is divided by, in float64."""
+    count = scene.splats.count
+    sums, D = np.zeros((count, CHANNELS)), np.zeros(count)
+    for name, view in scene.views.items():
+        A = weights_of(scene, name, GAIN if preset == "tikhonov" else 1.0)
+        if preset == "tikhonov":
+            A = A**2
+        if preset == "argmax":
+            A = np.where(np.arange(count) == A.argmax(axis=1)[:, None], A, 0)
+        if isinstance(view, lc.FeatureGrid):
+            sums += A.T @ read_grid(view.grid.double().numpy())
+            D += A.sum(axis=0)
+            continue
+        for labels in view.labels.numpy().reshape(len(view.labels), -1):
+            is_labelled = labels >= 0
+            sums += A[is_labelled].T @ view.codebook.double().numpy()[labels[is_labelled]]
+            D += A[is_labelled].sum(axis=0)
+    return np.divide(sums, D[:, None], out=np.zeros_like(sums), where=D[:, None] > 0), D
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("grids", [False, True])
+@pytest.mark.parametrize("preset", ["row-sum", "tikhonov", "argmax"])
+def test_lift_equals_its_dense_definition(preset: str, grids: bool, kernel: str) -> None:
+    scene = random_scene(11, count=60, grids=grids, kernel=kernel, wrong=0.3)
+    X, D = dense_lift(scene, preset)
+    result = lc.lift(*scene.arguments(), preset=preset, progress=False)
+    clear = D > 1e-4
+    assert clear.sum() > (10 if preset == "argmax" else 30)
+    error = np.linalg.norm(result.features.double().numpy() - X, axis=1)[clear]
+    assert (error / np.linalg.norm(X, axis=1)[clear]).max() < 1e-3
+    assert result.has_feature.numpy()[clear].all()
+    total = sum(weights_of(scene, name).sum(axis=0) for name in scene.views)
+    np.testing.assert_allclose(result.total_weight.numpy(), total, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("settings", [{"preset": "row-sum"}, {"preset": "tikhonov"}, {}], ids=str)
+def test_region_weights_times_codebooks_are_the_lift(settings: dict[str, Any]) -> None:
+    scene = random_scene(wrong=0.3)
+    weights = lc.region_weights(*scene.arguments(), reweight=not settings, progress=False, **settings)
+    W = weights.matrix(scene.splats.count)
+    E = np.concatenate([scene.views[name].codebook.double().numpy() for name in weights.views])
+    result = lc.lift(*scene.arguments(), dtype="float32", progress=False, **settings)
+    sums = W.sum(axis=1)
+    has_feature = result.has_feature.numpy() & (sums > 1e-6)
+    assert has_feature.sum() > 100
+    expected = (W @ E)[has_feature] / sums[has_feature, None]
+    np.testing.assert_allclose(result.features.numpy()[has_feature], expected, rtol=1e-4, atol=1e-5)
+
+
+def agreement(result: lc.LiftResult, truth: lc.LiftResult) -> float:
+    """Return the mean cosine of features to those of correct masks."""
+    a, b = result.features.double().numpy(), truth.features.double().numpy()
+    rows = (np.linalg.norm(a, axis=1) > 0) & (np.linalg.norm(b, axis=1) > 0)
+    cosines = (a * b).sum(axis=1)[rows] / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))[rows]
+    return float(cosines.mean())
+
+
+def test_reweighting_mends_masks_that_merge_things() -> None:
+    """In a third of the views one mask covers all: others tell its halves apart, which row sums cannot weigh."""
+    scene = random_scene(13, count=300, views=9, wrong=0.0)
+    views, merged = {}, {}
+    for number, (name, view) in enumerate(scene.views.items()):
+        assert isinstance(view, lc.Regions)
+        halves = view.labels[:1].clamp(max=1)
+        book = np.eye(6, CHANNELS, dtype=np.float32)
+        views[name] = lc.Regions(halves, book)
+        merged[name] = lc.Regions(halves * 0 + 2, book) if number % 3 == 0 else views[name]
+    truth = lc.lift(scene.splats, scene.cameras, views, preset="row-sum", progress=False)
+    plain = lc.lift(scene.splats, scene.cameras, merged, preset="row-sum", progress=False)
+    robust = lc.lift(scene.splats, scene.cameras, merged, progress=False)
+    assert agreement(plain, truth) < 0.97
+    assert 1 - agreement(robust, truth) < 0.5 * (1 - agreement(plain, truth))
+
+
+def test_objects_and_their_parts_are_those_of_the_masks() -> None:
+    """Halves are two objects, quarters their four parts: each splat lies in those of its place."""
+    scene = random_scene(17, count=300, views=9, wrong=0.02)
+    result = lc.lift(*scene.arguments(), progress=False)
+    assert result.object is not None and result.node is not None and result.node_parents is not None
+    x, y = scene.splats.means[:, 0].numpy(), scene.splats.means[:, 1].numpy()
+    tiny = scene.splats.log_scales.amax(dim=1).numpy() < -1.5
+    inside = tiny & (np.abs(x) > 0.3) & (np.abs(y) > 0.3) & (result.node.numpy() >= 0)
+    assert inside.sum() > 20
+    objects, nodes = result.object.numpy()[inside], result.node.numpy()[inside]
+    parents = result.node_parents.numpy()
+    assert int((parents < 0).sum()) == 2 and int((parents >= 0).sum()) == 4
+    for labels, places in ((objects, x[inside] > 0), (nodes, (x[inside] > 0) * 2 + (y[inside] > 0))):
+        pairs, counts = np.unique(np.stack([labels, places]), axis=1, return_counts=True)
+        largest = sum(counts[pairs[0] == label].max() for label in np.unique(labels))
+        assert largest > 0.9 * len(labels)
+
+
+def test_splats_of_a_cluster_take_its_feature_or_keep_their_own() -> None:
+    """The published aggregation: a cluster without a region that overlaps it enough changes nothing."""
+    scene = random_scene(19, count=300, views=6, wrong=0.0)
+    settings: dict[str, Any] = {"preset": "row-sum", "dtype": "float32", "progress": False}
+    plain = lc.lift(*scene.arguments(), **settings).features.numpy()
+    result = lc.lift(*scene.arguments(), aggregation=True, aggregation_cluster_size=5, **settings)
+    assert result.cluster is not None and result.cluster_features is not None
+    cluster, features, means = (x.float().numpy() for x in (result.cluster, result.features, result.cluster_features))
+    changed = 0
+    for number, mean in enumerate(means):
+        rows = cluster == number
+        assert rows.sum() >= 5
+        takes = np.allclose(features[rows], mean, atol=1e-3)
+        assert takes or np.array_equal(features[rows], plain[rows])
+        changed += int(takes)
+    assert changed >= 2
+    np.testing.assert_array_equal(features[cluster < 0], plain[cluster < 0])
+
+
+def test_smoothness_draws_neighbours_together_without_moving_their_mean() -> None:
+    scene = random_scene(23, grids=True)
+    plain, weak, strong = (
+        lc.lift(*scene.arguments(), preset="row-sum", smoothness=s, dtype="float32", progress=False).features.numpy()
+        for s in (0.0, 0.3, 30.0)
+    )
+    spreads = [float(np.var(X[np.linalg.norm(X, axis=1) > 0], axis=0).sum()) for X in (plain, weak, strong)]
+    assert spreads[0] > spreads[1] > spreads[2]
+
+
+def test_plan_names_the_views_of_the_lift_and_bounds_its_features() -> None:
+    scene = random_scene()
+    plan = lc.plan(*scene.arguments(), view_stride=2)
+    result = lc.lift(*scene.arguments(), view_stride=2, progress=False)
+    assert plan.views == result.views == ("v0", "v2")
+    assert plan.memory_bytes >= result.features.numpy().nbytes
