@@ -38,12 +38,6 @@ def scene(tmp_path):
     return paths, lc.read_splats(paths[0]), lc.read_cameras(paths[1]), {f"v{k}": observed(3, k) for k in range(3)}
 
 
-def as_numpy(view):
-    if isinstance(view, lc.Regions):
-        return lc.Regions(view.labels.numpy(), view.codebook.numpy())
-    return lc.FeatureGrid(view.grid.numpy())
-
-
 def public_names() -> dict[str, list[str]]:
     """Return the public names of each public module."""
     return {name: import_module(name).__all__ for name in ("liftcore", *(f"liftcore.{module}" for module in MODULES))}
@@ -92,23 +86,6 @@ def test_import_loads_neither_torch_nor_numba():
     assert json.loads(stdout) == []
 
 
-@pytest.mark.parametrize("form", ["dict", "numpy", "iterator", "pack"])
-def test_lift_of_values_has_the_bits_of_the_lift_of_files(scene, form):
-    (splats, cameras, pack), cloud, poses, views = scene
-    forms = {
-        "dict": lambda: views,
-        "numpy": lambda: {name: as_numpy(view) for name, view in views.items()},
-        "iterator": lambda: iter(views.items()),
-        "pack": lambda: lc.read_features(pack),
-    }
-    expected = lift_files(splats, cameras, [pack], lc.LiftSettings.of(preset="row-sum"))
-    result = lc.lift(cloud, poses, forms[form](), preset="row-sum")
-    for name in ("features", "total_weight", "view_consistency", "has_feature"):
-        assert torch.equal(getattr(result, name), getattr(expected, name))
-    assert result.views == expected.views == ("v0", "v1", "v2")
-    assert result.diagnostics["residual"] == pytest.approx(expected.diagnostics["residual"], rel=0.5)
-
-
 def test_iterator_is_taken_one_view_at_a_time_and_once(scene):
     _, splats, cameras, views = scene
     read_names = []
@@ -122,15 +99,6 @@ def test_iterator_is_taken_one_view_at_a_time_and_once(scene):
     result = lc.lift(splats, cameras, each())
     assert read_names == list(views)
     assert result.diagnostics["views_without_camera"] == ["nobody"]
-
-
-def test_saved_result_opens_as_it_was(scene, tmp_path):
-    _, splats, cameras, views = scene
-    result = lc.lift(splats, cameras, views, robust_steps=1)
-    result.save(tmp_path / "made.safetensors")
-    reopened = lc.load_lift(tmp_path / "made.safetensors")
-    assert torch.equal(result.features, reopened.features) and reopened.settings == result.settings
-    assert result.settings.robust_steps == 1
 
 
 def test_plan_chooses_what_the_lift_takes(scene):

@@ -276,36 +276,3 @@ def test_what_needs_all_rays_or_features_is_refused_before(
 @pytest.fixture(scope="module")
 def lift(scene: dict[str, Any]) -> lc.LiftResult:
     return lc.lift(*scene.values(), preset="row-sum", diagnostic_rays=0)
-
-
-def test_shards_read_as_one_file(scene: dict[str, Any], lift: lc.LiftResult, tmp_path: Path) -> None:
-    from safetensors import safe_open
-
-    lift.save(tmp_path / "one.safetensors")
-    lift.save(tmp_path / "lift.shards")
-    assert_same(lc.load_lift(tmp_path / "lift.shards"), lc.load_lift(tmp_path / "one.safetensors"))
-    with safe_open(
-        tmp_path / "lift.shards/features-00000.safetensors", framework="pt"
-    ) as file:  # as anybody reads them
-        assert torch.equal(file.get_tensor("features-00000"), lift.features)
-    answer = lc.load_lift(tmp_path / "lift.shards").query(np.ones((1, 4)), splats=scene["splats"])
-    assert answer.scores.shape == (COUNT,)
-
-
-@pytest.mark.parametrize(
-    ("file", "content", "message"),
-    [
-        ("lift.safetensors.index.json", b"{}", "an index without metadata"),
-        ("lift.safetensors.index.json", b'{"metadata": {}, "weight_map": {"a": "../../etc/x"}}', "an index of"),
-        ("features-00000.safetensors", b"\x08\0\0\0\0\0\0\0{}      ", "is no shard"),
-        ("features-00000.safetensors", None, "got no features-00000.safetensors in it"),
-    ],
-)
-def test_broken_shards_are_refused(
-    lift: lc.LiftResult, tmp_path: Path, file: str, content: bytes | None, message: str
-) -> None:
-    lift.save(tmp_path / "lift.shards")
-    path = tmp_path / "lift.shards" / file
-    path.unlink() if content is None else path.write_bytes(content)
-    with pytest.raises(lc.InvalidLift, match=message):
-        lc.load_lift(tmp_path / "lift.shards")

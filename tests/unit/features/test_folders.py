@@ -15,7 +15,6 @@ from safetensors.numpy import save_file
 from liftcore.errors import InvalidFeatures
 from liftcore.features.folders import Layout, array_views, files_below, langsplat_views
 from liftcore.features.masks import mask_views
-from liftcore.io.npy import open_npy
 from liftcore.io.photo_zip import describe_photos
 from liftcore.values.pack import read_features, write_pack
 from liftcore.values.views import FeatureGrid, Regions
@@ -84,63 +83,6 @@ def test_array_folder_becomes_a_pack(layout, tmp_path: Path) -> None:
     assert packs.channels == 4
     for view in ("a", "b"):
         assert np.array_equal(packs[view].codebook.numpy(), grid.reshape(6, 4))
-
-
-def test_arrays_that_are_no_maps_are_refused(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", np.zeros((5, 2, 3, 4), np.float32))
-    np.save(tmp_path / "b.npy", np.zeros((2, 3, 4), np.int32))
-    for view in ("a", "b"):
-        with pytest.raises(InvalidFeatures, match=r"floats \[h, w, F\]"):
-            array_views(tmp_path)[view]
-    np.save(tmp_path / "a.npy", np.array([[[1.0, 1e300]]]))
-    with pytest.raises(InvalidFeatures, match=r"'a' grid: expected finite values .*got 1 of 2"):
-        write_pack(tmp_path / "pack", array_views(tmp_path), {})
-
-
-def test_folder_without_arrays_says_why(tmp_path: Path) -> None:
-    with pytest.raises(InvalidFeatures, match="no such folder"):
-        array_views(tmp_path / "nowhere")
-    with pytest.raises(InvalidFeatures, match="0 other files"):
-        array_views(tmp_path)
-    (tmp_path / "a.pkl").write_bytes(b"never opened")
-    with pytest.raises(InvalidFeatures, match=r"1 pickles \(a\.pkl\), which can run code.*numpy\.save"):
-        array_views(tmp_path)
-
-
-def npy_of_shape(shape: tuple[int, ...]) -> bytes:
-    content = io.BytesIO()
-    np.lib.format.write_array_header_1_0(content, {"descr": "<f4", "fortran_order": False, "shape": shape})
-    return content.getvalue() + b"16 bytes of data"
-
-
-def npy_of_objects() -> bytes:
-    content = io.BytesIO()
-    np.save(content, np.array([{}], dtype=object))
-    return content.getvalue()
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (None, "No such file"),
-        (b"", r"a \.npy file"),
-        (b"\x93NUMPY", r"a \.npy file"),
-        (b"not an array", r"a \.npy file"),
-        (b"\x93NUMPY\x01\x00\x05\x00{'x':", r"a \.npy file"),
-        (b"\x93NUMPY\x03\x00\x00\x00\x00\x00", r"a \.npy file"),
-        (npy_of_objects(), "which may run code"),
-        (npy_of_shape((1 << 40,)), "as its header says, got a file of"),
-        (npy_of_shape((1 << 20, 1 << 20, 1 << 20)), "as its header says, got a file of"),
-        (npy_of_shape((0, 4)), "as its header says, got a file of"),
-        (npy_of_shape((-4,)), "as its header says, got a file of"),
-    ],
-)
-def test_arrays_that_are_broken_or_bombs_are_refused(content: bytes | None, message: str, tmp_path: Path) -> None:
-    if content is not None:
-        (tmp_path / "a.npy").write_bytes(content)
-    with pytest.raises(InvalidFeatures, match=message) as error:
-        open_npy(tmp_path / "a.npy")
-    assert "\n" not in str(error.value)
 
 
 UNRELATED_FILES = (

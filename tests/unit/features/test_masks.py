@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,6 @@ OVERLAPPING = np.stack([MASKS[0] | MASKS[1], MASKS[1], MASKS[2]])
 GREY, VALUES_255 = (LABELS + 1).astype(np.uint8), np.where(LABELS < 0, 255, LABELS).astype(np.uint8)
 PALETTE = Image.fromarray(GREY)
 PALETTE.putpalette([255, 0, 0, 0, 255, 0, 0, 0, 255])
-LARGE = np.random.default_rng(0).integers(0, 4, (128, 128), np.uint8)
 
 
 def save(folder: Path, files: dict[str, Any]) -> None:
@@ -45,12 +43,6 @@ def save(folder: Path, files: dict[str, Any]) -> None:
             (content if isinstance(content, Image.Image) else Image.fromarray(content)).save(path)
         else:
             path.write_text(content if isinstance(content, str) else json.dumps(content), encoding="utf-8")
-
-
-def png(values: np.ndarray) -> bytes:
-    content = io.BytesIO()
-    Image.fromarray(values).save(content, format="PNG")
-    return content.getvalue()
 
 
 KINDS: dict[str, dict[str, Any]] = {
@@ -128,63 +120,6 @@ def test_files_without_their_partners_are_refused(files: str, message: str, tmp_
     save(tmp_path, dict.fromkeys(files.split(), b"not opened yet"))
     with pytest.raises(InvalidFeatures, match=message):
         mask_views(tmp_path)
-
-
-def of_vectors(vectors: np.ndarray) -> dict[str, Any]:
-    return {"a.npy": vectors, "a_masks.npy": LABELS}
-
-
-OBJECTS = np.array([[None]], dtype=object)
-OTHER_SIZE = sam_records(MASKS[2:, :2])
-INVALID_FILES: list[tuple[dict[str, Any], str]] = [
-    (of_vectors(np.zeros(3, np.float32)), r"floats \[M, F\]"),
-    (of_vectors(np.zeros((3, 5), np.int32)), r"floats \[M, F\], got int32"),
-    (of_vectors(OBJECTS), "Python objects, which may run code"),
-    (of_vectors(VECTORS[:2]), r"ids in -1\.\.1, got ids from -1 to 2"),
-    (of_vectors(np.where(VECTORS == 7, np.nan, VECTORS)), r"view 'a' codebook.*1 of 15"),
-    (of_vectors(np.where(VECTORS == 7, 1e300, VECTORS.astype(np.float64))), r"view 'a' codebook.*1 of 15"),
-    ({"a_masks.npy": MASKS[:2]}, r"a_masks.npy.* 3 masks, one a vector, got bool \[2, 3, 4\]; row k of the vectors"),
-    ({"a_masks.npy": OVERLAPPING.T}, r"got bool \[4, 3, 3\]; row k .*, and masks are the first axis: \[M, H, W\]"),
-    ({"a_masks.npy": MASKS[0]}, r"booleans \[M, H, W\], got bool \[3, 4\]"),
-    ({"a_masks.npy": MASKS.astype(np.uint8)}, r"zeros and ones; .*astype\(bool\)"),
-    ({"a_masks.npy": np.full((3, 4), 3)}, r"ids in -1\.\.2"),
-    ({"a_masks.npy": np.full((3, 4), 255, np.uint8)}, r"got ids from 255 to 255"),
-    ({"a_masks.npy": np.full((3, 4), 0.5)}, "whole numbers"),
-    ({"a_masks.npy": np.zeros((2, 1, 3, 4), np.int32)}, r"mask ids \[L, H, W\]"),
-    ({"a_masks.npy": OBJECTS}, "Python objects, which may run code"),
-    ({"a_masks.npy": np.array(["a"])}, "an array of numbers"),
-    ({"a.json": ""}, r"a\.json.*invalid JSON"),
-    ({"a.json": '[{"segmentation": {"size": [3'}, "invalid JSON"),
-    ({"a.json": "[" * 100_000}, "invalid JSON"),
-    ({"a.json": 3}, r"a list of masks, or \{'annotations': \[\.\.\.\]\}, got none"),
-    ({"a.json": {"frames": [], "w": 3}}, "an object of 'frames', 'w'; move files without views out of it"),
-    ({"a.json": []}, "3 masks, one a vector, got 0; remove views without masks"),
-    ({"a.json": sam_records(MASKS[:2])}, "3 masks, one a vector, got 2; row k of the vectors belongs to mask k"),
-    ({"a.json": [*sam_records(MASKS[:2]), 3]}, r"a\.json mask 2: expected a segmentation"),
-    ({"a.json": [*sam_records(MASKS[:2]), *OTHER_SIZE]}, "one size, got 3 x 4 of mask 0 and 2 x 4 of mask 2"),
-    (
-        {"a.png": GREY + 1},
-        r"values 1\.\.3 for 3 vectors, and 0 for none, got values up to 4; give the value of .*--unlabelled",
-    ),
-    ({"a.png": VALUES_255}, r"got values up to 255; .*--unlabelled \(255, 65535\)"),
-    ({"a.png": LABELS.clip(0).astype(np.uint8)}, r"got values up to 2; remove a vector for 0"),
-    ({"a.png": np.zeros((3, 4), np.uint8)}, "got values up to 0"),
-    ({"a.png": Image.new("RGB", (4, 3))}, "red, green and blue of 8 bits; move photos to another folder"),
-    ({"a.png": Image.new("RGBA", (4, 3))}, "colours with transparency of 8 bits"),
-    ({"a.png": Image.new("LA", (4, 3))}, "grey with transparency of 8 bits"),
-    ({"a.png": Image.new("1", (4, 3))}, "grey of 1 bits"),  # Pillow spreads fewer bits of grey over 0 to 255
-    *(({"a.png": png(LARGE)[:length]}, r"a\.png: expected a PNG of one channel") for length in (0, 30, 60, 2000)),
-]
-
-
-@pytest.mark.parametrize(("files", "message"), INVALID_FILES)
-def test_files_that_hold_no_masks_of_their_vectors_are_refused(
-    files: dict[str, Any], message: str, tmp_path: Path
-) -> None:
-    save(tmp_path, {"a.npy": VECTORS, **files})
-    with pytest.raises(InvalidFeatures, match=message) as error:
-        write_pack(tmp_path / "pack", mask_views(tmp_path), {})
-    assert "\n" not in str(error.value) and not (tmp_path / "pack").exists()
 
 
 def test_values_that_begin_at_one_are_refused_where_zero_was_expected(tmp_path: Path) -> None:

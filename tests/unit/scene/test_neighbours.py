@@ -68,10 +68,3 @@ def test_splats_at_one_place_are_neighbours(count: int) -> None:
     inside = matrix[:count, :count]
     assert (inside.sum(axis=1) >= min(count - 1, NEIGHBOURS) / 2).all()
     assert (inside[inside > 0] >= 0.5).all()
-
-
-def test_graph_is_the_same_for_any_number_of_threads() -> None:
-    splats = random_splats(0, 9_000)
-    one_thread, three_threads = (SplatGraph.of(splats, threads) for threads in (1, 3))
-    for name in ("order", "starts", "neighbours", "affinities"):
-        assert np.array_equal(getattr(one_thread, name), getattr(three_threads, name))

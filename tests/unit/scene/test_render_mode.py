@@ -17,7 +17,6 @@ import liftcore as lc
 from liftcore.errors import InvalidSettings, InvalidSplats
 from liftcore.evaluate.inspect import inspect_file
 from liftcore.io.splats import read_splats, some_rows, with_columns, write_splats
-from liftcore.lifting.files import lift_files
 from liftcore.query.render import _as_trained as params_of_renders
 from liftcore.query.scene import Scene
 from liftcore.scene.kernel import Kernel
@@ -245,17 +244,6 @@ def test_commands_follow_the_file_tell_it_and_take_a_setting_by_hand(
     assert "says so" in report["diagnostics"]["plan"]["rendering"]
     assert run(capsys, "lift", splats, cameras, packs, "-o", out, "--set", "antialiased=false")[0] == 0
     assert not Scene(out).compositing.antialiased
-
-
-def test_a_lift_from_before_keeps_the_kernel_that_it_was_lifted_with(tmp_path: Path) -> None:
-    splats, cameras, packs = write_scene(tmp_path, 7)
-    splats.write_bytes(splats.read_bytes().replace(b"element", b"comment SplatRenderMode: 2dgs\nelement", 1))
-    result = lift_files(splats, cameras, [packs], LiftSettings.of(preset="row-sum", kernel="3dgs"))
-    settings = result.settings.model_copy(update={"kernel": "auto", "antialiased": False})
-    metadata = result.metadata.model_copy(update={"settings": settings})
-    replace(result, metadata=metadata).save(tmp_path / "old.safetensors")
-    scene = Scene(tmp_path / "old.safetensors")
-    assert scene.splats.kernel is Kernel.GAUSSIAN_3D and not scene.compositing.antialiased
 
 
 def splats_of(splats: Splats, row: int) -> Splats:

@@ -17,8 +17,6 @@ from liftcore.io.splats import labelled, read_labels, read_splats, write_splats
 from liftcore.io.transforms import FRAME_FILE
 from liftcore.io.usd import open_library
 from liftcore.scene.world import UNKNOWN, UPRIGHT, WorldFrame
-from liftcore.values.lift import LiftMetadata
-from liftcore.values.lift_file import open_lift
 from tests.unit.scene.test_gltf import FILES, assert_same, join, labels, parts_of, some_splats, write
 from tests.unit.scene.test_usd import needs_usd
 
@@ -155,21 +153,3 @@ def test_what_is_no_direction_or_length_is_refused_by_its_name(fields: dict[str,
 def test_a_known_distance_gives_the_length_of_a_unit() -> None:
     distance: Any = {"between": ((0, 0, 0), (0, 3, 4)), "metres": 2}
     assert WorldFrame(distance=distance) == WorldFrame(metres_per_unit=0.4)
-
-
-def test_a_lift_knows_its_frame_and_lifts_of_before_know_none(tmp_path: Path) -> None:
-    from tests.scenes import observed, random_splats, write_scene
-
-    _, cameras_file, _ = write_scene(tmp_path, 2)
-    cameras = lc.read_cameras(cameras_file)
-    cameras.world = WorldFrame(up=(0, 0, 1), metres_per_unit=3)
-    splats = replace(random_splats(3), world=WorldFrame(metres_per_unit=2))
-    lift = lc.lift(splats, cameras, {f"v{k}": observed(2, k) for k in range(2)}, preset="row-sum", progress=False)
-    assert lift.metadata.world == WorldFrame(up=(0, 0, 1), metres_per_unit=2), "splats come before cameras"
-    lift.with_world(WorldFrame(up=(0, -1, 0))).save(tmp_path / "l.safetensors")
-    copy = open_lift(tmp_path / "l.safetensors")
-    assert copy.metadata.world == WorldFrame(up=(0, -1, 0), metres_per_unit=2)
-    assert copy.transformed(scale=2.0).metadata.world == WorldFrame(up=(0, -1, 0), metres_per_unit=1)
-    fields = copy.metadata.model_dump()
-    del fields["world"]
-    assert LiftMetadata(**fields).world == UNKNOWN

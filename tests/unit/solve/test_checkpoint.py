@@ -115,37 +115,12 @@ def test_views_that_meet_no_label_are_kept_and_not_walked_again(
     assert_same(uninterrupted, resumed)
 
 
-def test_lift_killed_beside_views_in_work_walks_them_again_to_the_same_bits(
-    tmp_path: Path, rasterized_views: list[str]
-) -> None:
-    scene = write_scene(tmp_path, 3)
-    uninterrupted = lifted(scene, threads=2)
-    rasterized_views.clear()
-    checkpoint = Checkpoint(tmp_path / "kept", seconds=0)
-    kill_lift(scene, "geometry", 1, threads=2, checkpoint=checkpoint)
-    resumed = lifted(scene, threads=2, checkpoint=checkpoint)
-    assert rasterized_views.count("v0") == 1
-    assert {"v1", "v2"} <= set(rasterized_views)
-    assert_same(uninterrupted, resumed)
-
-
 def test_lift_killed_while_it_solves_walks_no_view_again(tmp_path: Path, rasterized_views: list[str]) -> None:
     scene, checkpoint = write_scene(tmp_path, 4), Checkpoint(tmp_path / "kept")
     kill_lift(scene, "solve", 1, checkpoint=checkpoint)
     resumed = lifted(scene, checkpoint=checkpoint)
     assert sorted(rasterized_views) == ["v0", "v1", "v2"]
     assert_same(lifted(scene), resumed)
-
-
-def test_checkpoint_of_another_walk_or_other_splats_is_never_used(
-    tmp_path: Path, rasterized_views: list[str]
-) -> None:
-    scene = write_scene(tmp_path, 5)
-    checkpoint = Checkpoint(tmp_path / "kept", seconds=0)
-    lifted(scene, LiftSettings.of(preset="row-sum"), checkpoint=checkpoint)
-    second = lifted(scene, LiftSettings.of(preset="tikhonov"), checkpoint=checkpoint)
-    assert len(rasterized_views) == 6
-    assert_same(lifted(scene, LiftSettings.of(preset="tikhonov")), second)
 
 
 @pytest.mark.parametrize("grids", [False, True])

@@ -54,16 +54,6 @@ def test_a_feature_far_from_every_cluster_stays_unclustered():
     assert labels[7] == labels[8] == NO_CLUSTER
 
 
-@pytest.mark.parametrize("channels", [1, 24])
-def test_the_number_of_threads_changes_no_label(channels):
-    features, _ = planted(20_000, channels)
-    features[::3] *= -1
-    few = SETTINGS.model_copy(update={"aggregation_sample": 500})
-    runs = [cluster_splats(features, np.ones(20_000), few, threads).labels for threads in (1, 2, 5)]
-    assert runs[0].max() >= 1
-    assert all(torch.equal(runs[0], other) for other in runs[1:])
-
-
 @pytest.mark.parametrize(
     "features",
     [

@@ -12,7 +12,7 @@ from liftcore.solve import consensus, consensus_on_card
 from liftcore.solve.consensus import MOST_SPLATS, MOST_WITNESSES, OBSERVES, PRIOR, mask_consensus
 from liftcore.solve.consensus_on_card import mask_consensus_on_card
 from liftcore.solve.membership import BELONGS, FAINT
-from liftcore.solve.reweight import SHARPNESS, Reweighting, reweighting_factors
+from liftcore.solve.reweight import SHARPNESS, reweighting_factors
 from liftcore.values.levels import region_levels
 from liftcore.values.region_weights import RegionWeights, stacked
 from liftcore.values.views import Regions
@@ -275,21 +275,6 @@ def test_reliability_and_confidence_equal_their_definition(seed: int, on_card: b
     np.testing.assert_allclose(got.confidence.numpy(), confidence, rtol=2e-3, atol=1e-5)
     consistency = got.feature_consistency.numpy()[W.row_sums().numpy() > 0]
     np.testing.assert_allclose(consistency, feature_consistency[W.row_sums().numpy() > 0], rtol=2e-3, atol=1e-5)
-
-
-def test_reliability_changes_no_bit_with_threads() -> None:
-    W, levels = random_scene(3, views=6)
-    q = torch.from_numpy(mask_consensus(W, levels))
-
-    def reweight(threads: int) -> Reweighting:
-        return reweighting_factors(
-            W, codebook_of(books_of(W, 3)), 1, threads=threads, reliability=all_regions(W), consensus=q
-        )
-
-    first, second = reweight(1), reweight(2)
-    assert torch.equal(first.factors, second.factors)
-    assert first.confidence is not None and second.confidence is not None
-    assert torch.equal(first.confidence, second.confidence)
 
 
 def test_a_region_with_a_wrong_word_loses_weight_everywhere() -> None:

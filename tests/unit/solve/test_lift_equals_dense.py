@@ -18,14 +18,14 @@ from liftcore.lifting.files import lift_files
 from liftcore.lifting.geometry import strided
 from liftcore.query.directions import directions
 from liftcore.query.question import Query
-from liftcore.query.result import LiftResult, load_lift
+from liftcore.query.result import load_lift
 from liftcore.query.scene import Scene
 from liftcore.query.terms import Region
 from liftcore.raster.reference import dense_view, reading_matrix, selected_weights, strided_rays
 from liftcore.scene.cameras import Cameras
 from liftcore.scene.compositing import CompositingParams, Selection, Weighting
 from liftcore.scene.splats import Kernel, Splats
-from liftcore.values.lift_file import CLUSTER_TENSORS, TENSORS, save_lift
+from liftcore.values.lift_file import save_lift
 from liftcore.values.pack import read_features, write_pack
 from liftcore.values.settings import LiftSettings
 from liftcore.values.views import Regions
@@ -125,31 +125,6 @@ def test_view_consistency_is_the_norm_of_the_mean_of_unit_inputs(tmp_path, prese
     norms = torch.linalg.vector_norm(got.features, dim=1)  # the codebooks are unit vectors
     assert torch.allclose(got.view_consistency, norms, atol=1e-5)
     assert float(got.view_consistency.max()) <= 1.0
-
-
-def same_bits(first: LiftResult, second: LiftResult) -> bool:
-    """Return True if all tensors and the diagnostics of two lifts are bitwise identical."""
-    names = [name for name in (*TENSORS, *CLUSTER_TENSORS) if getattr(first, name) is not None]
-    are_equal = all(torch.equal(getattr(first, name), getattr(second, name)) for name in names)
-    return are_equal and first.metadata.diagnostics == second.metadata.diagnostics
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {},
-        {"preset": "top-k", "k": 3},
-        {"preset": "centre", "stride": 2},
-        {"levels": "composite"},
-        {"cg_steps": 5, "damping": 0.1, "cg_basis": 3, "reference_channels": 4},
-        {"aggregation": True, "aggregation_cluster_size": 5},
-    ],
-    ids=str,
-)
-def test_the_number_of_threads_changes_no_bit_of_a_lift(tmp_path, settings):
-    paths = write_scene(tmp_path, 7)
-    single, threaded = (lift_files(*paths[:2], paths[2:], LiftSettings.of(**settings), threads=n) for n in (1, 5))
-    assert same_bits(single, threaded)
 
 
 def test_weights_in_files_give_the_same_lift_as_weights_in_memory(tmp_path, monkeypatch):

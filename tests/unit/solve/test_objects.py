@@ -142,9 +142,3 @@ def test_views_beyond_the_bound_join_what_the_others_found(monkeypatch: pytest.M
     regions = scene_objects.tree.region
     assert len(scene_objects.views) == 4 and (regions >= 0).all()
     np.testing.assert_array_equal(regions.reshape(12, 4), regions[:4][None].repeat(12, axis=0))
-
-
-def test_the_number_of_threads_changes_no_label() -> None:
-    W, levels = mistaken_scene(3, views=9)
-    single, threaded = (region_objects(W, levels, np.ones(SPLATS), threads) for threads in (1, 5))
-    np.testing.assert_array_equal(single.labels, threaded.labels)

@@ -137,11 +137,3 @@ def test_levels_that_differ_give_a_warning_and_stay_separate() -> None:
     vectors = NodeVectors.of(Codebook([ViewCodebook(rows) for rows in similar]), totals, objects)
     assert vectors.level_agreement is not None and vectors.level_agreement > 0.9
     assert "warning" not in object_facts(objects, vectors)
-
-
-def test_the_number_of_threads_changes_no_node() -> None:
-    W, levels, _ = three_levels(3)
-    single, threaded = (region_objects(W, levels, np.ones(SPLATS), threads) for threads in (1, 5))
-    np.testing.assert_array_equal(single.node, threaded.node)
-    for name, part in vars(single.tree).items():
-        np.testing.assert_array_equal(getattr(threaded.tree, name), part)

@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from liftcore.errors import InvalidSettings
-from liftcore.values.lift import LiftMetadata
 from liftcore.values.lift_options import LiftOptions
-from liftcore.values.settings import LiftSettings, Preset, Quality
+from liftcore.values.settings import LiftSettings, Preset
 
 LEVELS = "'rows' or 'composite' or a valid integer"
 
@@ -88,17 +87,6 @@ def test_a_preset_only_fills_settings_that_are_not_given(preset: Preset) -> None
     assert (explicit.power, explicit.weight_floor, explicit.selection, explicit.mass) == (1, 0.25, "front-mass", 0.5)
     assert explicit.render_gain == preset_settings.render_gain
     assert LiftSettings.of(**preset_settings.model_dump(mode="json")) == preset_settings
-
-
-@pytest.mark.parametrize("quality", Quality)
-def test_a_lift_from_before_a_setting_has_the_value_of_its_time(quality: Quality) -> None:
-    settings = LiftSettings.of(quality=quality)
-    value = LiftMetadata(version="1", settings=settings, views=("a",), diagnostics={}, timings={})
-    document = value.model_dump(mode="json")
-    assert LiftMetadata.model_validate(document).settings == settings
-    del document["settings"]["robust_directions"], document["settings"]["consensus"]
-    old = LiftMetadata.model_validate(document).settings
-    assert old == settings.model_copy(update={"robust_directions": 256, "consensus": False})
 
 
 def test_keyword_arguments_of_a_lift_are_typed_as_its_settings() -> None:

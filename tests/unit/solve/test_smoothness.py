@@ -102,14 +102,6 @@ def test_splats_without_weight_take_the_mean_of_their_neighbours(seed: int, unse
     assert not X[~has_weight].any()
 
 
-def test_number_of_threads_changes_no_bit() -> None:
-    scene = Scene(0, 9_000, channels=40)
-    expected = scene.smooth(1.0)
-    assert not torch.equal(expected, scene.X)
-    for options in ({"threads": 1}, {"threads": 3}):
-        assert torch.equal(scene.smooth(1.0, **options), expected), options
-
-
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float32])
 @pytest.mark.parametrize("longest", [6e4, 1e-6])
 def test_no_channel_leaves_the_range_of_the_features(dtype: torch.dtype, longest: float) -> None:
@@ -150,7 +142,6 @@ def test_features_that_are_one_stay_as_they_are() -> None:
     assert "not at all" in smoothing_line(facts)
 
 
-SPLATS_OF_FIELD = 17_000  # more than are sampled or solved at once
 PLACES = np.random.default_rng(2).random((900, 2))  # of splats on a square
 STRIPE_LABELS = (4 * PLACES[:, 0]).astype(int)  # four stripes
 STRIPES = np.random.default_rng(4).normal(size=(4, 6))[STRIPE_LABELS]
@@ -186,14 +177,6 @@ def test_strength_is_large_for_noise_and_small_for_features_that_vary_by_splat()
         (np.random.default_rng(7).normal(size=STRIPES.shape), 0.3),
     ):
         assert choose(truth, noise).smoothness <= STRENGTHS[0]
-
-
-def test_strength_is_the_same_for_any_number_of_threads() -> None:
-    places = np.random.default_rng(8).random((SPLATS_OF_FIELD, 2))
-    truth = np.random.default_rng(4).normal(size=(4, 3))[(4 * places[:, 0]).astype(int)]
-    single, three = (choose(truth, 2.0, 2, places, threads=threads) for threads in (1, 3))
-    assert single == three
-    assert single.smoothness > 0
 
 
 @pytest.mark.parametrize("views", [1, 2])
