@@ -26,7 +26,8 @@ test: $(READY)  ## everything that must hold
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync lint kernels
 	@if [ -d $(SHARED) ]; then echo "real scenes: found in $(SHARED)"; \
 	else echo "real scenes: no $(SHARED) here, so the tests on them are skipped"; fi
-	$(BIN)/python -m pytest -rs --numprocesses=2 --dist=loadfile --no-loadscope-reorder --max-worker-restart=0
+	$(BIN)/python -m pytest -rs --durations=25 --numprocesses=2 --dist=loadfile --no-loadscope-reorder \
+	--max-worker-restart=0
 
 # Fast tests: one module at a time, nothing of a server, a second process, a real scene or many kernels.
 check: $(READY) lint  ## before a commit: lint, types and the fast tests, in 90 s once set up
