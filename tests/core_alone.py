@@ -1,18 +1,18 @@
 """Run the core without any extra: read, plan, lift, save, ask with a table, render, export.
 
-    python tests/core_alone.py [--block] [--as darwin|win32]
+    python tests/core_alone.py [--block]
 
 In an environment that has the wheel alone, no folder of this checkout is imported but the tiny scene's file.
-``--block`` refuses the packages of all extras, for environments that have them; ``--as`` takes away what that system
-lacks (``other_system.py``).
+``--block`` refuses the packages of all extras, for environments that have them.
 """
 
 import gc
 import sys
 import tempfile
 from argparse import ArgumentParser
-from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from importlib.util import find_spec
 from pathlib import Path
+from runpy import run_path
 from typing import Any
 
 EXTRAS = (
@@ -22,30 +22,16 @@ EXTRAS = (
 )
 
 
-def file_beside(name: str) -> Any:
-    """The module in a file below this one's folder."""
-    path = Path(__file__).parent / name
-    spec = spec_from_file_location(path.stem, path)
-    assert spec is not None and spec.loader is not None
-    module = module_from_spec(spec)
-    sys.modules[path.stem] = module
-    spec.loader.exec_module(module)
-    return module
-
-
 def main() -> None:
     parser = ArgumentParser(description="What the core does without any extra.")
     parser.add_argument("--block", action="store_true", help="refuse the packages of extras")
-    parser.add_argument("--as", dest="system", choices=("darwin", "win32"), help="take away what that system lacks")
     options = parser.parse_args()
     if options.block:
         sys.modules.update(dict.fromkeys(EXTRAS))  # pyright: ignore - None: no package of that name is there
-    if options.system:
-        file_beside("other_system.py").become(options.system)
     import liftcore as lc
     from liftcore.runtime.cores import cores
 
-    scene = file_beside("api/tiny_scene.py").make_scene()
+    scene = run_path(str(Path(__file__).parent / "tiny_scene.py"))["make_scene"]()
     with tempfile.TemporaryDirectory() as text:
         folder = Path(text)
         for name in ("splats.ply", "cameras.json", "features.safetensors", "table.safetensors"):
