@@ -45,7 +45,6 @@ kernels: $(READY)
 
 soak: $(READY)  ## the long proofs of docs/service.md: prints their figures, takes an hour or so
 	$(BIN)/python -m tests.benchmarks.soak
-	$(BIN)/python -m tests.benchmarks.mutations
 
 contract: $(READY)  ## every operation against the OpenAPI document, without keys and with them; some minutes
 	$(BIN)/python -m tests.api.contract

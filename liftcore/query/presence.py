@@ -15,7 +15,6 @@ the word is the nearest of all for less than a half. Otherwise the answer is **n
 - The best splats are the few with LEAST_SHARE of the scene's total weight: a threshold selects no less either.
 - References related to the word, with at least RELATED of the similarity of its nearest reference, are left out:
   a synonym does not compete. All words of an encoder share a cone, so they are compared about their mean.
-- ``tests.benchmarks.presence`` measures the constants.
 
 Reference words are the words of a table if it has enough of them, else the shipped ones of CLIP ViT-B/32, else
 vectors that the encoder computes once for the same words, which are cached in the user's cache folder.

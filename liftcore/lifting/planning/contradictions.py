@@ -9,7 +9,7 @@ features without any geometry: each region's cosine to the most similar region o
 is .39 to .91 on the scenes of the first tests, which include noisy, merged and wrong masks (.26 with 6 views). With
 positions times 0.3 it is .05 to .31, and with another scene's cameras .15 at most. If it is low, positions times
 other factors are the control: on healthy scenes these reach .42 of it at most, and on scenes whose positions are off
-by .3 or .5 at least 1.4 of it (``python -m tests.benchmarks.first_hour``). Half and double come first: if the
+by .3 or .5 at least 1.4 of it. Half and double come first: if the
 original scale reaches LEAST_AGREEMENT and neither of these more, the others are skipped, which saves half of the
 work.
 
