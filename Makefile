@@ -97,7 +97,6 @@ web: $(READY)  ## the page, from service/web/src into service/web/built
 	$(BIN)/python -m liftcore.io.kinds > service/web/src/kinds.json
 	$(BIN)/python -m liftcore.query.question > service/web/src/question.json
 	cd service/web && npm ci --silent && node build.mjs
-	cp service/web/node_modules/axe-core/axe.min.js tests/browser/axe.min.js
 
 # The site's tools are no part of the lock: they have an environment of their own, and read docstrings from .venv.
 docs: $(READY)  ## the docs site in build/site; a broken link or reference fails

@@ -15,7 +15,6 @@ FIND_COLOUR = (
     "splatlift.query.questions.every(asked => asked.answer && (asked.objects.length || !asked.count)) && "
     "(!splatlift.viewer || splatlift.viewer.settled)"
 )
-ERROR_SHOWN = "!document.querySelector('#toast').hidden && document.querySelector('#toast').classList.contains('bad')"
 AMBER, SKY = "255,176,0", "56,182,255"  # colours of the first and the second question
 # Columns of the picture, in hundredths of its width, of pixels whose hue is near to a colour's.
 COLUMNS = """((wanted, near, canvas) => {

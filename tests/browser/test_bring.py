@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import io
-import json
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
-import numpy as np
 import pytest
 from PIL import Image
 
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.splats import read_splats
-from liftcore.lifting.files import lift_files
-from liftcore.values.settings import LiftSettings
 from tests.still_life.files import write_still_life
 from tests.still_life.scene import still_life
-from tests.tiny_scene import cameras_document, colmap_zip, make_scene, ply, splat_rows
-from tests.unit.scene.camera_files import binary_files, text_files, write_files
+from tests.tiny_scene import colmap_zip, make_scene
 
 from .browser import Browser
 from .conftest import PageServer, serving
@@ -64,13 +59,7 @@ def empty(browser: Browser, files: dict[str, Path], tmp_path: Path) -> Iterator[
         browser.open(address)
         browser.until(OPEN)
         yield browser
-        browser.open("about:blank#")
-
-
-@pytest.mark.parametrize("scheme", ["dark", "light"])
-def test_accessibility_check_finds_nothing_serious_on_the_first_screen(empty: Browser, scheme: str) -> None:
-    empty.window(1280, 800, scheme)
-    assert empty.violations() == {}
+        browser.open("about:blank")
 
 
 def test_dropped_files_are_planned_compared_and_cancelled(empty: Browser, files: dict[str, Path]) -> None:
@@ -122,22 +111,7 @@ def test_lift_file_asks_for_what_it_was_made_of_and_opens(
     assert min(columns(empty, AMBER)) > 50
 
 
-def test_lift_file_looks_again_for_what_came_while_it_looked(
-    empty: Browser, server: PageServer, files: dict[str, Path], tmp_path: Path
-) -> None:
-    """The answers to its first look, taken before anything was sent, come after all is there."""
-    lift = tmp_path / "brought.safetensors"
-    lift.write_bytes(httpx.get(f"{server.address}/lifts/{server.lift}/features").content)
-    empty.value(HELD_ANSWERS)
-    empty.drop([lift])
-    empty.until("held.length === 2")
-    empty.drop([files["splats"], files["cameras"]])
-    empty.until("document.querySelectorAll('.file.done').length === 2")
-    empty.value("held.splice(0).forEach(late => late())")
-    empty.until(READY)
-
-
-def test_dropped_folder_brings_its_cameras(empty: Browser, files: dict[str, Path], tmp_path: Path) -> None:
+def test_dropped_folder_brings_its_cameras(empty: Browser, tmp_path: Path) -> None:
     model = tmp_path / "model"
     with zipfile.ZipFile(io.BytesIO(colmap_zip())) as archive:
         archive.extractall(model)
@@ -147,73 +121,19 @@ def test_dropped_folder_brings_its_cameras(empty: Browser, files: dict[str, Path
     empty.until("document.querySelectorAll('.file.done').length === 2")
     names = empty.value("[...document.querySelectorAll('.file.done .name')].map(name => name.textContent)")
     assert sorted(names) == ["model.zip", "point_cloud.ply"] and "3 views" in text_of(empty, "#sent")
-    empty.until("splatlift.viewer?.draft")
-    cone_positions = empty.value("[...splatlift.viewer.cones.geometry.attributes.position.array]")
-    empty.drop([files["cameras"]])  # the same cameras
-    empty.until("splatlift.viewer.cones.geometry.attributes.position.count === 3 * 16")
-    empty.until("splatlift.uploads.cameras[0].name !== 'left.png'")
-    same_positions = empty.value("[...splatlift.viewer.cones.geometry.attributes.position.array]")
-    assert len(cone_positions) == 3 * 16 * 3 and cone_positions == pytest.approx(same_positions, abs=1e-5)
 
 
-def test_binary_and_text_colmap_model_are_drawn_as_they_are_lifted(empty: Browser, tmp_path: Path) -> None:
-    for folder, content in (("binary", binary_files()), ("text", text_files())):
-        model = write_files(tmp_path / folder, content)
-        lifted = list(read_cameras(model).values())
-        empty.value("splatlift.uploads.cameras = []")
-        empty.drop([model])
-        empty.until(f"splatlift.uploads.cameras.length === {len(lifted)}")
-        views = empty.value("splatlift.uploads.cameras")
-        for key in ("width", "height", "fx", "fy"):
-            assert [view[key] for view in views] == [getattr(camera, key) for camera in lifted], (folder, key)
-        for view, camera in zip(views, lifted, strict=True):
-            assert np.array(view["viewmat"]) == pytest.approx(camera.viewmat, abs=1e-6), (folder, view["name"])
-
-
-@pytest.mark.parametrize("in_folder", [False, True], ids=["alone", "with its cameras"])
-def test_folder_of_a_sog_is_sent_as_one_file(
-    empty: Browser, files: dict[str, Path], tmp_path: Path, in_folder: bool
+def test_folder_of_a_sog_and_cameras_is_sent_as_two_files(
+    empty: Browser, files: dict[str, Path], tmp_path: Path
 ) -> None:
     with zipfile.ZipFile(SOG_FILE) as archive:
         archive.extractall(tmp_path / "my garden" / "splats")
-    if in_folder:
-        write_inria_cameras(read_cameras(files["cameras"]), tmp_path / "my garden" / "cameras.json")
+    write_inria_cameras(read_cameras(files["cameras"]), tmp_path / "my garden" / "cameras.json")
     empty.drop([tmp_path / "my garden"])
-    names = ["cameras.json"] * in_folder + ["my garden.sog"]
-    empty.until(f"document.querySelectorAll('.file.done').length === {len(names)}")
+    empty.until("document.querySelectorAll('.file.done').length === 2")
     file_names = "[...document.querySelectorAll('.file.done .name')].map(name => name.textContent).sort()"
-    assert empty.value(file_names) == names
+    assert empty.value(file_names) == ["cameras.json", "my garden.sog"]
     assert f"{read_splats(SOG_FILE).count} splats" in text_of(empty, "#sent")
-
-
-def test_dragging_turns_about_the_way_up_of_the_cameras(
-    empty: Browser, files: dict[str, Path], tmp_path: Path
-) -> None:
-    document = cameras_document()
-    for frame, x in zip(document["frames"], (-0.1, 0.0, 0.1), strict=True):  # they look along y, and z is up
-        frame["transform_matrix"] = [[1, 0, 0, x], [0, 0, -1, -4], [0, 1, 0, 0], [0, 0, 0, 1]]
-    (tmp_path / "upright.json").write_text(json.dumps(document), encoding="utf-8")
-    rows = splat_rows()
-    rows[:, 1:3] = rows[:, [2, 1]]  # from y up to z up
-    (tmp_path / "upright.ply").write_bytes(ply(rows))
-    empty.drop([tmp_path / "upright.ply", tmp_path / "upright.json"])
-    empty.until("splatlift.viewer?.draft && splatlift.viewer.camera.up.z > 0.99 && !splatlift.viewer.frameRequest")
-    before = empty.value("splatlift.viewer.place3d")
-    empty.drag("#scene", (0.5, 0.5), (0.7, 0.5))
-    empty.until(
-        f"splatlift.viewer.place3d.join() !== '{','.join(map(str, before))}' && !splatlift.viewer.frameRequest"
-    )
-    after = empty.value("splatlift.viewer.place3d")
-    assert after[2] == pytest.approx(before[2], abs=1e-3) and abs(after[0] - before[0]) > 0.1
-    assert after[3:] == pytest.approx(before[3:], abs=1e-6)
-
-
-def test_zip_of_streamed_splats_is_taken_as_splats(empty: Browser, tmp_path: Path) -> None:
-    with zipfile.ZipFile(tmp_path / "scene.zip", "w") as archive:
-        for name in ("lod-meta.json", "0_0/meta.json", "0_0/means_l.webp", "0_0/means_u.webp"):
-            archive.writestr(name, "{}")
-    empty.drop([tmp_path / "scene.zip"])
-    empty.until("document.querySelector('.file .kind')?.textContent === 'splats'")
 
 
 def test_files_are_still_there_after_the_page_is_loaded_again(empty: Browser, files: dict[str, Path]) -> None:
@@ -230,23 +150,6 @@ def test_files_are_still_there_after_the_page_is_loaded_again(empty: Browser, fi
     assert empty.value("document.querySelectorAll('#sent .file').length") == 3
 
 
-def test_lift_file_waits_for_other_cameras_after_wrong_ones(
-    empty: Browser, files: dict[str, Path], tmp_path: Path
-) -> None:
-    model, lift = tmp_path / "model", tmp_path / "made.safetensors"
-    with zipfile.ZipFile(io.BytesIO(colmap_zip())) as archive:
-        archive.extractall(model)
-    lift_files(files["splats"], model, [files["features"]], LiftSettings.of(preset="row-sum")).save(lift)
-    wrong = tmp_path / "wrong.json"
-    wrong.write_text(json.dumps({**cameras_document(), "fl_x": 31.0}), encoding="utf-8")
-    empty.drop([lift, files["splats"], wrong])
-    empty.until("document.querySelector('.file.bad .state')?.textContent.includes('cameras that see')")
-    empty.drop([model])  # the right ones, which are another asset than the folder that was lifted with
-    empty.until(READY)
-    ask(empty, "lamp")
-    assert min(columns(empty, AMBER)) > 50
-
-
 def test_scenes_that_others_make_and_delete_are_followed(empty: Browser, files: dict[str, Path]) -> None:
     with httpx.Client(base_url=empty.value("location.origin")) as other:
         asset_ids = {kind: other.put(f"/assets/{kind}", content=file.read_bytes()) for kind, file in files.items()}
@@ -259,18 +162,6 @@ def test_scenes_that_others_make_and_delete_are_followed(empty: Browser, files: 
         assert other.delete(f"/jobs/{job}?with_lift=true").status_code == 204
         empty.press("#tab-bring")
         empty.until("!document.querySelector('#empty').hidden && !splatlift.lift")
-
-
-def test_table_of_words_is_dropped_and_named_by(browser: Browser, server: PageServer, files: dict[str, Path]) -> None:
-    browser.window(1200, 800)
-    browser.open(server.address)
-    browser.until(READY)
-    browser.drop([files["table"]])
-    browser.until("document.querySelector('.file.done')")
-    browser.press("#tab-name")
-    browser.until("document.querySelectorAll('#vocabulary option').length === 3")
-    table = browser.value("document.querySelectorAll('#vocabulary option')[1].value")
-    assert httpx.delete(f"{server.address}/assets/{table}").status_code == 204
 
 
 def test_lift_takes_a_name_and_photos(browser: Browser, server: PageServer, tmp_path: Path) -> None:
@@ -311,7 +202,7 @@ def test_strangers_files_become_an_object_that_lights_up(browser: Browser, tmp_p
         page.open(address)
         page.until("globalThis.splatlift && !document.querySelector('#empty').hidden")
         (tmp_path / "broken.ply").write_bytes((scene / "point_cloud.ply").read_bytes()[:-40])
-        page.give("#files", [tmp_path / "broken.ply", scene / "cameras.json"])
+        page.choose_files("#files", [tmp_path / "broken.ply", scene / "cameras.json"])
         page.until("document.querySelector('.file.bad')")
         assert "broken.ply" in text_of(page, ".file.bad .name")
         assert "It must be" in text_of(page, ".file.bad .state") and "got" in text_of(page, ".file.bad .state")
@@ -335,20 +226,4 @@ def test_strangers_files_become_an_object_that_lights_up(browser: Browser, tmp_p
         page.press("#jobs button.danger")  # and away with it
         page.press("#jobs button.danger")
         page.until("!document.querySelector('#empty').hidden")
-        page.open("about:blank#")
-
-
-def test_dropped_scene_is_seen_planned_and_named_and_the_next_is_another_order(
-    empty: Browser, files: dict[str, Path], tmp_path: Path
-) -> None:
-    garden = tmp_path / "my garden.ply"
-    garden.write_bytes(files["splats"].read_bytes())
-    empty.drop([garden, files["cameras"], files["features"]])
-    empty.until("splatlift.viewer?.draft && document.querySelector('#plan').textContent.includes('60 splats')")
-    assert empty.value("splatlift.viewer.cones.geometry.attributes.position.count") == 3 * 16  # three cameras
-    assert empty.value("document.querySelector('#empty').hidden") is True
-    empty.press("#lift-it")
-    empty.until(READY, LONG)
-    assert empty.value("document.querySelector('#lift option:checked').textContent") == "my garden"
-    empty.drop([files["splats"]])
-    empty.until("document.querySelectorAll('#sent .file').length === 1")
+        page.open("about:blank")

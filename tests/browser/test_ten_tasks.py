@@ -6,7 +6,6 @@ Set SPLATLIFT_PICTURES to a folder to have a picture of each step.
 
 from __future__ import annotations
 
-import base64
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -49,7 +48,7 @@ def pictures(page: Browser, width: int) -> Callable[[str], None]:
         assert page.value("document.documentElement.scrollWidth") <= width, name
         assert page.violations() == {}, name
         if folder:
-            (Path(folder) / f"{width}-{name}.png").write_bytes(base64.b64decode(page.screenshot()))
+            page.page.screenshot(path=Path(folder) / f"{width}-{name}.png")
 
     return save
 
