@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
-import runpy
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = ("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md")
-GUIDE, SETTINGS, PYTHON, SERVICE, METHOD, RESULTS = (
-    f"docs/{page}.md" for page in ("guide", "settings", "python", "service", "method", "results")
+GUIDE, SETTINGS, PYTHON, SERVICE, RESULTS = (
+    f"docs/{page}.md" for page in ("guide", "settings", "python", "service", "results")
 )
 FOR_USERS = ("README.md", GUIDE, SETTINGS, PYTHON, SERVICE, RESULTS)
 PAGES = (*DOCUMENTS, *sorted(str(page.relative_to(ROOT)) for page in ROOT.glob("docs/*.md")))
@@ -37,11 +36,6 @@ def shell_commands(name: str) -> list[str]:
     # Not the first of `run splatlift splatlift keys`, which names a service of the compose file.
     matches = [re.search(r"(?:^|[ (])(?:\.venv/bin/)?splatlift (?!splatlift )([^#()]+)", line) for line in lines]
     return [match[1].strip() for match in matches if match]
-
-
-def site_text(name: str) -> str:
-    """Return a page of docs/ as the docs site has it: with the tables that `make docs` makes of code."""
-    return runpy.run_path(str(ROOT / "docs" / "conf.py"))["fill_page"](text(name))
 
 
 def table_heads(name: str) -> list[str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import io
 import json
-import re
 import runpy
 import shlex
 import shutil
@@ -19,7 +18,6 @@ import matplotlib
 import numpy as np
 import pytest
 import torch
-from fastapi.routing import APIRoute
 from matplotlib import pyplot
 from PIL import Image
 from plyfile import PlyData
@@ -37,15 +35,12 @@ from liftcore.io.splats import read_splats, write_splats
 from liftcore.text.table import TableEncoder
 from liftcore.values.pack import read_features, write_pack
 from service import models
-from service.auth import OPEN
 from service.commands.demo import find_scene
-from service.routes import assets, jobs, lifts, operations, queries, selections
 from tests.run_lengths import sam_records
 from tests.tiny_scene import HEIGHT, WIDTH, WORDS, cameras_document, codebook, colmap_zip, labels, make_scene
 
-from .readme import FOR_USERS, GUIDE, PYTHON, ROOT, SERVICE, SETTINGS, blocks, site_text, text
+from .readme import GUIDE, PYTHON, ROOT, SERVICE, SETTINGS, blocks, text
 
-ROUTES: tuple[ModuleType, ...] = (operations, assets, jobs, lifts, queries, selections)
 SHAPES: dict[str, type[BaseModel]] = {  # a field that no other answer has -> the answer
     "counts": models.Asset,
     "attempt": models.Job,
@@ -188,25 +183,6 @@ class GreyEncoder:
         return torch.from_numpy(codebook()).float()[clusters]
 
 
-def test_command_line_example_writes_its_files(scene_folder: Path) -> None:
-    main(["lift", "scene.ply", "cameras.json", "features.safetensors", "-o", "scene.lift.safetensors"])
-    section = text(GUIDE).partition("## Queries")[2].partition("###")[0]
-    commands = [line.split()[1:] for line in section.splitlines() if line.startswith("splatlift ")]
-    assert [command[0] for command in commands] == ["query"] * 4
-    assert [main(command) for command in commands] == [0] * len(commands)
-    assert (scene_folder / "apple.png").is_file()
-    apple, scores = (read_splats(scene_folder / name) for name in ("apple.ply", "scores.ply"))
-    assert 0 < apple.count < scores.count == read_splats(scene_folder / "scene.ply").count
-    assert float(apple.means[:, 0].max()) < 0  # the apple is the cluster on the left
-
-
-def test_no_example_saves_an_error_as_what_was_asked_for() -> None:
-    shell = [block for page in FOR_USERS for block in blocks(page, "sh")]
-    saving = [line for block in shell for line in block.splitlines() if " -o " in line]
-    curls = [line for line in saving if line.startswith("curl ")]
-    assert curls and all(re.match(r"curl -[a-zA-Z]*f", line) for line in curls)
-
-
 def test_the_way_from_own_maps_to_a_mask_leads_there(scene_folder: Path) -> None:
     (scene_folder / "maps").mkdir()
     for view, clusters in labels().items():
@@ -252,21 +228,6 @@ def test_json_examples_show_fields_that_the_service_sends() -> None:
         assert example.keys() <= model.model_fields.keys() | model.model_computed_fields.keys()
         documented_fields.add(model)
     assert documented_fields == set(SHAPES.values())
-
-
-def test_every_route_is_in_the_sites_table_and_no_other() -> None:
-    rows = site_text(SERVICE).partition("| route | answer")[2]
-    documented = set(re.findall(r"^\| `([A-Z]+ /[^`]*)` \| .", rows, flags=re.MULTILINE))
-    real = set()
-    for module in ROUTES:
-        for route in module.router.routes:
-            assert isinstance(route, APIRoute)
-            real |= {f"{method} {route.path}" for method in route.methods or ()}
-    in_a_sentence = {f"GET {path}" for path in OPEN if path.startswith(("/openapi", "/docs", "/web"))}
-    assert documented == real - in_a_sentence
-    overview = text(SERVICE).partition("## Routes")[2].partition("\n## ")[0]
-    families = {f"/{route.split('/')[1]}" for route in documented} - {"/"}
-    assert families <= set(re.findall(r"`(/[a-z]+)`", overview))
 
 
 # Scenes of nerfstudio and gsplat
@@ -373,11 +334,6 @@ def test_cells_run_in_order_and_print_what_is_saved(
     assert scene.truth is not None
     mask, truth = names["mask"], scene.truth.mask_of(names["phrase"], "view_030")
     assert (mask & truth).sum() / (mask | truth).sum() > 0.8
-
-
-def test_notebook_is_small_and_its_cells_ran_in_order() -> None:
-    assert NOTEBOOK.stat().st_size < 400_000
-    assert [cell["execution_count"] for cell in CELLS] == list(range(1, len(CELLS) + 1))
 
 
 # The five lines for a training loop, on tensors as gsplat trains them
