@@ -1,22 +1,49 @@
-"""The service as tests start it: an application in this process, known by HTTP alone."""
+"""The service as tests start it, in this process or as one of its own; known by HTTP, commands and the environment.
+
+Settings have the names of `splatlift serve`; this is the one module of tests that knows how the application is made.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
 import time
-from collections.abc import Iterator
+import uuid
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, Self, TypeVar
 
+import httpx
 from fastapi.testclient import TestClient
+from safetensors.numpy import load
 
 from service.app import assemble
 from service.settings import ServiceSettings
 from service.store.store import Store
 
+Result = TypeVar("Result")
 ADDRESS = "http://127.0.0.1"
+ROOT = Path(__file__).parents[1]
 PATIENCE_SECONDS = 900.0  # of a machine that has other things to do, kernels to compile among them
 FINAL_STATES = ("succeeded", "failed", "canceled")
+MARK = "SERVER_UNDER_TEST"  # in the environment of a server and of all that it starts
+KINDS = ("splats", "cameras", "features", "masks", "table", "photos", "lift")
+# Setting -> the fields that it stands for, where the service has other names.
+FIELDS = {
+    "parallel_jobs": ("parallel_lifts",),
+    "threads": ("lift_threads",),
+    "job_seconds": ("lift_seconds",),
+    "memory_bytes": ("check_memory_bytes",),
+    "floor_bytes": ("disk_floor_bytes",),
+    "upload_bytes": tuple(f"max_{kind}_bytes" for kind in KINDS),
+}
 
 
 class Client(Protocol):
@@ -27,10 +54,15 @@ class Client(Protocol):
         ...
 
 
+def fields_of(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return the fields of the service's settings and their values."""
+    return {field: value for name, value in settings.items() for field in FIELDS.get(name, (name,))}
+
+
 @contextmanager
 def serving(data: Path, **settings: Any) -> Iterator[TestClient]:
     """Yield a client of the application over a data directory; settings are those of `splatlift serve`."""
-    options = ServiceSettings.model_validate({"data": data, **settings})
+    options = ServiceSettings.model_validate({"data": data, **fields_of(settings)})
     store = Store.open(options.data, floor_bytes=options.disk_floor_bytes)
     try:
         with TestClient(assemble(options, store), ADDRESS, raise_server_exceptions=False) as client:
@@ -39,12 +71,147 @@ def serving(data: Path, **settings: Any) -> Iterator[TestClient]:
         store.close()
 
 
+def until(condition: Callable[[], Result | None], seconds: float = PATIENCE_SECONDS) -> Result:
+    """Wait until a condition holds: at once, but for a machine that has other things to do; return its value."""
+    deadline = time.monotonic() + seconds
+    while not (value := condition()):
+        assert time.monotonic() < deadline, "it did not happen"
+        time.sleep(0.02)
+    return value
+
+
 def wait_for_end(client: Client, job: str) -> dict[str, Any]:
     """Poll the job at a path until it has ended; return it."""
-    deadline = time.monotonic() + PATIENCE_SECONDS
-    while time.monotonic() < deadline:
+
+    def ended() -> dict[str, Any] | None:
         record = client.get(job).json()
-        if record["state"] in FINAL_STATES:
-            return record
-        time.sleep(0.1)
-    raise AssertionError(f"{job} did not end within {PATIENCE_SECONDS:g} s")
+        return record if record["state"] in FINAL_STATES else None
+
+    return until(ended)
+
+
+def digest_of_lift(client: Client, lift: str) -> str:
+    """Return the digest of the tensors and diagnostics of the lift at a path: all that does not tell of time."""
+    tensors = load(client.get(f"{lift}/features").content)
+    total = hashlib.sha256()
+    for name in sorted(tensors):
+        total.update(f"{name} {tensors[name].dtype} {tensors[name].shape}".encode() + tensors[name].tobytes())
+    total.update(json.dumps(client.get(lift).json()["diagnostics"], sort_keys=True).encode())
+    return total.hexdigest()
+
+
+def run_command(*arguments: str, data: Path, status: int = 0) -> str:
+    """Run `splatlift ARGUMENTS --data DATA`, which must exit with a status; return what it prints."""
+    command = [sys.executable, "-m", "liftcore.cli", *arguments, "--data", str(data)]
+    process = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
+    assert process.returncode == status, process.stdout + process.stderr
+    return process.stdout + (process.stderr if status else "")
+
+
+class Server:
+    """`splatlift serve` as a process, over a data directory; it may be killed and started again."""
+
+    def __init__(self, data: Path, *, command: tuple[str, ...] = ("-m", "service", "--port", "0"), **settings: Any):
+        self.data = data
+        self._command = command
+        self._mark = uuid.uuid4().hex
+        texts = {
+            name: json.dumps(value) if isinstance(value, dict) else str(value)
+            for name, value in fields_of({"data": data, **settings}).items()
+        }
+        self._environment = {f"SPLATLIFT_{name.upper()}": text for name, text in texts.items()}
+        self._process: subprocess.Popen[str] | None = None
+        # No connection is used twice: one that lay idle may be closed in the moment in which it is taken up again.
+        self.client = httpx.Client(timeout=PATIENCE_SECONDS, limits=httpx.Limits(max_keepalive_connections=0))
+        self.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        if self.is_alive():
+            self.kill()
+        self.client.close()
+        until(lambda: not self.processes())  # nothing outlives its server
+
+    @property
+    def pid(self) -> int:
+        """Process id of the server."""
+        assert self._process is not None
+        return self._process.pid
+
+    @property
+    def log(self) -> Path:
+        """The file with what the server says on stderr."""
+        return self.data.with_name(f"{self.data.name}.log")
+
+    def start(self, *options: str) -> None:
+        """Start, and wait until it listens."""
+        inherited = {name: value for name, value in os.environ.items() if not name.startswith("SPLATLIFT_")}
+        environment = inherited | {"PYTHONPATH": str(ROOT), MARK: self._mark} | self._environment
+        self.data.parent.mkdir(parents=True, exist_ok=True)
+        with self.log.open("ab") as stderr:
+            self._process = subprocess.Popen(
+                [sys.executable, *self._command, *options],
+                stdout=subprocess.PIPE, stderr=stderr, text=True, cwd=ROOT, env=environment,
+            )  # fmt: skip
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        address = re.search(r'http://[^\s"]+', line)
+        assert address is not None, line + self.log.read_text()
+        self.client.base_url = address[0]
+
+    def is_alive(self) -> bool:
+        """Return True if it runs; a request may also be cut off while it lives."""
+        return self._process is not None and self._process.poll() is None
+
+    def kill(self) -> None:
+        """SIGKILL, and wait for the end."""
+        assert self._process is not None
+        self._process.kill()
+        self.wait()
+
+    def stop(self) -> int:
+        """SIGTERM; return its exit status."""
+        assert self._process is not None
+        self._process.send_signal(signal.SIGTERM)
+        return self.wait()
+
+    def wait(self) -> int:
+        """Wait until it has ended; return its exit status."""
+        assert self._process is not None and self._process.stdout is not None
+        status = self._process.wait(PATIENCE_SECONDS)
+        self._process.stdout.close()
+        return status
+
+    def processes(self) -> list[int]:
+        """Return the ids of the server's process and of all that it started, by their environment."""
+        marked = f"{MARK}={self._mark}".encode()
+        ids = []
+        for entry in Path("/proc").iterdir():
+            with contextlib.suppress(OSError, ValueError):
+                if marked in (entry / "environ").read_bytes().split(b"\0"):
+                    ids.append(int(entry.name))
+        return ids
+
+    def kill_children(self) -> int:
+        """SIGKILL what the server started; return the number of processes."""
+        children = [pid for pid in self.processes() if pid != self.pid]
+        for pid in children:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        return len(children)
+
+    def usage(self) -> dict[str, int]:
+        """Return the descriptors, threads and resident kilobytes of the server's process."""
+        return usage(self.pid)
+
+
+def usage(pid: int) -> dict[str, int]:
+    """Return the descriptors, threads and resident kilobytes of a process."""
+    status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
+    return {
+        "descriptors": len(list(Path(f"/proc/{pid}/fd").iterdir())),
+        "threads": int(status["Threads"]),
+        "resident_kb": int(status["VmRSS"].split()[0]),
+    }

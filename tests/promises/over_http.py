@@ -1,0 +1,122 @@
+"""The tiny scene over HTTP: its uploads, orders, lifts and deletes, and what replies are read by."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from tests.server import wait_for_end
+from tests.tiny_scene import TinyScene
+
+NO_ID = "0" * 32  # of a job or a lift
+NO_ASSET = f"sha256:{'0' * 64}"
+INPUTS = ("splats", "cameras", "features")
+
+
+def assert_problem(reply: Any, status: int | None = None) -> dict[str, Any]:
+    """Require a problem of RFC 9457 with all that a person needs; return it."""
+    assert reply.headers["content-type"] == "application/problem+json", reply.text
+    problem = reply.json()
+    assert problem["status"] == reply.status_code, reply.text
+    assert reply.status_code == status or (status is None and 400 <= reply.status_code < 500), reply.text
+    assert re.fullmatch(r"/problems/[a-z0-9]+(-[a-z0-9]+)*", problem["type"]), problem["type"]
+    assert problem["title"] and problem["detail"] and "\n" not in problem["detail"]
+    return problem
+
+
+def upload(client: Any, kind: str, content: bytes, **options: Any) -> str:
+    """Upload a file; return its id."""
+    reply = client.put(f"/assets/{kind}", content=content, **options)
+    assert reply.status_code in (200, 201), reply.text
+    return reply.json()["id"]
+
+
+def upload_scene(client: Any, scene: TinyScene, **options: Any) -> dict[str, Any]:
+    """Upload splats, cameras and features; return the body of an order of their lift by `row-sum`."""
+    splats, cameras, features = (upload(client, kind, getattr(scene, kind), **options) for kind in INPUTS)
+    return {"splats": splats, "cameras": cameras, "features": [features], "settings": {"preset": "row-sum"}}
+
+
+def lift_of(client: Any, order: dict[str, Any]) -> dict[str, Any]:
+    """Order a lift and wait for it; return it."""
+    reply = client.post("/lift", json=order)
+    assert reply.status_code == 202, reply.text
+    job = wait_for_end(client, reply.headers["location"])
+    assert job["state"] == "succeeded", job
+    return client.get(job["links"]["lift"]).json()
+
+
+def delete_lift(client: Any, lift: str) -> None:
+    """Delete the lift of an id."""
+    reply = client.delete(f"/lifts/{lift}")
+    assert reply.status_code == 204, reply.text
+
+
+def events_of(text: str) -> Iterator[tuple[int, str, Any]]:
+    """Yield number, name and data of each event of a stream."""
+    for block in text.replace("\r\n", "\n").strip().split("\n\n"):
+        fields = dict(re.split(": ?", line, maxsplit=1) for line in block.split("\n") if line and line[0] != ":")
+        if fields:
+            yield int(fields["id"]), fields["event"], json.loads(fields["data"])
+
+
+def array(content: bytes) -> np.ndarray:
+    """Read an array of a .npy file."""
+    return np.load(io.BytesIO(content), allow_pickle=False)
+
+
+def picture(content: bytes) -> np.ndarray:
+    """Read the pixels of a picture."""
+    return np.asarray(Image.open(io.BytesIO(content)))
+
+
+def bearer(secret: str) -> dict[str, str]:
+    """Return the header that brings a key."""
+    return {"Authorization": f"Bearer {secret}"}
+
+
+# Requests that fit the OpenAPI document
+
+# Values of parameters and fields that make a request to any operation.
+VALUES: dict[str, Any] = {
+    "text": ["apple"], "view": "left", "example": "splat:1", "words": ["apple"], "name": "a name", "x": 1, "y": 1,
+    "level": 0, "region": 0, "operation": "grow", "kind": "cameras",
+}  # fmt: skip
+PLACES = {"object": "0", "selection": "0" * 16, "share": "0" * 12, "kind": "cameras"}
+
+
+def operations_of(client: Any) -> list[tuple[str, str, dict[str, Any]]]:
+    """Return method, path template and description of each operation of the OpenAPI document."""
+    paths = client.get("/openapi.json").json()["paths"]
+    operations = [(method.upper(), path, described) for path, methods in paths.items()
+                  for method, described in methods.items()]  # fmt: skip
+    assert len(operations) >= 30
+    return operations
+
+
+def address_of(path: str, lift: str, asset: str) -> str:
+    """Fill the template of a path."""
+    path = re.sub(r"\{(job|lift|tradeoff)\}", lift, path).replace("{asset}", asset)
+    return re.sub(r"\{(\w+)\}", lambda place: PLACES[place[1]], path)
+
+
+def request_to(client: Any, path: str, described: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+    """Return the parameters and the JSON body of a request to an operation that names a lift and assets."""
+    values = VALUES | values
+    names = [entry["name"] for entry in described.get("parameters", ()) if entry["in"] == "query"]
+    options = {"params": {name: values[name] for name in names if name in values}}
+    content = described.get("requestBody", {}).get("content", {})
+    if "application/json" in content:
+        schema = content["application/json"]["schema"]
+        for part in schema.get("anyOf", [schema]):
+            name = part.get("$ref", "").rpartition("/")[2]
+            schema = client.get("/openapi.json").json()["components"]["schemas"].get(name, schema)
+        fields = {name: values[name] for name in schema.get("properties", ()) if name in values}
+        options["json"] = {"encoder": "x"} if path == "/assets/{asset}" else fields
+    return options

@@ -1,0 +1,283 @@
+"""Jobs over HTTP: ordered once, followed, canceled, failed with reasons; plans and trade-offs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from tests.server import Server, until, wait_for_end
+from tests.tiny_scene import TinyScene, cameras_document, codebook, labels, masks, pack
+
+from .over_http import NO_ASSET, NO_ID, assert_problem, delete_lift, events_of, upload, upload_scene
+
+LONG_BUDGET_S = 600  # of a trade-off, which runs for as long as somebody is to cancel it
+
+
+def order_job(client: httpx.Client, body: dict[str, Any], key: str | None = None, route: str = "/lift") -> Any:
+    return client.post(route, json=body, headers={} if key is None else {"Idempotency-Key": key})
+
+
+@pytest.fixture
+def busy(server: Server, order: dict[str, Any]) -> Iterator[str]:
+    """The path of a job that keeps all others waiting."""
+    reply = order_job(server.client, order | {"budget_s": LONG_BUDGET_S}, route="/tradeoff")
+    assert reply.status_code == 202, reply.text
+    path = reply.headers["location"]
+    until(lambda: server.client.get(path).json()["state"] == "running")
+    yield path
+    server.client.post(f"{path}/cancel")
+    assert wait_for_end(server.client, path)["state"] == "canceled"
+    assert server.client.delete(path).status_code == 204
+
+
+# While a job runs
+
+
+def test_order_is_a_job_at_once_and_repeated_the_same_one(
+    client: httpx.Client, order: dict[str, Any], busy: str
+) -> None:
+    del busy
+    first, second = (order_job(client, order, "one") for _ in range(2))
+    assert (first.status_code, second.status_code) == (202, 200)
+    job = first.json()
+    assert first.headers["location"] == second.headers["location"] == f"/jobs/{job['id']}" == job["links"]["self"]
+    assert client.get(first.headers["location"]).json() == second.json()
+    assert (job["kind"], job["state"], job["problem"], job["settings"]["preset"]) == (
+        "lift",
+        "queued",
+        None,
+        "row-sum",
+    )
+    assert [job[name] for name in ("splats", "cameras", "features")] == [*order.values()][:3]
+    other = order_job(client, order, "two").json()
+    keyless = [order_job(client, order).json()["id"] for _ in range(2)]
+    assert len({job["id"], other["id"], *keyless}) == 4
+    changed = order_job(client, order | {"settings": {"preset": "tikhonov"}}, "one")
+    assert assert_problem(changed, 422)["type"] == "/problems/key-reused"
+    assert_problem(order_job(client, order | {"budget_s": 60}, "one", route="/tradeoff"), 422)
+    for identifier in (job["id"], other["id"], *keyless):
+        assert client.post(f"/jobs/{identifier}/cancel").json()["state"] == "canceled"
+        assert client.delete(f"/jobs/{identifier}").status_code == 204
+
+
+@pytest.mark.parametrize("key", ["", "x" * 256])
+def test_key_of_no_use_is_refused(client: httpx.Client, order: dict[str, Any], key: str) -> None:
+    assert_problem(order_job(client, order, key), 422)
+
+
+def test_queued_job_is_canceled_at_once_and_can_be_deleted(
+    client: httpx.Client, order: dict[str, Any], busy: str
+) -> None:
+    assert busy in [job["links"]["self"] for job in client.get("/jobs").json()["jobs"]]
+    path = order_job(client, order).headers["location"]
+    for job in (path, busy):
+        assert_problem(client.delete(job), 409)
+    for _ in range(2):  # again does no harm
+        reply = client.post(f"{path}/cancel")
+        assert (reply.status_code, reply.json()["state"], reply.json()["attempt"]) == (200, "canceled", 0)
+    states = [data["state"] for _, name, data in events_of(client.get(f"{path}/events").text) if name == "state"]
+    assert states == ["queued", "canceled"]
+    assert client.delete(path).status_code == 204
+    for reply in (client.get(path), client.delete(path), client.get(f"{path}/events"), client.post(f"{path}/cancel")):
+        assert_problem(reply, 404)
+
+
+def test_canceled_job_has_ended_with_all_its_processes(server: Server, order: dict[str, Any]) -> None:
+    idle = len(server.processes())
+    body = order | {"budget_s": LONG_BUDGET_S}
+    path = order_job(server.client, body, route="/tradeoff").headers["location"]
+    until(lambda: server.client.get(path).json()["state"] == "running" and len(server.processes()) > idle)
+    reply = server.client.post(f"{path}/cancel")
+    assert reply.status_code in (200, 202) and reply.json()["state"] in ("canceling", "canceled")
+    job = wait_for_end(server.client, path)
+    assert len(server.processes()) <= idle  # canceled means that none of it is left
+    assert (job["state"], job["problem"]) == ("canceled", None) and job["ended"] >= job["started"]
+    assert server.client.post(f"{path}/cancel").json()["state"] == "canceled"
+    assert server.client.delete(path).status_code == 204
+
+
+# What a job becomes
+
+
+def test_events_tell_the_whole_story_and_go_on_after_the_last(client: httpx.Client, lift: dict[str, Any]) -> None:
+    path = f"{lift['links']['job']}/events"
+    reply = client.get(path)
+    assert reply.headers["content-type"].startswith("text/event-stream")
+    story = list(events_of(reply.text))
+    numbers = [number for number, _, _ in story]
+    assert numbers == sorted(set(numbers))
+    assert [data["state"] for _, name, data in story if name == "state"] == ["queued", "running", "succeeded"]
+    assert story[-1][1] == "state" and {name for _, name, _ in story} >= {"state", "plan"}
+    (plan,) = [data for _, name, data in story if name == "plan"]
+    assert plan == client.get(lift["links"]["job"]).json()["plan"]
+    later = list(events_of(client.get(path, headers={"Last-Event-ID": str(numbers[2])}).text))
+    assert later == story[3:]
+    assert client.get(path, headers={"Last-Event-ID": str(numbers[-1])}).status_code == 204
+
+
+def test_stream_of_events_ends_with_its_job(client: httpx.Client, order: dict[str, Any]) -> None:
+    path = order_job(client, order).headers["location"]
+    story = list(events_of(client.get(f"{path}/events").text))  # which returns when the stream ends
+    assert story[-1][2]["state"] == client.get(path).json()["state"] == "succeeded"
+    delete_lift(client, path.removeprefix("/jobs/"))
+
+
+def test_succeeded_job_tells_its_plan_its_times_and_its_lift(client: httpx.Client, lift: dict[str, Any]) -> None:
+    job = client.get(lift["links"]["job"]).json()
+    assert (job["id"], job["state"], job["attempt"], job["problem"]) == (lift["id"], "succeeded", 1, None)
+    assert job["created"] <= job["started"] <= job["ended"]
+    assert job["plan"]["summary"][0].startswith("60 splats") and job["plan"]["splats"] == 60
+    assert job["progress"]["completed"] == job["progress"]["total"] and job["progress"]["unit"]
+    assert job in client.get("/jobs").json()["jobs"]
+    assert_problem(client.post(f"{job['links']['self']}/cancel"), 409)
+    assert_problem(client.delete(job["links"]["self"]), 409)  # its lift is somebody's work
+    assert client.get(lift["links"]["self"]).json() == lift
+
+
+def test_failed_job_says_why_as_a_problem(client: httpx.Client, order: dict[str, Any]) -> None:
+    elsewhere = upload(client, "features", pack({"nowhere": labels()["left"]}))
+    narrow = upload(client, "features", pack({"left": labels()["left"]}, codebook(5)))
+    for body in (
+        order | {"features": [elsewhere]},
+        order | {"features": [*order["features"], narrow]},
+        order | {"settings": {"kernel": "dbs"}},
+    ):
+        reply = order_job(client, body)
+        if reply.status_code == 202:  # else it is refused at once, in the same words
+            job = wait_for_end(client, reply.headers["location"])
+            problem = job["problem"]
+            assert (job["state"], job["attempt"]) == ("failed", 1), job
+            *_, (_, name, last) = events_of(client.get(job["links"]["events"]).text)
+            assert (name, last["state"], last["problem"]) == ("state", "failed", problem)
+            assert client.delete(job["links"]["self"]).status_code == 204
+        else:
+            problem = assert_problem(reply, 422)
+        assert problem["type"].startswith("/problems/") and problem["status"] == 422, problem
+        assert problem["argument"] and problem["expected"] and problem["got"]
+        assert "/tmp" not in json.dumps(problem)
+    for asset in (narrow, elsewhere):
+        assert client.delete(f"/assets/{asset}").status_code == 204
+
+
+def test_job_and_lift_keep_what_the_plan_warned_of(client: httpx.Client, order: dict[str, Any]) -> None:
+    away = cameras_document()
+    for frame in away["frames"]:  # they look the other way
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([-1.0, 1, -1, 1])).tolist()
+    cameras = upload(client, "cameras", json.dumps(away).encode())
+    body = order | {"cameras": cameras}
+    warnings = client.post("/lift/plan", json=body).json()["warnings"]
+    assert any("no camera can see" in line for line in warnings)
+    job = wait_for_end(client, order_job(client, body).headers["location"])
+    assert job["state"] == "succeeded", job
+    assert set(warnings) <= set(job["plan"]["warnings"])
+    kept = client.get(job["links"]["lift"]).json()["diagnostics"]["warnings"]
+    assert any("no camera can see" in line for line in kept)
+    delete_lift(client, job["id"])
+    assert client.delete(f"/assets/{cameras}").status_code == 204
+
+
+BAD_ORDERS: dict[str, tuple[dict[str, Any], int, str]] = {
+    "an unknown preset": ({"settings": {"preset": "magic"}}, 422, "preset"),
+    "an unknown setting": ({"settings": {"speediness": 1}}, 422, "speediness"),
+    "a setting out of bounds": ({"settings": {"power": 3}}, 422, "power"),
+    "an unknown asset": ({"splats": NO_ASSET}, 404, "splats"),
+    "no features": ({"features": []}, 422, "features"),
+    "no digest": ({"cameras": "sha256:short"}, 422, "cameras"),
+    "an unknown field": ({"extra": 1}, 422, "extra"),
+    "a table that is none": ({"table": NO_ASSET}, 404, "table"),
+}
+
+
+@pytest.mark.parametrize("route", ["/lift", "/lift/plan"])
+@pytest.mark.parametrize("name", BAD_ORDERS)
+def test_bad_order_names_its_field_and_is_no_job(
+    client: httpx.Client, order: dict[str, Any], route: str, name: str
+) -> None:
+    change, status, argument = BAD_ORDERS[name]
+    before = client.get("/jobs").json()
+    problem = assert_problem(client.post(route, json=order | change), status)
+    assert argument in problem["argument"] and problem["expected"] and problem["got"]
+    assert client.get("/jobs").json() == before
+
+
+def test_asset_in_a_wrong_place_is_refused(client: httpx.Client, order: dict[str, Any]) -> None:
+    problem = assert_problem(order_job(client, order | {"splats": order["cameras"]}))
+    assert problem["status"] in (404, 422) and "cameras" in problem["detail"]
+    for path in (f"/jobs/{NO_ID}", f"/jobs/{NO_ID}/events"):
+        assert_problem(client.get(path), 404)
+    assert_problem(client.post(f"/jobs/{NO_ID}/cancel"), 404)
+
+
+def test_plan_counts_and_makes_no_job(client: httpx.Client, order: dict[str, Any], lift: dict[str, Any]) -> None:
+    before = client.get("/jobs").json()
+    plan = client.post("/lift/plan", json=order).json()
+    assert (plan["splats"], plan["views"], plan["channels"], plan["warnings"]) == (60, 3, 8, [])
+    assert plan["summary"] and plan["memory_bytes"] > 0
+    assert plan["summary"][0] == client.get(lift["links"]["job"]).json()["plan"]["summary"][0]
+    assert client.get("/jobs").json() == before
+
+
+def test_full_line_is_refused_for_a_while_and_known_keys_are_not(tmp_path: Any, tiny: TinyScene) -> None:
+    with Server(tmp_path / "data", max_queued=1) as server:
+        client, body = server.client, upload_scene(server.client, tiny)
+        long = order_job(client, body | {"budget_s": LONG_BUDGET_S}, route="/tradeoff").headers["location"]
+        until(lambda: client.get(long).json()["state"] == "running")
+        assert order_job(client, body, "k").status_code == 202
+        reply = order_job(client, body)
+        assert_problem(reply, 503)
+        assert int(reply.headers["retry-after"]) > 0
+        assert order_job(client, body, "k").status_code == 200
+
+
+# Trade-offs
+
+
+def test_tradeoff_is_judged_by_the_masks_of_its_order(
+    client: httpx.Client, order: dict[str, Any], tiny: TinyScene
+) -> None:
+    masks_of_right = masks({"right": 2 - labels()["right"][0]})  # numbers of the classes below
+    judged = {
+        "masks": upload(client, "masks", masks_of_right),
+        "table": upload(client, "table", replace(tiny).table),
+        "classes": ["lamp", "book", "apple"],
+    }
+    body = order | {"settings": {"diagnostic_rays": 0, "preset": "tikhonov"}, "budget_s": 10, "labels": judged}
+    first, second = (order_job(client, body, "judged", route="/tradeoff") for _ in range(2))
+    assert (first.status_code, second.status_code, first.json()["kind"]) == (202, 200, "tradeoff")
+    job = wait_for_end(client, first.headers["location"])
+    assert (job["state"], job["problem"]) == ("succeeded", None), job
+    tradeoff = client.get(job["links"]["tradeoff"]).json()
+    exact = tradeoff["runs"][0]
+    assert exact["settings"]["preset"] == "tikhonov" and exact["mask_iou"] > 0.5 and exact["seconds"] > 0
+    assert tradeoff["choice"]["name"] in {run["name"] for run in tradeoff["runs"]}
+    assert tradeoff["labels"] == judged and "/tmp" not in json.dumps(tradeoff)
+    assert client.get(job["links"]["chart"]).content.startswith(b"\x89PNG")
+    assert job["id"] not in {entry["id"] for entry in client.get("/lifts").json()["lifts"]}
+    assert_problem(client.delete(job["links"]["self"]), 409)
+    assert client.delete(job["links"]["self"], params={"with_tradeoff": True}).status_code == 204
+    for link in job["links"].values():
+        assert_problem(client.get(link), 404)
+    for asset in (judged["masks"], judged["table"]):
+        assert client.delete(f"/assets/{asset}").status_code == 204
+
+
+@pytest.mark.parametrize(
+    ("change", "argument"),
+    [
+        ({"budget_s": 0}, "budget_s"),
+        ({"settings": {"quality": "fast"}}, "quality"),
+        ({"labels": {"masks": NO_ASSET, "table": NO_ASSET, "classes": []}}, "labels"),
+        ({"splats": "x"}, "splats"),
+    ],
+)
+def test_bad_tradeoff_names_its_field(
+    client: httpx.Client, order: dict[str, Any], change: dict[str, Any], argument: str
+) -> None:
+    problem = assert_problem(client.post("/tradeoff", json=order | change), 422)
+    assert argument in problem["argument"]

@@ -1,0 +1,234 @@
+"""Keys: nobody comes in without one, none does more than it may, and nobody sees what is another's."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import httpx
+import pytest
+
+from tests.server import Server, run_command, until
+from tests.tiny_scene import TinyScene
+
+from .over_http import NO_ASSET, NO_ID, address_of, assert_problem, bearer, operations_of, request_to, upload_scene
+
+OPEN = {"/healthz", "/readyz", "/version", "/openapi.json", "/docs", "/"}
+OWN = {"/key", "/metrics"}  # of whoever asks, and of operators
+IDS = re.compile("sha256:[0-9a-f]{64}|[0-9a-f]{32}")
+
+
+def create_key(server: Server, *options: str) -> dict[str, Any]:
+    """Make a key by the command line; return its document, with the secret."""
+    return json.loads(run_command("keys", "create", *options, "--json", data=server.data))
+
+
+@dataclass(frozen=True)
+class Keyed:
+    """A server with keys; Alice has two lifts."""
+
+    server: Server
+    secrets: dict[str, str]
+    order: dict[str, Any]
+    lifts: tuple[str, str]
+
+    def ask(self, name: str | None, method: str, path: str, **options: Any) -> httpx.Response:
+        """Send a request with somebody's key, or without one."""
+        headers = options.pop("headers", {}) | ({} if name is None else bearer(self.secrets[name]))
+        return self.server.client.request(method, path, headers=headers, **options)
+
+    def operations(self) -> Iterator[tuple[str, str, dict[str, Any]]]:
+        """Yield method, path template and description of each operation that needs a key."""
+        yield from (entry for entry in operations_of(self.server.client) if entry[1] not in OPEN)
+
+
+@pytest.fixture(scope="module")
+def keyed(tiny: TinyScene, encoder: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Keyed]:
+    data = tmp_path_factory.mktemp("keyed") / "data"
+    with Server(data, encoder=encoder, allowed_hosts="lift.example.org") as server:
+        assert server.client.get("/lifts").status_code == 200  # open until the first key
+        scopes = {"alice": "read,write", "bob": "read,write", "reader": "read", "writer": "write"}
+        secrets = {
+            name: create_key(server, "--name", name, "--scopes", scope)["key"] for name, scope in scopes.items()
+        }
+        with httpx.Client(base_url=server.client.base_url, headers=bearer(secrets["alice"]), timeout=900) as alice:
+            order = upload_scene(alice, tiny)
+            jobs = [alice.post("/lift", json=order).headers["location"] for _ in range(2)]
+            for job in jobs:
+                until(lambda job=job: alice.get(job).json()["state"] == "succeeded")
+        first, second = (job.rpartition("/")[2] for job in jobs)
+        yield Keyed(server, secrets, order, (first, second))
+
+
+def test_every_operation_wants_a_key(keyed: Keyed) -> None:
+    for method, path, _ in keyed.operations():
+        for headers in ({}, bearer("wrong"), bearer(keyed.secrets["alice"][:-1]), {"Authorization": "Basic YTpi"}):
+            address = address_of(path, keyed.lifts[0], keyed.order["splats"])
+            reply = keyed.ask(None, method, address, content=b"{", headers=headers)
+            assert assert_problem(reply, 401)["type"] == "/problems/unauthorized", f"{method} {path}"
+            assert reply.headers["www-authenticate"].startswith("Bearer")
+    assert keyed.ask(None, "GET", "/nowhere").status_code == 401
+    for path in OPEN:
+        assert keyed.ask(None, "GET", path).status_code == 200, path
+
+
+def test_every_operation_wants_its_scope(keyed: Keyed) -> None:
+    refusals = {"reader": 0, "writer": 0}
+    for method, path, _ in keyed.operations():
+        if path in OWN:
+            continue
+        reads = method == "GET" or path.startswith(("/query", "/render"))
+        other = "writer" if reads else "reader"
+        reply = keyed.ask(other, method, address_of(path, keyed.lifts[0], keyed.order["splats"]), content=b"{")
+        assert_problem(reply, 403)
+        refusals[other] += 1
+    assert min(refusals.values()) >= 10
+    assert {entry["id"] for entry in keyed.ask("alice", "GET", "/lifts").json()["lifts"]} == set(keyed.lifts)
+
+
+def named_requests(keyed: Keyed, lift: str, asset: str) -> Iterator[tuple[str, str, str, dict[str, Any]]]:
+    """Yield method, template, path and options of a request to each operation that names a lift, job or asset."""
+    values = {"lift": lift, "splats": asset, "cameras": asset, "features": [asset]}
+    for method, path, described in keyed.operations():
+        options = request_to(keyed.server.client, path, described, values)
+        named = "{" in path or "lift" in options["params"] or {"lift", "splats"} & options.get("json", {}).keys()
+        if named and method != "PUT":
+            yield method, path, address_of(path, lift, asset), options
+
+
+def test_what_is_anothers_is_absent(keyed: Keyed) -> None:
+    own = list(named_requests(keyed, keyed.lifts[0], keyed.order["splats"]))
+    absent = list(named_requests(keyed, NO_ID, NO_ASSET))
+    assert len(own) == len(absent) >= 25
+    for (method, path, address, options), (_, _, nowhere, nothing) in zip(own, absent, strict=True):
+        reply = keyed.ask("bob", method, address, headers={"If-None-Match": "*"}, **options)
+        other = keyed.ask("bob", method, nowhere, **nothing)
+        for answer in (reply, other):
+            assert_problem(answer, 404)
+        texts = [IDS.sub("ID", json.dumps(answer.json() | {"request_id": None})) for answer in (reply, other)]
+        assert texts[0] == texts[1], f"{method} {path}"  # it does not tell that it is there
+    for path in ("/assets", "/jobs", "/lifts"):
+        assert keyed.ask("bob", "GET", path).json()[path[1:]] == []
+        assert keyed.ask("alice", "GET", path).json()[path[1:]] != []
+    assert keyed.ask("alice", "GET", f"/lifts/{keyed.lifts[0]}").status_code == 200
+
+
+def test_same_bytes_and_order_keys_are_of_each_who_sent_them(keyed: Keyed, tiny: TinyScene) -> None:
+    key = {"Idempotency-Key": "the same"}
+    first = keyed.ask("alice", "POST", "/lift", json=keyed.order, headers=key)
+    assert first.status_code == 202
+    assert keyed.ask("bob", "POST", "/lift", json=keyed.order, headers=key).status_code == 404
+    reply = keyed.ask("bob", "PUT", "/assets/cameras", content=tiny.cameras)
+    assert (reply.status_code, reply.json()["id"]) == (201, keyed.order["cameras"])  # that she has it is not told
+    assert keyed.ask("bob", "PUT", "/assets/cameras", content=tiny.cameras).status_code == 200
+    assert keyed.ask("bob", "DELETE", f"/assets/{keyed.order['cameras']}").status_code == 204
+    content = keyed.ask("alice", "GET", f"/assets/{keyed.order['cameras']}/content").content
+    assert content == tiny.cameras
+    assert keyed.ask("bob", "POST", f"/jobs/{first.json()['id']}/cancel").status_code == 404
+    job = f"/jobs/{first.json()['id']}"
+    keyed.ask("alice", "POST", f"{job}/cancel")
+    until(lambda: keyed.ask("alice", "GET", job).json()["state"] in ("canceled", "succeeded"))
+    keyed.ask("alice", "DELETE", f"/lifts/{first.json()['id']}")
+
+
+def test_share_reads_and_asks_its_lift_and_nothing_else(keyed: Keyed) -> None:
+    shares = f"/lifts/{keyed.lifts[0]}/shares"
+    reply = keyed.ask("alice", "POST", shares, json={"name": "a guest", "expires_s": 3600})
+    share = reply.json()
+    assert reply.status_code == 201 and share["expires"] == pytest.approx(time.time() + 3600, abs=600)
+    guest = bearer(share["key"])
+    own, other = (list(named_requests(keyed, lift, keyed.order["splats"])) for lift in keyed.lifts)
+    allowed = 0
+    for (method, path, address, options), (_, _, elsewhere, others) in zip(own, other, strict=True):
+        reply, refused = (
+            keyed.server.client.request(method, at, headers=guest, **fields)
+            for at, fields in ((address, options), (elsewhere, others))
+        )
+        assert refused.status_code in (403, 404), f"{method} {path}"
+        reads = method == "GET" or path.startswith(("/query", "/render"))
+        if path.startswith(("/lifts", "/query", "/render")) and reads and "/shares" not in path:
+            assert reply.status_code == keyed.ask("alice", method, address, **options).status_code, f"{method} {path}"
+            allowed += reply.status_code == 200
+        else:
+            assert reply.status_code in (403, 404), f"{method} {path}"
+    assert allowed >= 15
+    assert [entry["id"] for entry in keyed.server.client.get("/lifts", headers=guest).json()["lifts"]] == [
+        keyed.lifts[0]
+    ]
+    assert keyed.server.client.put("/assets/cameras", content=b"{}", headers=guest).status_code == 403
+    listed = keyed.ask("alice", "GET", shares)
+    assert [entry["id"] for entry in listed.json()["shares"]] == [share["id"]] and share["key"] not in listed.text
+    assert keyed.ask("bob", "DELETE", share["links"]["self"]).status_code == 404
+    assert keyed.server.client.get(f"/lifts/{keyed.lifts[0]}", headers=guest).status_code == 200
+    assert keyed.ask("alice", "DELETE", share["links"]["self"]).status_code == 204
+    assert_problem(keyed.server.client.get(f"/lifts/{keyed.lifts[0]}", headers=guest), 401)
+
+
+def test_key_says_whose_it_is_and_what_it_may(keyed: Keyed) -> None:
+    own = keyed.ask("reader", "GET", "/key").json()
+    assert (own["name"], own["scopes"], own["expires"]) == ("reader", ["read"], None)
+
+
+def test_keys_are_listed_without_secrets_and_end_at_once(keyed: Keyed) -> None:
+    secret = create_key(keyed.server, "--name", "for a while", "--scopes", "read", "--expires", "12h")
+    text = run_command("keys", "list", "--json", data=keyed.server.data)
+    listed = {entry["name"]: entry for entry in json.loads(text)["keys"]}
+    assert {"alice", "bob", "reader", "writer", "for a while"} <= listed.keys()
+    assert listed["for a while"]["expires"] == pytest.approx(time.time() + 12 * 3600, abs=600)
+    assert not any(value in text for value in (secret["key"], *keyed.secrets.values()))
+    for path in keyed.server.data.rglob("*"):
+        if path.is_file() and "sqlite" in path.name:
+            assert secret["key"].encode() not in path.read_bytes()
+    headers = bearer(secret["key"])
+    assert keyed.server.client.get("/lifts", headers=headers).status_code == 200
+    run_command("keys", "revoke", secret["id"], data=keyed.server.data)
+    assert_problem(keyed.server.client.get("/lifts", headers=headers), 401)
+    assert keyed.ask("reader", "GET", "/lifts").status_code == 200
+
+
+def test_expired_key_is_let_in_no_more(keyed: Keyed) -> None:
+    def create_until(moment: int) -> dict[str, Any] | None:
+        """Make a key that is valid until a moment; None where a busy machine comes to it too late."""
+        date = datetime.fromtimestamp(moment, UTC).strftime("%Y-%m-%dT%H:%M:%S")
+        with contextlib.suppress(AssertionError):
+            return create_key(keyed.server, "--name", "late", "--scopes", "read", "--expires", date)
+        return None
+
+    key = create_until(int(time.time()) + 5) or create_until(int(time.time()) + 120)
+    assert key is not None
+    until(lambda: keyed.server.client.get("/lifts", headers=bearer(key["key"])).status_code == 401)
+    assert time.time() >= key["expires"] - 1
+
+
+def test_service_stays_closed_when_its_last_key_is_revoked(keyed: Keyed, tmp_path: Any) -> None:
+    with Server(tmp_path / "data") as server:
+        assert server.client.get("/lifts").status_code == 200
+        key = create_key(server, "--name", "only", "--scopes", "read,write")
+        assert_problem(server.client.get("/lifts"), 401)
+        run_command("keys", "revoke", key["id"], data=server.data)
+        for headers in ({}, bearer(key["key"])):
+            assert_problem(server.client.get("/lifts", headers=headers), 401)
+    del keyed
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["create", "--scopes", "read"],
+        ["create", "--name", "x", "--scopes", "everything"],
+        ["create", "--name", "x"],
+        ["create", "--name", "x", "--scopes", "read", "--expires", "yesterday"],
+        ["create", "--name", "x", "--scopes", "read", "--expires", "2001-01-01"],
+        ["revoke", "nobody"],
+    ],
+    ids=" ".join,
+)
+def test_bad_command_about_keys_is_one_line(keyed: Keyed, options: list[str]) -> None:
+    line = run_command("keys", *options, data=keyed.server.data, status=2)
+    assert "splatlift" in line and "Traceback" not in line

@@ -1,0 +1,228 @@
+"""Running the service: health, documents, hosts and origins, the log, backups, and starts that are refused."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import socket
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from tests.server import Server, run_command, until
+from tests.tiny_scene import TinyScene
+
+from .over_http import assert_problem, operations_of, upload, upload_scene
+
+
+def test_service_is_alive_ready_and_of_a_version(client: httpx.Client, lift: dict[str, Any]) -> None:
+    assert client.get("/healthz").json() == {"status": "ok"}
+    until(lambda: client.get("/readyz").status_code == 200)
+    assert client.get("/version").json()["version"] == lift["version"]
+
+
+def test_metrics_count_jobs_and_requests(client: httpx.Client, lift: dict[str, Any]) -> None:
+    del lift
+    reply = client.get("/metrics")
+    assert reply.headers["content-type"].startswith("text/plain")
+    lines = dict(line.rsplit(" ", 1) for line in reply.text.splitlines() if not line.startswith("#"))
+    assert float(lines['splatlift_jobs{state="succeeded"}']) >= 1
+    requests = {name for name in lines if name.startswith("splatlift_http_requests")}
+    assert requests and not any(re.search("[0-9a-f]{32}", name) for name in requests)  # routes and not addresses
+
+
+def test_openapi_document_describes_every_operation(client: httpx.Client) -> None:
+    document = client.get("/openapi.json").json()
+    names = []
+    for method, path, described in operations_of(client):
+        names.append(described["operationId"])
+        assert " " in described["summary"], f"{method} {path}"
+        assert set(described["responses"]) & {"200", "201", "202", "204"}, f"{method} {path}"
+    assert len(set(names)) == len(names) and all(re.fullmatch("[a-z]+(_[a-z]+)*", name) for name in names)
+    for reference in set(re.findall(r'"\$ref": ?"#/([^"]+)"', json.dumps(document))):
+        node = document
+        for part in reference.split("/"):
+            node = node[part]
+    for path in ("/assets/{asset}", "/lift", "/lift/plan", "/tradeoff", "/jobs/{job}/events", "/query", "/render"):
+        assert path in document["paths"] or path.replace("{asset}", "{kind}") in document["paths"]
+
+
+def test_page_and_documents_load_nothing_of_other_hosts(client: httpx.Client) -> None:
+    for path in ("/", "/docs"):
+        page = client.get(path)
+        assert page.status_code == 200 and page.headers["content-type"].startswith("text/html")
+        for address in re.findall(r"""<(?:script|link|img)[^>]*?(?:src|href)=['"]([^'"]+)""", page.text):
+            if not address.startswith("data:"):
+                assert client.get(f"/{address.lstrip('/')}").status_code == 200, address
+    assert "splatlift" in client.get("/").text
+
+
+@pytest.mark.parametrize("host", ["example.org", "example.org:80", "localhost.example.org", "", "127.0.0.1.nip.io"])
+def test_request_to_another_host_is_misdirected(client: httpx.Client, host: str) -> None:
+    for path in ("/healthz", "/lifts", "/"):
+        assert_problem(client.get(path, headers={"Host": host}), 421)
+
+
+def test_hosts_of_the_machine_and_of_the_settings_are_taken(client: httpx.Client, tmp_path: Path) -> None:
+    for host in ("localhost", "LOCALHOST:80", "127.0.0.1:9", "[::1]"):
+        assert client.get("/lifts", headers={"Host": host}).status_code == 200, host
+    with Server(tmp_path / "data", allowed_hosts="lift.example.org") as server:
+        assert server.client.get("/lifts", headers={"Host": "lift.example.org"}).status_code == 200
+        assert_problem(server.client.get("/lifts", headers={"Host": "example.org"}), 421)
+
+
+@pytest.mark.parametrize(
+    "origin", ["https://example.org", "http://127.0.0.1.example.org", "null", "http://localhost:1"]
+)
+def test_page_of_another_site_changes_nothing(
+    client: httpx.Client, order: dict[str, Any], tiny: TinyScene, origin: str
+) -> None:
+    before = client.get("/jobs").json()
+    headers = {"Origin": origin}
+    for reply in (
+        client.post("/lift", json=order, headers=headers),
+        client.put("/assets/splats", content=tiny.splats, headers=headers),
+        client.delete(f"/assets/{order['splats']}", headers=headers),
+    ):
+        assert_problem(reply, 403)
+    assert client.get("/jobs").json() == before
+    assert "access-control-allow-origin" not in client.get("/lifts", headers=headers).headers
+    own = {"Origin": str(client.base_url).rstrip("/")}
+    assert client.put("/assets/splats", content=tiny.splats, headers=own).status_code == 200
+
+
+def test_answers_carry_safe_headers_and_request_ids(client: httpx.Client) -> None:
+    for path in ("/healthz", "/lifts", "/nowhere", "/", "/openapi.json"):
+        headers = client.get(path).headers
+        assert headers["x-content-type-options"] == "nosniff" and headers["x-request-id"], path
+        assert headers["x-frame-options"] == "DENY" or "frame-ancestors" in headers["content-security-policy"]
+    ids = {client.get("/nowhere").headers["x-request-id"] for _ in range(3)}
+    assert len(ids) == 3
+    reply = client.get("/nowhere", headers={"X-Request-ID": "mine-7"})
+    assert reply.headers["x-request-id"] == "mine-7" == reply.json()["request_id"]
+    for odd in ("a b", "x" * 1000, "<script>"):
+        assert client.get("/nowhere", headers={"X-Request-ID": odd}).headers["x-request-id"] != odd
+
+
+def test_job_and_log_have_the_request_id_and_no_secret(client: httpx.Client, server: Server, tiny: TinyScene) -> None:
+    headers = {"X-Request-ID": "the-order", "Authorization": "Bearer the-secret", "Cookie": "the-secret"}
+    order = upload_scene(client, tiny)
+    job = client.post("/lift", json=order, headers=headers).json()
+    assert job["request_id"] == "the-order"
+    client.post(f"{job['links']['self']}/cancel")
+    for path in ("/healthz?token=the-secret", "/nowhere?the-secret", "/query?text=the-secret"):
+        client.get(path, headers=headers)
+    client.put("/assets/splats", content=b"the-secret", headers=headers)
+    text = until(lambda: server.log.read_text() if server.log.read_text().count("the-order") >= 5 else "")
+    assert "the-secret" not in text
+    lines = [json.loads(line) for line in text.splitlines()]
+    statuses = [line.get("status") for line in lines if line.get("request_id") == "the-order" and "status" in line]
+    assert statuses.count(200) == 1 and {202, 404, 422} <= set(statuses)
+    until(lambda: client.get(job["links"]["self"]).json()["state"] in ("canceled", "succeeded"))
+    client.delete(job["links"]["self"])
+    client.delete(f"/lifts/{job['id']}")
+
+
+def test_slow_clients_keep_nobody_waiting(client: httpx.Client) -> None:
+    with ExitStack() as stack:
+        for number in range(60):
+            address = (client.base_url.host, client.base_url.port or 80)
+            connection = stack.enter_context(closing(socket.create_connection(address)))
+            head = b"PUT /assets/splats HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9000\r\n\r\nply"
+            connection.sendall(head if number % 2 else b"GET /healthz HTTP/1.1\r\nHo")
+        for path in ("/healthz", "/readyz", "/lifts"):
+            assert client.get(path).status_code == 200, path
+        upload_reply = client.put("/assets/cameras", content=b"{}")
+        assert_problem(upload_reply, 422)
+
+
+# Data
+
+
+def test_backup_beside_a_running_server_is_whole(
+    client: httpx.Client, server: Server, lift: dict[str, Any], tmp_path: Path, encoder: str
+) -> None:
+    backup = tmp_path / "backup"
+    run_command("store", "backup", str(backup), data=server.data)
+    run_command("store", "backup", str(backup), data=server.data, status=2)  # it replaces nothing
+    assert run_command("store", "verify", data=backup)
+    with Server(backup, encoder=encoder) as other:
+        assert other.client.get(lift["links"]["self"]).json() == client.get(lift["links"]["self"]).json()
+        question = {"lift": lift["id"], "text": "lamp"}
+        answers = [each.get("/query", params=question).json() for each in (client, other.client)]
+        assert answers[0] == answers[1]
+        content = [each.get(f"/assets/{lift['splats']}/content").content for each in (client, other.client)]
+        assert content[0] == content[1]
+
+
+def test_damage_of_a_file_is_found(tmp_path: Path, tiny: TinyScene) -> None:
+    with Server(tmp_path / "data") as server:
+        digest = upload(server.client, "splats", tiny.splats).removeprefix("sha256:")
+    assert run_command("store", "verify", data=server.data)
+    (file,) = (path for path in server.data.rglob("*") if digest in path.name)
+    content = file.read_bytes()
+    file.chmod(0o600)
+    for damage in (content[:-1], content[:-1] + b"\0", None):
+        file.unlink() if damage is None else file.write_bytes(damage)
+        assert digest[:8] in run_command("store", "verify", data=server.data, status=1)
+
+
+def test_files_without_a_database_are_refused_and_stay(tmp_path: Path, tiny: TinyScene) -> None:
+    with Server(tmp_path / "data") as server:
+        digest = upload(server.client, "splats", tiny.splats).removeprefix("sha256:")
+    for path in server.data.glob("*.sqlite*"):
+        path.unlink()
+    line = run_command("serve", "--port", "0", data=server.data, status=2)
+    assert line.count("\n") == 1 and "database" in line
+    assert [path for path in server.data.rglob("*") if digest in path.name]
+
+
+def test_second_server_of_a_directory_is_refused(server: Server, tmp_path: Path) -> None:
+    assert str(server.data) in run_command("serve", "--port", "0", data=server.data, status=2)
+    port = str(server.client.base_url.port)
+    assert port in run_command("serve", "--port", port, data=tmp_path / "other", status=2)
+    assert server.client.get("/healthz").status_code == 200
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--host", "0.0.0.0"],  # beyond this machine only with keys
+        ["--port", "70000"],
+        ["--encoder", "nonsense"],
+        ["--encoder", "table:/nowhere/table.safetensors"],
+        ["--nonsense"],
+    ],
+    ids=" ".join,
+)
+def test_setting_that_cannot_be_is_refused_at_the_start(options: list[str], tmp_path: Path) -> None:
+    line = run_command("serve", *options, data=tmp_path / "data", status=2)
+    assert "splatlift" in line and "Traceback" not in line
+    assert not (tmp_path / "data").exists()
+
+
+def test_data_directory_is_for_its_user_alone(server: Server) -> None:
+    assert server.data.stat().st_mode & 0o077 == 0
+
+
+def test_full_disk_refuses_uploads_and_orders_and_serves_the_rest(
+    tmp_path: Path, tiny: TinyScene, order: dict[str, Any]
+) -> None:
+    floor = 10 * shutil.disk_usage(tmp_path).total
+    with Server(tmp_path / "data") as server:
+        body = upload_scene(server.client, tiny)
+    with Server(tmp_path / "data", floor_bytes=floor) as full:
+        assert body == order
+        for reply in (
+            full.client.put("/assets/splats", content=tiny.splats + b"\n"),
+            full.client.post("/lift", json=body),
+        ):
+            assert_problem(reply, 507)
+        assert full.client.get("/jobs").json()["jobs"] == []
+        assert full.client.get(f"/assets/{order['splats']}/content").content == tiny.splats
+        assert full.client.get("/healthz").status_code == 200
+        assert full.client.delete(f"/assets/{order['splats']}").status_code == 204

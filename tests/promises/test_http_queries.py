@@ -1,0 +1,274 @@
+"""Questions over HTTP: words, examples, points and vectors, by GET and POST; their pictures, arrays and splats."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from tests.tiny_scene import (
+    CHANNELS,
+    FOCAL,
+    HEIGHT,
+    POSE,
+    SPLATS_A_CLUSTER,
+    WIDTH,
+    WORDS,
+    codebook,
+    ply,
+    splat_rows,
+    text_table,
+)
+
+from .over_http import NO_ASSET, NO_ID, array, assert_problem, delete_lift, lift_of, picture, upload
+
+COLUMNS: dict[str, int] = dict(zip(WORDS, (6, 16, 26), strict=True))  # of view "middle" that show a word
+PLACES: dict[str, int] = {word: place for place, word in enumerate(WORDS)}
+LAMP = {"text": "lamp", "threshold": 0.5}
+
+
+def ask(client: httpx.Client, lift: dict[str, Any], **fields: Any) -> dict[str, Any]:
+    """Ask a lift by GET; return the answer."""
+    reply = client.get("/query", params={"lift": lift["id"], **fields})
+    assert reply.status_code == 200, reply.text
+    return reply.json()
+
+
+def is_of(answer: dict[str, Any], word: str) -> bool:
+    """Return True if an answer is the cluster of a word, to a splat or two."""
+    rows = {splat["splat"] // SPLATS_A_CLUSTER for splat in answer["top"]}
+    return rows == {PLACES[word]} and abs(answer["count"] - SPLATS_A_CLUSTER) <= 2
+
+
+@pytest.mark.parametrize("word", WORDS)
+def test_word_selects_its_cluster_in_numbers_arrays_and_pictures(
+    client: httpx.Client, lift: dict[str, Any], word: str
+) -> None:
+    answer = ask(client, lift, text=word, view="middle", threshold=0.5)
+    assert is_of(answer, word) and (answer["lift"], answer["text"], answer["view"]) == (lift["id"], [word], "middle")
+    assert (answer["threshold"]["value"], answer["threshold"]["method"]) == (0.5, "fixed")
+    best = [splat["score"] for splat in answer["top"]]
+    assert best == sorted(best, reverse=True)
+    links = answer["links"]
+    scores, selection = (array(client.get(link).content) for link in (links["scores"], as_selection(links["scores"])))
+    assert (scores.shape, scores.dtype, selection.dtype) == ((60,), np.float32, np.bool_)
+    assert scores[answer["top"][0]["splat"]] == pytest.approx(best[0]) == scores.max()
+    assert ((scores >= 0.5) == selection).all() and selection.sum() == answer["count"]
+    mask = picture(client.get(links["mask"]).content)
+    assert mask.shape == (HEIGHT, WIDTH) and set(np.unique(mask)) == {0, 255}
+    assert abs(np.nonzero(mask)[1].mean() - COLUMNS[word]) < 3
+    objects = client.get(links["objects"]).json()
+    (entry,) = objects["objects"]
+    assert entry["splats"] + objects["unassigned_splats"] == objects["count"] == answer["count"]
+    assert entry["centre"][0] == pytest.approx((PLACES[word] - 1) * 1.2, abs=0.2)
+    assert client.get(links["object"]).content == ply(splat_rows()[selection])  # the rows to the byte
+    for name, link in links.items():
+        assert client.get(link).status_code == 200, name
+
+
+def as_selection(link: str) -> str:
+    return link.replace("/query/scores", "/query/selection")
+
+
+@pytest.mark.parametrize(
+    "like", ["middle:26,12", "region:left:0:2", f"splat:{2 * SPLATS_A_CLUSTER}", "middle:box:22,4,30,20"]
+)
+def test_example_selects_more_of_it(client: httpx.Client, lift: dict[str, Any], like: str) -> None:
+    answer = ask(client, lift, like=like, view="middle", threshold=0.5)
+    assert is_of(answer, "lamp") and (answer["like"], answer["text"]) == ([like], [])
+    assert np.nonzero(picture(client.get(answer["links"]["mask"]).content))[1].min() >= WIDTH // 2
+
+
+def test_vector_is_posted_and_so_is_all_that_belongs_to_it(client: httpx.Client, lift: dict[str, Any]) -> None:
+    body = {"like": [codebook()[2].tolist()], "unlike": ["middle:6,12"], "view": "middle", "lift": lift["id"]}
+    answer = client.post("/query", json=body).json()
+    assert is_of(answer, "lamp") and answer["like"] == [f"a vector of {CHANNELS} channels"]
+    assert array(client.post(as_selection(answer["links"]["scores"]), json=body).content).sum() == answer["count"]
+    for name in ("mask", "attention"):
+        content = client.post(answer["links"][name].partition("?")[0], json=body).content
+        assert picture(content).shape[:2] == (HEIGHT, WIDTH)
+    for wrong in ([1.0] * (CHANNELS - 1), [0.0] * CHANNELS, [], ["x"]):
+        assert_problem(client.post("/query", json=body | {"like": [wrong]}), 422)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"text": ["apple"]},
+        {"text": ["apple"], "negatives": ["book"], "threshold": 0.5},
+        {"text": ["apple"], "like": ["middle:26,12"], "top": 3, "view": "left"},
+        {"like": ["splat:1"], "unlike": ["splat:30"], "threshold": 0.25},
+        {"sets": ["object:0", "object:1"]},
+        {"text": ["zeppelin"]},
+        {"like": ["behind:1,1"]},
+    ],
+    ids=str,
+)
+def test_get_and_post_are_one_question(client: httpx.Client, lift: dict[str, Any], fields: dict[str, Any]) -> None:
+    fields = fields | {"lift": lift["id"]}
+    by_get, by_post = client.get("/query", params=fields), client.post("/query", json=fields)
+    assert by_get.status_code == by_post.status_code
+    documents = [reply.json() | {"request_id": None} for reply in (by_get, by_post)]
+    assert documents[0] == documents[1]
+
+
+def test_negatives_and_thresholds_change_the_selection(client: httpx.Client, lift: dict[str, Any]) -> None:
+    both = ask(client, lift, text="apple", like="middle:26,12", threshold=0.5)
+    assert both["count"] > 1.5 * SPLATS_A_CLUSTER
+    assert is_of(ask(client, lift, text="apple", negatives="lamp", threshold=0.5), "apple")
+    counts = [ask(client, lift, text="lamp", threshold=value)["count"] for value in (-1, 0.5, 1.0)]
+    assert counts[0] == 60 and counts == sorted(counts, reverse=True)
+    for method in ("auto", "paper"):
+        assert ask(client, lift, text="lamp", threshold=method)["threshold"]["method"] == method
+    assert len(ask(client, lift, text="lamp", top=3)["top"]) == 3
+
+
+def test_only_lift_may_be_left_out_and_several_are_named(
+    client: httpx.Client, lift: dict[str, Any], order: dict[str, Any]
+) -> None:
+    assert client.get("/query", params={"text": "lamp"}).json() == ask(client, lift, text="lamp")
+    other = lift_of(client, order)
+    assert_problem(client.get("/query", params={"text": "lamp"}))
+    assert is_of(ask(client, other, text="lamp"), "lamp")
+    delete_lift(client, other["id"])
+
+
+def test_nothing_selected_is_said_and_has_no_splats(client: httpx.Client, lift: dict[str, Any]) -> None:
+    fields = {"lift": lift["id"], "text": "lamp", "negatives": "book", "threshold": 1}
+    answer = client.get("/query", params=fields).json()
+    assert (answer["count"], answer["clear"], answer["box"]) == (0, False, None)
+    assert "object" not in answer["links"]
+    problem = assert_problem(client.get("/query/splats", params=fields), 422)
+    assert "threshold" in problem["hint"]
+
+
+def test_camera_of_a_body_sees_what_a_view_sees(client: httpx.Client, lift: dict[str, Any]) -> None:
+    camera = {"width": WIDTH, "height": HEIGHT, "fx": FOCAL, "viewmat": POSE}
+    body = {"lift": lift["id"], "text": ["lamp"]}
+    for path in ("/query/mask", "/query/attention"):
+        by_camera, by_view = (
+            client.post(path, json=body | seen) for seen in ({"camera": camera}, {"view": "middle"})
+        )
+        assert (picture(by_camera.content) == picture(by_view.content)).all()
+
+
+WRONG: dict[str, tuple[str, dict[str, Any], int, str]] = {
+    "no question": ("/query", {}, 422, "query"),
+    "an empty word": ("/query", {"text": [""]}, 422, "text.0"),
+    "an unknown word": ("/query", {"text": ["apple", "zeppelin"], "negatives": ["lamp"]}, 422, "text.1"),
+    "an unknown negative": ("/query", {"text": ["apple"], "negatives": ["zeppelin"]}, 422, "negatives.0"),
+    "a splat that is none": ("/query", {"like": ["splat:1", "splat:60"]}, 422, "like.1"),
+    "an unknown view": ("/query", {"unlike": ["behind:1,1"], "like": ["splat:1"]}, 404, "unlike.0"),
+    "an unknown region": ("/query", {"like": ["region:left:7:0"]}, 404, "like.0"),
+    "a pixel outside": ("/query", {"like": ["middle:99,0"]}, 422, "like.0"),
+    "an unknown notation": ("/query", {"like": ["nonsense"]}, 422, "like.0"),
+    "an unknown lift": ("/query", {"text": ["apple"], "lift": NO_ID}, 404, "lift"),
+    "no lift's id": ("/query", {"text": ["apple"], "lift": "../../etc/passwd"}, 422, "lift"),
+    "a negative number": ("/query", {"text": ["apple"], "top": -1}, 422, "top"),
+    "an unknown method": ("/query", {"text": ["apple"], "threshold": "best"}, 422, "threshold"),
+    "a threshold beyond all": ("/query", {"text": ["apple"], "threshold": 1.5}, 422, "threshold"),
+    "an unknown encoder": ("/query", {"text": ["apple"], "encoder": "table:/etc/passwd"}, 422, "encoder"),
+    "an encoder that does not fit": ("/query", {"text": ["apple"], "encoder": "narrow"}, 422, "encoder"),
+    "an unknown table": ("/query", {"text": ["apple"], "table": NO_ASSET}, 404, ""),
+    "an unknown object": ("/query", {"sets": ["object:77"]}, 404, ""),
+    "a mask of no view": ("/query/mask", {"text": ["apple"]}, 422, "view"),
+    "a mask of an unknown view": ("/query/mask", {"text": ["apple"], "view": "behind"}, 404, "view"),
+    "too many examples": ("/query/scores", {"like": ["splat:1"] * 99}, 422, "like"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_question_that_leads_nowhere_names_what_is_wrong(
+    client: httpx.Client, lift: dict[str, Any], name: str
+) -> None:
+    path, fields, status, argument = WRONG[name]
+    fields = {"lift": lift["id"]} | fields
+    for reply in (client.get(path, params=fields), client.post(path, json=fields)):
+        problem = assert_problem(reply, status)
+        assert (problem.get("argument") or "").startswith(argument), problem
+        assert "/tmp" not in json.dumps(problem) and ".safetensors" not in problem["detail"]
+
+
+def test_unknown_parameter_is_refused_and_not_ignored(client: httpx.Client, lift: dict[str, Any]) -> None:
+    fields = {"lift": lift["id"], "text": ["lamp"], "treshold": 0.5}
+    for reply in (client.get("/query", params=fields), client.post("/query", json=fields)):
+        assert "treshold" in assert_problem(reply, 422)["argument"]
+
+
+# Words: of the scene, of an uploaded table, of every splat
+
+
+@pytest.fixture(scope="module")
+def table(client: httpx.Client) -> str:
+    """A table of other names for the three things, and of one that is not there."""
+    names = ("fruit", "novel", "light", "boat")
+    return upload(client, "table", text_table(words=names, rows=np.eye(4, CHANNELS, dtype=np.float32)))
+
+
+def test_uploaded_table_answers_and_completes(client: httpx.Client, lift: dict[str, Any], table: str) -> None:
+    assert is_of(ask(client, lift, text="light", table=table), "lamp")
+    answer = ask(client, lift, text="two old lights", table=table)
+    assert [(entry["text"], entry["word"]) for entry in answer["wording"]] == [("two old lights", "light")]
+    fields = {"lift": lift["id"], "table": table}
+    problem = assert_problem(client.get("/query", params=fields | {"text": "boaat"}), 422)
+    assert (problem["argument"], problem["nearest"]) == ("text.0", ["boat"])
+    words = client.get("/query/words", params=fields | {"text": "no"}).json()
+    assert [entry["word"] for entry in words["words"]] == ["novel"]
+    assert set(client.get("/query/words", params=fields).json()["here"]) == {"fruit", "novel", "light"}
+    assert_problem(client.get("/query", params=fields | {"text": "light", "encoder": "default"}), 422)
+    assert_problem(client.get("/query", params=fields | {"text": "light", "table": lift["splats"]}), 422)
+
+
+def test_table_of_an_order_has_the_words_of_its_lift(client: httpx.Client, order: dict[str, Any], table: str) -> None:
+    other = lift_of(client, order | {"table": table})
+    assert is_of(ask(client, other, text="fruit"), "apple")
+    assert_problem(client.delete(f"/assets/{table}"), 409)
+    narrow = upload(client, "table", text_table(CHANNELS - 1))
+    reply = client.post("/lift", json=order | {"table": narrow})
+    assert reply.status_code == 202 or assert_problem(reply, 422)["argument"] == "table"
+    delete_lift(client, other["id"])
+    if reply.status_code != 202:
+        assert client.delete(f"/assets/{narrow}").status_code == 204
+
+
+def test_every_splat_has_its_word(client: httpx.Client, lift: dict[str, Any], table: str) -> None:
+    body = {"lift": lift["id"], "table": table, "view": "middle"}
+    answer = client.post("/query/segment", json=body).json()
+    values = {entry["word"]: entry["value"] for entry in answer["found"]}
+    assert set(values) == {"fruit", "novel", "light"}
+    labels = array(client.post("/query/segment/labels", json=body).content)
+    assert (labels.dtype, (labels == 0).sum()) == (np.int32, answer["none"])
+    for place, word in enumerate(("fruit", "novel", "light")):
+        rows = labels[place * SPLATS_A_CLUSTER : (place + 1) * SPLATS_A_CLUSTER]
+        assert set(rows.tolist()) - {0} == {values[word]}
+    label_map = picture(client.post("/query/segment/map", json=body).content)
+    assert label_map.shape == (HEIGHT, WIDTH)
+    assert [label_map[HEIGHT // 2, column] for column in COLUMNS.values()] == [values[word] for word in
+        ("fruit", "novel", "light")]  # fmt: skip
+    for wrong in ({"words": []}, {"words": ["lamp", "lamp"]}, {"words": ["zeppelin"]}):
+        assert_problem(client.post("/query/segment", json={"lift": lift["id"]} | wrong), 422)
+
+
+@pytest.mark.parametrize("word", WORDS)
+def test_example_is_named_by_its_nearest_words(client: httpx.Client, lift: dict[str, Any], word: str) -> None:
+    for example in (f"middle:{COLUMNS[word]},12", f"splat:{SPLATS_A_CLUSTER * PLACES[word]}"):
+        body = {"lift": lift["id"], "example": example, "top": 2}
+        best = client.post("/query/what", json=body).json()["words"]
+        assert best[0]["word"] == word and best[0]["score"] > best[1]["score"]
+
+
+def test_answer_from_the_cache_is_the_answer(client: httpx.Client, lift: dict[str, Any]) -> None:
+    paths = {
+        "/query": LAMP, "/query/scores": LAMP, "/query/objects": LAMP,
+        "/query/mask": LAMP | {"view": "left"}, "/render": {"view": "left"},
+    }  # fmt: skip
+    for path, fields in paths.items():
+        first, second = (client.get(path, params=fields | {"lift": lift["id"]}) for _ in range(2))
+        assert first.status_code == 200 and first.content == second.content
+        tag = first.headers.get("etag")
+        if tag is not None:
+            other = client.get(path, params=fields | {"lift": lift["id"]}, headers={"If-None-Match": tag})
+            assert (other.status_code, other.content) == (304, b"")
