@@ -47,7 +47,7 @@ soak: $(READY)  ## the long proofs of docs/service.md: prints their figures, tak
 	$(BIN)/python -m tests.benchmarks.soak
 
 contract: $(READY)  ## every operation against the OpenAPI document, without keys and with them; some minutes
-	$(BIN)/python -m tests.api.contract
+	$(BIN)/python -m tests.contract
 
 load: $(READY)  ## what clients wait for under load (docs/service.md): prints figures, takes some minutes
 	$(BIN)/python -m tests.benchmarks.load

@@ -111,7 +111,14 @@ def run_command(*arguments: str, data: Path, status: int = 0) -> str:
 class Server:
     """`splatlift serve` as a process, over a data directory; it may be killed and started again."""
 
-    def __init__(self, data: Path, *, command: tuple[str, ...] = ("-m", "service", "--port", "0"), **settings: Any):
+    def __init__(
+        self,
+        data: Path,
+        *,
+        command: tuple[str, ...] = ("-m", "service", "--port", "0"),
+        options: tuple[str, ...] = (),
+        **settings: Any,
+    ) -> None:
         self.data = data
         self._command = command
         self._mark = uuid.uuid4().hex
@@ -123,7 +130,7 @@ class Server:
         self._process: subprocess.Popen[str] | None = None
         # No connection is used twice: one that lay idle may be closed in the moment in which it is taken up again.
         self.client = httpx.Client(timeout=PATIENCE_SECONDS, limits=httpx.Limits(max_keepalive_connections=0))
-        self.start()
+        self.start(*options)
 
     def __enter__(self) -> Self:
         return self

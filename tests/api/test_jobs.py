@@ -5,18 +5,14 @@ from __future__ import annotations
 import errno
 import io
 import json
-import shutil
 import tempfile
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import replace
-from datetime import datetime
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from fastapi.testclient import TestClient
@@ -25,7 +21,6 @@ from liftcore import WorldFrame, load_lift
 from liftcore.errors import Unavailable
 from liftcore.lifting.files import open_files
 from liftcore.lifting.pipeline import plan as plan_of
-from liftcore.query.scene import Scene
 from liftcore.runtime.device import choose_device
 from liftcore.runtime.progress import Progress
 from liftcore.values.settings import LiftSettings
@@ -34,18 +29,15 @@ from service import supervisor as pace
 from service.child import fault_of
 from service.job_child import Reporter
 from service.models import AssetKind
-from service.routes.jobs import shape
 from service.store.jobs import LINE_CHARACTERS, LOG_LINES, EventKind, log_line, note
 from service.store.owners import SERVICE
 from service.store.store import Store
 from service.tasks import plan_document
-from tests.crash.conftest import asset_of, order, until
+from tests.crash.conftest import asset_of, order
 from tests.crash.server import standing_in
-from tests.server import wait_for_end
-from tests.tiny_scene import CHANNELS, SPLATS_A_CLUSTER, VIEWS, TinyScene, cameras_document
+from tests.tiny_scene import TinyScene
 
-from .conftest import LIFT_REQUEST, SceneAssets, parts_of, put
-from .guarded import finish
+from .conftest import SceneAssets
 from .test_problems import assert_problem
 
 Quick = Callable[..., AbstractContextManager[tuple[TestClient, dict[str, Any]]]]
@@ -65,203 +57,6 @@ def events(text: str) -> list[tuple[int, str, dict[str, Any]]]:
         if fields:
             records.append((int(fields["id"]), fields["event"], json.loads(fields["data"])))
     return records
-
-
-def test_same_key_is_the_same_job_or_refused_with_another_order(quick: Quick) -> None:
-    with quick("answer") as (client, body):
-        first = client.post("/lift", json=body, headers={"Idempotency-Key": "one"})
-        second = client.post("/lift", json=body, headers={"Idempotency-Key": "one"})
-        assert (first.status_code, second.status_code) == (202, 200)
-        assert first.json()["id"] == second.json()["id"] and first.headers["location"] == second.headers["location"]
-        wait_for_end(client, first.headers["location"])
-        late = client.post("/lift", json=body, headers={"Idempotency-Key": "one"})
-        assert late.status_code == 200 and late.json()["state"] == "succeeded"
-        assert len(client.get("/jobs").json()["jobs"]) == 1
-        other = client.post("/lift", json=body, headers={"Idempotency-Key": "two"})
-        assert other.status_code == 202 and other.json()["id"] != first.json()["id"]
-        other_body = body | {"settings": {"preset": "row-sum"}}
-        reply = client.post("/lift", json=other_body, headers={"Idempotency-Key": "one"})
-        assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/key-reused", 422)
-        for key in ("", "x" * 256):
-            reply = client.post("/lift", json=body, headers={"Idempotency-Key": key})
-            assert assert_problem(reply)["status"] == 422
-
-
-def test_lifts_are_ordered_by_json_and_times_are_in_seconds_and_iso(quick: Quick) -> None:
-    with quick("answer") as (client, body):
-        first = client.post("/lift", json=body, headers={"Idempotency-Key": "one"})
-        second = client.post("/lifts", json=body, headers={"Idempotency-Key": "one"})
-        other = client.post("/lifts", content=json.dumps(body), headers={"Content-Type": "Application/json"})
-        assert [reply.status_code for reply in (first, second, other)] == [202, 200, 202]
-        assert first.json()["id"] == second.json()["id"] != other.json()["id"]
-        assert other.headers["location"] == f"/jobs/{other.json()['id']}"
-        assert client.post("/lifts?sha256=" + "0" * 64, json=body).status_code == 422  # of files
-        job = wait_for_end(client, other.headers["location"])
-        for name in ("created", "started", "ended"):
-            assert datetime.fromisoformat(job[f"{name}_at"]).timestamp() == pytest.approx(job[name], abs=1e-5)
-        queued = client.post("/lift", json=body).json()
-        assert queued["ended"] is None and queued["ended_at"] is None
-
-
-def test_full_line_is_503_with_retry_after_and_a_known_key_still_finds_its_job(quick: Quick) -> None:
-    with quick("hang", max_queued=1) as (client, body):
-        location = client.post("/lift", json=body).headers["location"]
-        until(lambda: client.get(location).json()["state"] != "queued")
-        assert client.post("/lift", json=body, headers={"Idempotency-Key": "k"}).status_code == 202
-        counts = client.get("/metrics").text
-        for line in ("queue_length 1.0", "running_lifts 1.0", 'jobs{state="queued"} 1.0'):
-            assert f"splatlift_{line}" in counts
-        reply = client.post("/lift", json=body)
-        assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/busy", 503)
-        assert int(reply.headers["retry-after"]) > 0
-        assert client.post("/lift", json=body, headers={"Idempotency-Key": "k"}).status_code == 200
-
-
-def test_canceled_job_keeps_its_plan(quick: Quick) -> None:
-    with quick("hang") as (client, body):
-        running = client.post("/lift", json=body).headers["location"]
-        until(lambda: client.get(running).json()["plan"])
-        record = client.get(running).json()
-        assert record["state"] == "running" and record["plan"]["summary"] == ["a long time"]
-        waiting = client.post("/lift", json=body).headers["location"]
-        assert client.get(waiting).json()["links"]["cancel"] == f"{waiting}/cancel"
-        reply = client.post(f"{waiting}/cancel")
-        assert (reply.status_code, reply.json()["state"]) == (200, "canceled")
-        reply = client.post(f"{running}/cancel")
-        assert (reply.status_code, reply.json()["state"]) == (202, "canceling")
-        assert wait_for_end(client, running)["state"] == "canceled"
-        for job in (running, waiting):
-            reply = client.post(f"{job}/cancel")
-            assert (reply.status_code, reply.json()["state"]) == (200, "canceled")
-        problem_fields = [data for _, name, data in events(client.get(f"{running}/events").text) if name == "plan"]
-        assert problem_fields == [record["plan"]] == [client.get(running).json()["plan"]]
-
-
-def test_ended_job_cannot_be_canceled_and_only_an_ended_one_can_be_deleted(quick: Quick, store: Store) -> None:
-    with quick("slowly") as (client, body):
-        job = client.post("/lift", json=body).headers["location"]
-        reply = client.delete(job)
-        assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/conflict", 409)
-        assert wait_for_end(client, job)["state"] == "succeeded"
-        assert assert_problem(client.post(f"{job}/cancel"))["status"] == 409
-        reply = client.delete(job)  # a retried DELETE must not cost a lift that nobody gave up
-        assert reply.status_code == 409 and "with_lift" in reply.json()["hint"]
-        lift = store.files.lift(job.rpartition("/")[2])
-        assert lift.exists() and client.get(job.replace("jobs", "lifts")).status_code == 200
-        assert client.delete(job, params={"with_lift": True}).status_code == 204
-        assert not lift.exists() and client.get(job.replace("jobs", "lifts")).status_code == 404
-        for reply in (client.get(job), client.delete(job), client.get(f"{job}/events"), client.post(f"{job}/cancel")):
-            assert assert_problem(reply)["status"] == 404
-        assert client.delete(f"/assets/{body['splats']}").status_code == 204  # nothing needs it any more
-
-
-def test_events_tell_the_whole_story_and_go_on_after_the_last_one_seen(quick: Quick) -> None:
-    with quick("slowly") as (client, body):
-        job = client.post("/lift", json=body).headers["location"]
-        reply = client.get(f"{job}/events")  # returns when the stream ends
-        assert reply.headers["content-type"].startswith("text/event-stream")
-        story = events(reply.text)
-        assert [data["state"] for _, name, data in story if name == "state"] == ["queued", "running", "succeeded"]
-        assert {name for _, name, _ in story} == {"state", "plan", "progress", "log"}
-        numbers = [number for number, _, _ in story]
-        assert numbers == sorted(set(numbers))
-        third = {"Last-Event-ID": str(numbers[2])}
-        recent = [
-            event for event in events(client.get(f"{job}/events", headers=third).text) if event[1] != "progress"
-        ]
-        assert recent == [event for event in story[3:] if event[1] != "progress"]
-        assert client.get(f"{job}/events", headers={"Last-Event-ID": str(numbers[-1])}).status_code == 204
-        for nonsense in ("x", "-1", "9" * 30):
-            reply = client.get(f"{job}/events", headers={"Last-Event-ID": nonsense})
-            assert assert_problem(reply)["status"] == 422
-
-
-def test_failed_job_tells_its_problem_in_its_events(quick: Quick) -> None:
-    with quick("die") as (client, body):
-        job = client.post("/lift", json=body).headers["location"]
-        *_, (_, name, last) = events(client.get(f"{job}/events").text)
-        assert (name, last["state"], last["attempt"]) == ("state", "failed", 3)
-        assert last["problem"] == client.get(job).json()["problem"]
-        assert last["problem"]["type"] == "/problems/crashed"
-
-
-def test_no_work_is_taken_below_the_disk_floor_and_the_service_lives(
-    quick: Quick, scene: TinyScene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    usage = shutil.disk_usage("/")
-    with quick("answer", disk_floor_bytes=1000) as (client, body):
-        parts_of(client).store.files._floor = 1000
-        monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=999))
-        for reply in (
-            client.put("/assets/splats", content=scene.splats),
-            client.post("/lift", json=body),
-        ):
-            assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/no-space", 507)
-        assert client.get("/jobs").json()["jobs"] == [] and len(client.get("/assets").json()["assets"]) == 3
-        monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=1000))
-        assert wait_for_end(client, client.post("/lift", json=body).headers["location"])["state"] == "succeeded"
-
-
-def test_job_and_lift_keep_what_the_plan_warned_of(client: TestClient, scene_assets: SceneAssets) -> None:
-    away = cameras_document()
-    for frame in away["frames"]:  # they look the other way
-        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([-1.0, 1, -1, 1])).tolist()
-    cameras = put(client, AssetKind.CAMERAS, json.dumps(away).encode())
-    order = replace(scene_assets, cameras=cameras).order(preset="row-sum")
-    job = wait_for_end(client, client.post("/lift", json=order).headers["location"])
-    assert job["state"] == "succeeded", job
-    data = [line for line in job["plan"]["warnings"] if "no camera can see" in line]
-    assert data and set(data) <= set(client.get(job["links"]["lift"]).json()["diagnostics"]["warnings"])
-    assert client.delete(f"{job['links']['self']}?with_lift=true").status_code == 204
-
-
-def test_job_tells_of_every_stage_and_its_plan_comes_with_the_first_views(
-    client: TestClient, lift: dict[str, Any]
-) -> None:
-    story = events(client.get(f"{lift['links']['job']}/events").text)
-    lines = [(number, data["line"]) for number, name, data in story if name == "log"]
-    _, *stages = (line for _, line in lines)
-    assert stages == ["read", "digest", "compile", "plan", "geometry: 3 views", "solve", "certify", "save"]
-    (planned_at,) = (number for number, name, _ in story if name == "plan")
-    at = {line: number for number, line in lines}
-    assert at["plan"] < at["geometry: 3 views"] < planned_at < at["solve"]
-    job = client.get(lift["links"]["job"]).json()
-    assert job in client.get("/jobs").json()["jobs"]
-    first, *_ = job["plan"].pop("summary")
-    assert first.startswith(f"{3 * SPLATS_A_CLUSTER} splats (3dgs), ") and first.endswith("3 of 3 views")
-    assert isinstance(job["plan"].pop("warnings"), list)  # what there is to say is of the machine
-    assert job["plan"] == lift["diagnostics"]["plan"]
-    assert (job["state"], job["attempt"], job["problem"]) == ("succeeded", 1, None)
-    assert job["settings"]["preset"] == "row-sum" and job["settings"]["power"] == 1
-    assert job["created"] <= job["started"] <= job["ended"]
-    assert job["request_id"] == LIFT_REQUEST
-    assert LIFT_REQUEST in client.get(job["links"]["events"]).text
-    assert job["progress"] == {
-        "stage": "save", "completed": 1, "done": 1, "total": 1, "unit": "steps", "eta_s": 0.0,
-    }  # fmt: skip
-
-
-def test_progress_stored_by_its_old_name_is_answered_by_both(store: Store) -> None:
-    job, _ = store.jobs.submit(SERVICE, order(store))
-    progress = {"stage": "solve", "done": 2, "total": 3, "unit": "slices", "eta_s": None}
-    with store.database.write() as connection:
-        connection.execute("UPDATE jobs SET progress = ? WHERE id = ?", (json.dumps(progress), job))
-    shaped = shape(store.jobs.get(SERVICE, job)).model_dump(mode="json")
-    assert shaped["progress"] == progress | {"completed": 2}
-
-
-def test_lists_begin_with_the_newest(store: Store) -> None:
-    jobs = [store.jobs.submit(SERVICE, order(store))[0] for _ in range(3)]
-    for job in jobs:
-        finish(store, job.encode())
-    assets = [asset.id for asset in store.assets.all(SERVICE)]
-    with store.database.write() as connection:
-        for created, job, asset in zip((20.0, 10.0, 30.0), jobs, assets, strict=True):
-            connection.execute("UPDATE jobs SET created = ? WHERE id = ?", (created, job))
-            connection.execute("UPDATE lifts SET created = ? WHERE id = ?", (created, job))
-            connection.execute("UPDATE asset_owners SET created = ? WHERE asset = ?", (created, asset))
-    for table, ids in ((store.jobs, jobs), (store.lifts, jobs), (store.assets, assets)):
-        assert [record.id for record in table.all(SERVICE)] == [ids[2], ids[0], ids[1]]
 
 
 def test_job_keeps_its_states_the_last_of_its_log_and_its_latest_progress(store: Store) -> None:
@@ -296,51 +91,6 @@ def test_what_a_stage_will_still_take_follows_from_its_own_pace(monkeypatch: pyt
     now += 3
     assert seconds_left("solve", 3) == 7
     assert seconds_left("solve", 10) == 0
-
-
-COUNT = 3 * SPLATS_A_CLUSTER
-
-
-def test_assets_say_what_is_in_them_and_their_names_alone(client: TestClient, scene_assets: SceneAssets) -> None:
-    table = {asset["id"]: asset["counts"] for asset in client.get("/assets").json()["assets"]}
-    splats, cameras, features = (
-        client.get(f"/assets/{asset}").json()["counts"]
-        for asset in (scene_assets.splats, scene_assets.cameras, scene_assets.features)
-    )
-    assert (splats["splats"], splats["kernel"]) == (COUNT, "3dgs")
-    assert (cameras["views"], features["channels"], features["text_space"]) == (len(VIEWS), CHANNELS, "tiny")
-    for asset, counts in ((scene_assets.cameras, cameras), (scene_assets.features, features)):
-        assert "middle" in counts.pop("names") and table[asset] == counts  # lists leave out the names
-
-
-def test_lift_tells_how_far_to_trust_it(client: TestClient, lift: dict[str, Any], scene_assets: SceneAssets) -> None:
-    assert (lift["count"], lift["channels"], lift["text_space"]) == (COUNT, CHANNELS, "tiny")
-    assert sorted(lift["views"]) == sorted(VIEWS) and lift["diagnostics"] and lift["timings"]
-    assert lift["certificate"] == lift["diagnostics"]  # by its old name, until version 1 ends
-    assert lift["settings"]["certificate_rays"] == lift["settings"]["diagnostic_rays"]
-    assert (lift["splats"], lift["cameras"], lift["features"]) == (
-        scene_assets.splats, scene_assets.cameras, [scene_assets.features]
-    )  # fmt: skip
-    now = client.get(f"/lifts/{lift['id']}").json()
-    assert now in client.get("/lifts").json()["lifts"]
-    assert now == lift | {"photos": now["photos"]}  # another test may have given it photos
-
-
-def test_lift_and_its_files_are_found_where_they_were_downloaded(
-    client: TestClient, data: Path, lift: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    full = client.get(lift["links"]["features"])
-    assert len(full.content) == lift["bytes"] and full.headers["etag"] == f'"{lift["sha256"]}"'
-    files = [f"/assets/{asset}/content" for asset in (lift["splats"], lift["cameras"], *lift["features"])]
-    for reply in (full, *map(client.get, files)):
-        name = reply.headers["content-disposition"].partition('filename="')[2].rstrip('"')
-        (tmp_path / name).write_bytes(reply.content)
-    [file] = tmp_path.glob("lift-*.safetensors")
-    assert str(data).encode() not in file.read_bytes()  # paths of the server are nobody's business
-    monkeypatch.chdir(tmp_path)
-    scene = Scene(file)
-    assert scene.splats.count == COUNT and {camera.name for camera in scene.cameras.values()} == set(VIEWS)
-    assert set(scene.packs.views) == set(VIEWS)
 
 
 def test_downloaded_lift_has_the_world_that_it_was_given_later(

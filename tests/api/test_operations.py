@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import os
-import re
 import signal
 import sqlite3
 import sys
@@ -14,44 +13,33 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 from unittest.mock import Mock, patch
 
 import anyio
 import pytest
-import uvicorn
 from fastapi.testclient import TestClient
-from prometheus_client import REGISTRY
 from prometheus_client.parser import text_string_to_metric_families
 from pydantic import ValidationError
 
-from service import app as layers
-from service.commands.serve import AnnouncingServer
-from service.content import EventStreams
 from service.errors import NoSpace, ServiceUnavailable
 from service.models import BODY_BRACKETS, BODY_COMMAS, PACKS, SETTINGS, AssetKind, Question
-from service.observe import SAME_A_MINUTE, JsonLines, LogRateLimit, TextLines, working_for
-from service.query_client import Frame
+from service.observe import JsonLines, working_for
 from service.sandbox import SandboxLimits
-from service.state import Stopping
-from service.store.assets import SHOWN_CHARACTERS
 from service.store.database import Database
 from service.store.files import DataDirectory
 from service.store.owners import SERVICE
 from service.store.store import Store
-from service.supervisor import Supervisor
 from service.uploads import check
 from tests.crash.conftest import order, until
-from tests.crash.server import NoQueries
 from tests.crash.service_process import ServiceProcess, processes_of, template_of
-from tests.tiny_scene import TinyScene, cameras_document
+from tests.tiny_scene import TinyScene
 
-from .conftest import SceneAssets, app_of, parts_of, put
+from .conftest import SceneAssets, app_of, parts_of
 from .guarded import address, every_route, keyed_server
 from .test_problems import assert_problem
 
 Start = Callable[..., Any]
-REQUEST_ID = re.compile(r"[0-9a-f]{32}")
 
 
 def fails(client: TestClient, check: str) -> None:
@@ -157,64 +145,6 @@ def test_operations_and_errors_answer_while_every_thread_of_the_pool_is_busy(sta
             assert (problem["status"], problem["request_id"]) == (status, "mine")
 
 
-def test_metrics_count_requests_by_route_template_and_labels_stay_few(
-    client: TestClient, scene_assets: SceneAssets
-) -> None:
-    name, labels = "splatlift_http_requests_total", {"route": "/assets/{asset}", "status": "200"}
-    for path in ("/x", "/jobs/x"):
-        client.get(path)
-    client.request("BREW", "/x")
-    before = samples(client)
-    for asset in (scene_assets.splats, scene_assets.cameras):
-        client.get(f"/assets/{asset}")
-        client.head(f"/assets/{asset}")
-    value = samples(client)
-    for method in ("GET", "HEAD"):
-        assert (
-            metric_value(value, name, method=method, **labels)
-            == metric_value(before, name, method=method, **labels) + 2
-        )
-    assert metric_value(value, "splatlift_http_request_seconds_count", method="GET", route="/assets/{asset}") >= 2
-    for number in range(20):
-        client.get(f"/nowhere/{number}?{number}", headers={"X-Request-ID": f"id{number}"})
-        client.get(f"/jobs/{number}")
-        client.request(f"BREW{number}", f"/y{number}")
-    assert samples(client).keys() == value.keys()
-    # Each application counts for itself.
-    assert not [family.name for family in REGISTRY.collect() if family.name.startswith("splatlift")]
-
-
-def test_metrics_tell_of_uploads_jobs_queries_and_the_disk(client: TestClient, scene: TinyScene, lift: Any) -> None:
-    before = samples(client)
-    body = scene.cameras
-    assert client.put("/assets/cameras", content=body).status_code == 200  # it is there already, and still was sent
-    assert client.get("/query", params={"text": "apple", "lift": lift["id"]}).status_code == 200
-    assert client.get("/query", params={"text": "zeppelin", "lift": lift["id"]}).status_code == 422
-    value = samples(client)
-
-    def growth(name: str, **labels: str) -> float:
-        return metric_value(value, name, **labels) - metric_value(before, name, **labels)
-
-    uploads = {"method": "PUT", "route": "/assets/{asset}"}
-    assert growth("splatlift_http_request_body_bytes_total", **uploads) == len(body)
-    for outcome in ("answered", "invalid-query"):
-        assert growth("splatlift_query_seconds_count", operation="query", outcome=outcome) == 1
-    succeeded = len([job for job in client.get("/jobs").json()["jobs"] if job["state"] == "succeeded"])
-    assert metric_value(value, "splatlift_jobs", state="succeeded") == succeeded > 0
-    assert metric_value(value, "splatlift_attempt_seconds_count", outcome="succeeded") >= succeeded
-    assert metric_value(value, "splatlift_disk_free_bytes") > 0
-    assert metric_value(value, "splatlift_query_worker_up") == 1
-
-
-def test_sane_request_id_is_kept_and_any_other_replaced(client: TestClient) -> None:
-    for sane in ("a", "7f3c-22.ab_~", "Root=1-67891233-abcdef012345678912345678", "x" * 128):
-        assert client.get("/healthz", headers={"X-Request-ID": sane}).headers.get_list("x-request-id") == [sane]
-    odd = ["", " ", "a b", 'a"b', "x" * 129, "a\tb", "<script>", "{}", "\u00e4"]
-    for headers in [[(b"X-Request-ID", request_id.encode())] for request_id in odd] + [[(b"X-Request-ID", b"a")] * 2]:
-        (value,) = client.get("/healthz", headers=headers).headers.get_list("x-request-id")
-        assert REQUEST_ID.fullmatch(value), headers
-
-
 def record(message: str, **fields: Any) -> logging.LogRecord:
     value = logging.makeLogRecord({"name": "place", "levelname": "INFO", "msg": message, "created": 0.25})
     value.fields = fields
@@ -234,11 +164,6 @@ def test_json_log_is_one_object_a_line_whatever_is_logged() -> None:
     assert list(problem) == ["time", "level", "logger", "message", "request_id", "path", "odd", "error"]
     assert problem["time"] == "1970-01-01T00:00:00.250Z"
     assert "ValueError" in problem["error"] and "abc.def" not in line
-
-
-def test_text_log_is_one_line_that_no_client_can_break() -> None:
-    line = TextLines().format(record("a\nINFO forged", path="/b\nINFO forged"))
-    assert line == r'1970-01-01T00:00:00.250Z INFO place: a\nINFO forged path="/b\nINFO forged"'
 
 
 def test_stop_refuses_work_ends_streams_puts_jobs_back_and_exits_0(
@@ -285,40 +210,6 @@ def test_stop_ends_a_check_that_would_take_long(tmp_path: Path) -> None:
     ending.set()
     thread.join(30)
     assert ends == [True]
-
-
-def test_routes_are_described_without_another_host(client: TestClient) -> None:
-    page = client.get("/docs").text
-    parameters = re.findall(r"(?:src|href|url)[=:]\s*['\"]([^'\"]+)", page)
-    assert {"openapi.json", "docs/swagger-ui-bundle.js", "docs/swagger-ui.css"} <= set(parameters)
-    assert all(client.get(f"/{address}").status_code == 200 for address in parameters if address != "data:,")
-    assert "//" not in page.replace("<!-- ", "").split("<script>")[0]
-    assert client.get("/redoc").status_code == 404
-
-
-class Idle:
-    """Stands in for the supervisor of jobs."""
-
-    def stop(self) -> None: ...
-
-
-async def do_nothing(*_: Any) -> None:
-    """No application."""
-
-
-def test_second_sigint_ends_the_notice() -> None:
-    stopping = Stopping(EventStreams(1, 1), cast("Supervisor", Idle()), notice_seconds=600)
-    server = AnnouncingServer(uvicorn.Config(do_nothing, lifespan="off"), stopping, 1, print)
-    server.handle_exit(signal.SIGINT, None)
-    timer = threading.Timer(0.3, server.handle_exit, (signal.SIGINT, None))
-
-    async def stop() -> None:
-        timer.start()
-        with anyio.fail_after(60):
-            await stopping.begin(lambda: server.force_exit)
-
-    anyio.run(stop)
-    assert server.force_exit
 
 
 AUDIT_HOOKS: list[Callable[[str, tuple[Any, ...]], None]] = []  # an audit hook stays for good, so it asks here
@@ -424,34 +315,6 @@ def test_upload_to_a_stalled_disk_keeps_nobody_else_waiting(
                 upload.join()
 
 
-@pytest.mark.parametrize(("seconds", "at_once"), [(1000.0, layers.SLOTS), (0.001, 2 * layers.SLOTS)])
-def test_few_requests_begin_at_a_time_and_none_waits_for_slow_ones(
-    monkeypatch: pytest.MonkeyPatch, seconds: float, at_once: int
-) -> None:
-    monkeypatch.setattr(layers, "SLOT_SECONDS", seconds)
-    started_names: list[str] = []
-
-    async def ask_all() -> None:
-        go_on = anyio.Event()
-
-        async def app(scope: Any, receive: Any, send: Any) -> None:
-            started_names.append(scope["path"])
-            if scope["path"] == "/slow":
-                await go_on.wait()
-
-        turns: Any = layers.ConcurrencyLimit(app)
-        async with anyio.create_task_group() as parameters:
-            for path in ["/slow"] * 2 * layers.SLOTS + ["/healthz"]:
-                parameters.start_soon(turns, {"type": "http", "path": path}, None, None)
-            while "/healthz" not in started_names or started_names.count("/slow") < at_once:
-                await anyio.sleep(0.001)
-            assert started_names.count("/slow") == at_once
-            go_on.set()
-        assert started_names.count("/slow") == 2 * layers.SLOTS
-
-    anyio.run(ask_all)
-
-
 def test_settings_are_bounded_before_they_are_looked_at(client: TestClient, scene_assets: SceneAssets) -> None:
     for settings in (
         {f"name{number}": 1 for number in range(SETTINGS + 1)},
@@ -495,94 +358,3 @@ def test_pack_counts_once_and_packs_are_bounded(tmp_path: Path) -> None:
         assert (problem["argument"], problem["status"]) == ("features", 422) and f"at most {PACKS}" in problem[
             "expected"
         ]
-
-
-def test_page_of_long_names_is_no_longer_than_others(client: TestClient) -> None:
-    cameras = cameras_document()
-    names = [f"{number:03}" + "\U0001f600" * 490 for number in range(700)]
-    cameras["frames"] = [cameras["frames"][0] | {"file_path": f"{name}.png"} for name in names]
-    route = f"/assets/{put(client, AssetKind.CAMERAS, json.dumps(cameras).encode())}/names"
-    value: list[str] = []
-    cursor: int | None = 0
-    while cursor is not None:
-        reply = client.get(route, params={"cursor": cursor})
-        assert len(reply.content) < 2 << 20
-        value += reply.json()["names"]
-        cursor = reply.json()["next"]
-    assert value == names
-
-
-def test_small_pages_together_are_the_large_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.content.STREAMED_RECORDS", 2)
-    with keyed_server(tmp_path / "data") as server:
-        for _ in range(3):
-            server.store.jobs.submit(SERVICE, server.order)
-        for path, count in (("jobs", 6), ("lifts", 1), ("assets", 3)):
-            full = server.ask("boss", "GET", f"/{path}").json()
-            value, cursor = [], {}
-            while cursor is not None:
-                page = server.ask("boss", "GET", f"/{path}", params={"limit": 2} | cursor).json()
-                assert len(page[path]) <= 2
-                value += page[path]
-                cursor = None if page["next"] is None else {"cursor": page["next"]}
-            assert full == {path: value, "next": None} and len(value) == count
-            for wrong in ({"cursor": "x"}, {"limit": 0}):
-                assert server.ask("boss", "GET", f"/{path}", params=wrong).status_code == 422
-
-
-def test_very_many_names_are_distinct_in_pages(client: TestClient) -> None:
-    document = cameras_document()
-    frame, long = document["frames"][0], "a" * 400
-    names = [f"{long}{number:04}" for number in range(SHOWN_CHARACTERS // 400 + 1)]
-    document["frames"] = [frame | {"file_path": f"images/{name}.png"} for name in names]
-    asset = put(client, AssetKind.CAMERAS, json.dumps(document).encode())
-    problem = client.get(f"/assets/{asset}")
-    assert "names" not in problem.json()["counts"] and len(problem.content) < 10_000
-    first = client.get(problem.json()["links"]["names"], params={"limit": 500}).json()
-    rest = client.get(problem.json()["links"]["names"], params={"cursor": first["next"]}).json()
-    assert sorted(first["names"] + rest["names"]) == names and rest["next"] is None
-    assert client.delete(f"/assets/{asset}").status_code == 204
-
-
-def test_lift_of_very_many_views_tells_their_names_apart_in_pages(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lifted = [f"{'a' * 100}{number:04}" for number in range(3000)]
-    with keyed_server(tmp_path / "data", views=lifted) as server:
-        path = f"/lifts/{server.lift_job}"
-        problem = server.ask("alice", "GET", path)
-        assert (problem.json()["views"], problem.json()["view_count"]) == ([], 3000) and len(problem.content) < 4000
-        assert problem.json()["diagnostics"] == {"warnings": ["x"]}  # and no names of views in it
-        assert server.ask("alice", "GET", "/lifts").json()["lifts"] == [problem.json()]
-        numbers = {"width": 1, "height": 1, "fx": 1, "fy": 1, "cx": 1, "cy": 1, "viewmat": [[1.0]]}
-        page = Frame({"views": [{"name": name, **numbers} for name in (lifted[7], "another")], "more": True})
-        monkeypatch.setattr(NoQueries, "call", lambda *arguments: page, raising=False)
-        views = server.ask("alice", "GET", problem.json()["links"]["views"], params={"limit": 2}).json()
-        assert [(view["name"], view["lifted"]) for view in views["views"]] == [(lifted[7], True), ("another", False)]
-        assert views["next"] == 2
-    with keyed_server(tmp_path / "few") as server:
-        problem = server.ask("alice", "GET", f"/lifts/{server.lift_job}").json()
-        assert (problem["views"], problem["view_count"]) == (["v"], 1)
-
-
-def test_every_answer_tells_browsers_to_guess_and_frame_nothing(client: TestClient) -> None:
-    for path in ("/", "/docs", "/healthz", "/nowhere", "/assets", "/lifts/x"):
-        problem = client.get(path).headers
-        assert (problem["x-content-type-options"], problem["x-frame-options"]) == ("nosniff", "DENY"), path
-        assert problem["cross-origin-resource-policy"] == "same-origin", path
-        assert "default-src 'none'" in problem["content-security-policy"], path
-        assert "frame-ancestors 'none'" in problem["content-security-policy"], path
-    policy = client.get("/").headers["content-security-policy"]
-    assert "script-src 'self' 'wasm-unsafe-eval'; style-src 'self';" in policy  # its own files alone
-    assert "http" not in policy and "unsafe-inline" not in policy and "'unsafe-eval'" not in policy
-
-
-def test_log_of_one_thing_again_and_again_is_thinned_out() -> None:
-    now = [0.0]
-    sparing, access = LogRateLimit(lambda: now[0]), logging.LogRecord("service.access", 20, "x", 1, "m", (), None)
-    records = [logging.LogRecord("service.jobs", 40, "x", 1, "m", (), None) for _ in range(10_000)]
-    assert sum(map(sparing.filter, records)) == SAME_A_MINUTE
-    assert all(sparing.filter(access) for _ in range(1000))
-    now[0] = 61
-    late = logging.LogRecord("service.jobs", 40, "x", 1, "m", (), None)
-    assert sparing.filter(late) and vars(late)["fields"] == {"left_out": 10_000 - SAME_A_MINUTE}

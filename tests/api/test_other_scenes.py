@@ -6,21 +6,15 @@ import io
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from fastapi.testclient import TestClient
-from plyfile import PlyData
 
-from liftcore.raster.cpu.warm_up import warm_up
-from liftcore.scene.splats import Kernel
 from service.models import AssetKind
-from tests.server import wait_for_end
 from tests.tiny_scene import (
     PROPERTIES,
-    SPLATS_A_CLUSTER,
     cameras_document,
     labels,
     pack,
@@ -49,84 +43,6 @@ def betas() -> bytes:
     extra_properties = ["beta", *(f"sb_params_{i}" for i in range(6))]
     columns = np.zeros((len(splat_rows()), len(extra_properties)), np.float32)
     return ply(np.concatenate([splat_rows(), columns], axis=1), [*names, *extra_properties])
-
-
-def test_discs_are_lifted_and_answered_in_their_rows(client: TestClient, scene_assets: SceneAssets) -> None:
-    warm_up(Kernel.GAUSSIAN_2D)  # compiles, where nobody has yet: that may take longer than `ended` waits
-    asset = client.put("/assets/splats", content=discs()).json()
-    assert asset["counts"]["kernel"] == "2dgs"
-    order = replace(scene_assets, splats=asset["id"]).order(preset="row-sum", diagnostic_rays=0)
-    job = wait_for_end(client, client.post("/lift", json=order).headers["location"])
-    assert job["state"] == "succeeded", job
-    parameters = {"lift": job["id"], "text": "apple", "view": "middle", "threshold": 0.5}
-    answer = client.get("/query", params=parameters).json()
-    scores = np.load(io.BytesIO(client.get(answer["links"]["scores"]).content), allow_pickle=False)
-    assert set(np.argsort(-scores)[:SPLATS_A_CLUSTER]) == set(range(SPLATS_A_CLUSTER))
-    view_labels = PlyData.read(io.BytesIO(client.get(answer["links"]["object"]).content))
-    assert np.array_equal(view_labels["vertex"]["x"], splat_rows()[np.flatnonzero(scores >= 0.5), 0])
-    for link in ("mask", "render"):
-        assert client.get(answer["links"][link]).headers["content-type"] == "image/png"
-    assert client.delete(job["links"]["self"], params={"with_lift": True}).status_code == 204
-    assert client.delete(f"/assets/{asset['id']}").status_code == 204
-
-
-@pytest.mark.parametrize(
-    ("content", "settings", "argument", "message"),
-    [
-        (discs(), {"kernel": "3dgs"}, "kernel", "'scale_2'"),
-        (discs(), {"kernel": "dbs"}, "kernel", "leave it out: the file speaks of 2dgs"),
-        (betas(), {"antialiased": True}, "antialiased", "dbs"),
-    ],
-)
-def test_kernel_that_does_not_fit_the_splats_is_refused_with_the_order(
-    client: TestClient,
-    scene_assets: SceneAssets,
-    content: bytes,
-    settings: dict[str, Any],
-    argument: str,
-    message: str,
-) -> None:
-    asset = put(client, AssetKind.SPLATS, content)
-    answer = client.post("/lift", json=replace(scene_assets, splats=asset).order(**settings))
-    assert assert_problem(answer)["type"] == "/problems/invalid-settings"
-    assert argument in answer.json()["detail"] and message in answer.text
-    assert client.delete(f"/assets/{asset}").status_code == 204
-
-
-def test_a_scene_in_map_coordinates_answers_in_them(client: TestClient, scene_assets: SceneAssets) -> None:
-    offset, rows, document = (
-        np.array([500_000.25, 5_400_000.5, 300.125]),
-        splat_rows().astype("f8"),
-        cameras_document(),
-    )
-    rows[:, :3] += offset
-    header = ply(splat_rows()).split(b"end_header")[0].replace(b"float", b"double")
-    splats = put(client, AssetKind.SPLATS, header + b"end_header\n" + rows.tobytes())
-    for frame in document["frames"]:
-        pose = np.array(frame["transform_matrix"])
-        pose[:3, 3] += offset
-        frame["transform_matrix"] = pose.tolist()
-    cameras = put(client, AssetKind.CAMERAS, json.dumps(document).encode())
-    order = replace(scene_assets, splats=splats, cameras=cameras).order(preset="row-sum", diagnostic_rays=0)
-    job = wait_for_end(client, client.post("/lift", json=order).headers["location"])
-    assert job["state"] == "succeeded", job
-    answer = client.get("/query", params={"lift": job["id"], "text": "apple", "threshold": 0.5, "top": 3}).json()
-    for splat in answer["top"]:
-        assert np.abs(np.array(splat["position"]) - rows[splat["splat"], :3]).max() < 1e-5
-    (entry, *_) = client.get(answer["links"]["objects"]).json()["objects"]
-    for box in (answer["box"], entry["box"]):
-        assert (np.array(box["low"]) >= rows[:, :3].min(axis=0) - 1e-5).all()
-        assert (np.array(box["high"]) <= rows[:, :3].max(axis=0) + 1e-5).all()
-    # A viewer's file is about the origin of the lift, and views are in the file's frame.
-    scene = np.frombuffer(client.get(f"/lifts/{job['id']}/splats").content, "<f4").reshape(-1, 8)[:, :3]
-    origin = client.get(f"/lifts/{job['id']}").json()["origin"]
-    assert np.abs(scene + np.array(origin) - rows[:, :3]).max() < 1e-5
-    for view in client.get(f"/lifts/{job['id']}/views").json()["views"]:
-        pose = np.array(view["viewmat"])
-        assert np.abs(-pose[:3, :3].T @ pose[:3, 3] - offset).max() < 8
-    assert client.delete(job["links"]["self"], params={"with_lift": True}).status_code == 204
-    for asset in (splats, cameras):
-        assert client.delete(f"/assets/{asset}").status_code == 204
 
 
 @pytest.mark.parametrize(

@@ -14,24 +14,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
 from liftcore.errors import SplatliftError
-from liftcore.query import ask
-from liftcore.query.objects import objects
-from liftcore.query.presence import NOT_IN_WORDS
-from liftcore.query.question import Answer, Query, Threshold
-from liftcore.query.terms import Vector
 from service import query_client as client
 from service import query_worker as answers
 from service.auth import LOCAL_ADMIN
 from service.child import children_of
-from service.errors import ClientDisconnected, KeyLimitReached, ServiceUnavailable, TimedOut
+from service.errors import ClientDisconnected, ServiceUnavailable, TimedOut
 from service.models import Question
 from service.query_client import Frame, QueryClient, QueryLimits, Waiter
-from service.query_worker import Answers, bytes_of, reply_to
+from service.query_worker import Answers, reply_to
 from service.routes.queries import query_request
 from tests.crash.conftest import address_of, until
 from tests.crash.server import NoQueries
@@ -113,20 +107,6 @@ def read_calls(folder: Path) -> list[tuple[str, list[str]]]:
     return [tuple(json.loads(line)) for line in (folder / "asked").read_text().splitlines()]
 
 
-def test_keys_take_turns_however_many_calls_one_has(start: Start, tmp_path: Path) -> None:
-    calls, anna, bob = Calls(start()), Waiter("anna"), Waiter("bob")
-    for name in ("a0", "a1", "a2", "a3"):
-        calls.begin(name, anna)
-    for name in ("b0", "b1"):
-        calls.begin(name, bob)
-    until(lambda: calls.worker.waiting == 5)
-    (tmp_path / "open").touch()
-    calls.end()
-    assert [first for first, _ in read_calls(tmp_path)] == ["a0", "b0", "a1", "b1", "a2", "a3"]
-    assert sorted(read_calls(tmp_path)[1][1]) == ["a1", "a2", "a3", "b1"]  # so that one pass answers all of them
-    assert calls.came == {name: name for name in ("a0", "a1", "a2", "a3", "b0", "b1")}
-
-
 def test_call_whose_client_left_is_not_asked(start: Start, tmp_path: Path) -> None:
     calls, stays, leaves = Calls(start()), Waiter(), Waiter()
     calls.begin("first", stays)
@@ -138,21 +118,6 @@ def test_call_whose_client_left_is_not_asked(start: Start, tmp_path: Path) -> No
     (tmp_path / "open").touch()
     calls.end()
     assert read_calls(tmp_path) == [("first", []), ("last", [])] and calls.came["last"] == "last"
-
-
-@pytest.mark.parametrize(("of_a_key", "waiting", "share"), [(2, 16, 2), (16, 4, 3)])
-def test_key_has_a_share_of_the_places(start: Start, of_a_key: int, waiting: int, share: int) -> None:
-    calls = Calls(start(of_a_key=of_a_key, waiting=waiting))
-    for number in range(share + 1):
-        calls.begin(f"a{number}", Waiter("anna"))
-    until(lambda: calls.came == {f"a{share}": KeyLimitReached.kind})
-    calls.begin("b", Waiter("bob"))
-    assert "b" not in calls.came
-    for number in range(waiting - share):
-        calls.begin(f"c{number}", Waiter(f"carl{number}"))
-    until(lambda: len(calls.came) == 2)
-    assert ServiceUnavailable.kind in calls.came.values()  # beyond all places
-    until(lambda: calls.worker.waiting == waiting - 1)
 
 
 def stop(worker: QueryClient) -> subprocess.Popen[bytes]:
@@ -271,20 +236,6 @@ def request_of(client: TestClient, lift: dict[str, Any]) -> Callable[..., dict[s
     return make
 
 
-@pytest.fixture
-def passes(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """The number of words of each pass over the features."""
-    passes_of_rows: list[int] = []
-    original = ask.cosines
-
-    def count_rows(features: Any, norms: Any, rows: Any) -> Any:
-        passes_of_rows.append(len(rows))
-        return original(features, norms, rows)
-
-    monkeypatch.setattr(ask, "cosines", count_rows)
-    return passes_of_rows
-
-
 def frame_parts(frame: Frame) -> tuple[object, bytes]:
     return frame.header, frame.body
 
@@ -335,22 +286,6 @@ def test_what_would_take_minutes_is_refused_before_it_begins(
     assert (fault["kind"], fault["argument"]) == ("invalid-query", argument) and "at most" in fault["expected"]
 
 
-def test_questions_asked_together_take_one_pass_within_cache_and_memory(
-    request_of: Callable[..., dict[str, Any]], passes: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    requests = [request_of(text=[word], threshold=k / 8) for k in range(4) for word in WORDS]
-    for cache_bytes, cached in ((1 << 20, [12]), (5 * (AN_ANSWER + len("apple")), [5, 5, 2])):
-        shared = Answers(scenes=1, cache_bytes=cache_bytes)
-        passes.clear()
-        for first in range(len(requests)):
-            reply_to(requests[first:], shared)
-        assert passes == cached
-    passes.clear()
-    monkeypatch.setattr(answers, "PRODUCT_BYTES", 8 * 4 * 60)
-    reply_to(requests, Answers(scenes=1, cache_bytes=1 << 20))
-    assert passes == [8]
-
-
 def test_what_is_kept_stays_within_its_size_over_many_different_questions(
     request_of: Callable[..., dict[str, Any]],
 ) -> None:
@@ -362,34 +297,6 @@ def test_what_is_kept_stays_within_its_size_over_many_different_questions(
         reply_to([request_of(operation, text=["apple"], threshold=number / 300)], answers)
         sizes.append(answers.kept_bytes)
     assert max(sizes) <= limit and min(sizes[50:]) > limit / 2
-
-
-def test_objects_of_an_answer_are_made_once_for_all_its_masks(
-    request_of: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls: list[int] = []
-    monkeypatch.setattr("liftcore.query.objects.objects", lambda *arguments: calls.append(0) or objects(*arguments))
-    answers = Answers(scenes=1, cache_bytes=1 << 20)
-    reply_to([request_of("scores", text=["apple"])], answers)
-    before = answers.kept_bytes
-    reply_to([request_of("objects", text=["apple"])], answers)
-    assert answers.kept_bytes == before + 4 * 60 + (2 << 10)
-    for view in ("left", "middle", "left"):
-        reply_to([request_of("mask", text=["apple"]) | {"view": view}], answers)
-    assert len(calls) == 1
-    reply_to([request_of("mask", text=["lamp"])], answers)
-    assert len(calls) == 2
-
-
-def test_question_counts_with_its_answer() -> None:
-    none, no_scores = np.empty(0, bool), np.empty(0, np.float32)
-    cut = Threshold(value=0.5, method="fixed", explanation="as asked")
-    fields = {"threshold": cut, "clear": False, "statistics": {}, **dict(NOT_IN_WORDS)}
-    short, long, vector = (
-        bytes_of(Answer.of(Query.of(terms), no_scores, none, none, **fields))
-        for terms in (("apple",), ("apple", "x" * 1000), (Vector((0.5,) * 65_536),))
-    )
-    assert short >= 1024 and long >= short + 1000 and vector >= 65_536 * 24  # an entry is never free
 
 
 def test_calls_of_a_worker_that_dies_are_answered_by_the_next(

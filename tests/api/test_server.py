@@ -18,9 +18,7 @@ from pathlib import Path
 from typing import IO
 
 import httpx
-import numpy as np
 import pytest
-from safetensors.numpy import save
 
 from liftcore.cli import build_parser, main
 from liftcore.lifting.files import lift_files
@@ -30,12 +28,9 @@ from liftcore.values.settings import LiftSettings
 from service.commands.serve import settings_of
 from service.errors import InvalidRequest
 from service.routes.operations import WEB
-from service.settings import ServiceSettings, encoder_label, encoder_spec
+from service.settings import ServiceSettings, encoder_spec
 from tests.crash.conftest import until
-from tests.server import wait_for_end
-from tests.tiny_scene import TinyScene, colmap_zip, make_scene
-
-from .conftest import SceneAssets
+from tests.tiny_scene import colmap_zip, make_scene
 
 ROOT = Path(__file__).parents[2]
 
@@ -57,38 +52,6 @@ def server(data: Path, table: Path, stderr: IO[str] | None = None) -> Iterator[s
             assert process.wait(60) == 0
 
 
-def test_server_process_does_the_main_job_and_its_log_holds_no_secret(
-    tmp_path: Path, scene: TinyScene, table: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("SPLATLIFT_HEADER_SECONDS", "soon")  # a setting of release 0.4
-    with (tmp_path / "log").open("w") as stderr, server(tmp_path / "data", table, stderr=stderr) as address:
-        with httpx.Client(base_url=address, timeout=120) as client:
-            assert client.get("/healthz").json() == {"status": "ok"}
-            contents = {"splats": scene.splats, "cameras": scene.cameras, "features": scene.features}
-            ids = [client.put(f"/assets/{kind}", content=body).json()["id"] for kind, body in contents.items()]
-            job = wait_for_end(client, client.post("/lift", json=SceneAssets(*ids).order()).headers["location"])
-            assert job["state"] == "succeeded", job
-            answer = client.get("/query", params={"text": "lamp", "view": "right"}).json()
-            assert answer["top"][0]["splat"] >= 40
-            assert client.get(answer["links"]["mask"]).content.startswith(b"\x89PNG")
-            assert "<title>splatlift</title>" in client.get("/").text
-        secret = {"Authorization": "Bearer the-secret", "X-Request-ID": "mine", "Cookie": "the-secret"}
-        with httpx.Client(base_url=address, headers=secret, timeout=120) as client:
-            for path in ("/healthz?token=the-secret", "/nowhere?the-secret", "/query?text=the-secret"):
-                client.get(path)
-            client.post("/lift", json={"splats": "the-secret"})
-            client.put("/assets/splats", content=b"the-secret")
-    text = (tmp_path / "log").read_text()
-    assert "the-secret" not in text
-    assert "SPLATLIFT_HEADER_SECONDS is no setting any more" in text
-    messages = [json.loads(line) for line in text.splitlines()]
-    access = [line for line in messages if line["logger"] == "service.access" and line["request_id"] == "mine"]
-    assert [line["status"] for line in access] == [200, 404, 422, 422, 422]
-    expected_keys = {"method", "route", "path", "status", "seconds", "received", "sent"}
-    assert all(expected_keys <= line.keys() for line in access)
-    assert access[-1]["received"] == len(b"the-secret") and access[-1]["sent"] > 0
-
-
 @pytest.mark.parametrize("allowed_proxies", ["", "10.0.0.0/8,127.0.0.1"])
 def test_client_of_a_proxy_is_believed_where_the_operator_names_the_proxy(
     allowed_proxies: str, tmp_path: Path, table: Path, monkeypatch: pytest.MonkeyPatch
@@ -101,20 +64,6 @@ def test_client_of_a_proxy_is_believed_where_the_operator_names_the_proxy(
     assert clients == ["192.0.2.7" if allowed_proxies else "127.0.0.1"]
 
 
-def test_server_that_speaks_json_says_one_object_when_it_is_ready_and_nothing_after(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "liftcore.cli", "serve", "--json", "--port", "0", "--data", "kept"]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path, env=environment) as process:
-        assert process.stdout is not None
-        try:
-            messages = json.loads(process.stdout.readline())
-            assert messages == {"address": messages["address"], "data": str(tmp_path / "kept")}
-            assert httpx.get(f"{messages['address']}/healthz").json() == {"status": "ok"}
-        finally:
-            process.send_signal(signal.SIGTERM)
-        assert (process.stdout.read(), process.wait(60)) == ("", 0)
-
-
 def test_http_process_loads_neither_torch_nor_numba_nor_hdbscan() -> None:
     code = (
         "import sys, service.app, service.commands.serve, service.commands.view\n"
@@ -122,57 +71,6 @@ def test_http_process_loads_neither_torch_nor_numba_nor_hdbscan() -> None:
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert result.stdout.strip() == "[]"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "messages"),
-    [
-        (["--host", "0.0.0.0"], "a loopback address such as 127.0.0.1, as there are no keys"),
-        (["--host", "example.org"], "a loopback address"),
-        (["--port", "70000"], "port: expected"),
-        (["--text-space", "name"], "expected NAME=SPEC"),
-        (["--text-space", "clip=nonsense"], "text_spaces, 'clip': expected one of table:FILE"),
-        (["--encoder", "open_clip:RN50@/nowhere/w.pt"], "w.pt (No such file"),
-    ],
-)
-def test_setting_that_cannot_be_is_one_line_at_the_start(
-    arguments: list[str], messages: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["serve", *arguments, "--data", str(tmp_path / "data")]) == 2
-    output = capsys.readouterr().err
-    assert output.startswith("splatlift: ") and messages in output and output.count("\n") == 1
-    assert not (tmp_path / "data").exists()
-
-
-@pytest.mark.parametrize(
-    ("content", "messages"),
-    [
-        (None, "No such file"),
-        (b"", "an empty file"),
-        (b"PK\x03\x04 and a zip", "zip"),
-        (save({"rows": np.eye(2)}), "embeddings"),
-        (save({"embeddings": np.eye(2)}), "no words"),
-        (save({"embeddings": np.eye(2)}, {"words": "[1"}), "in "),
-        (save({"embeddings": np.eye(2)}, {"words": '["cat"]'}), "1 words and embeddings [2, 2]"),
-    ],
-)
-def test_invalid_text_table_is_an_error_at_the_start(
-    content: bytes | None, messages: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    table = tmp_path / "words.safetensors"
-    if content is not None:
-        table.write_bytes(content)
-    assert main(["serve", "--encoder", f"table:{table}", "--data", str(tmp_path / "data")]) == 2
-    output = capsys.readouterr().err
-    assert output.startswith("splatlift: encoder: expected ") and messages in output and str(table) in output
-    assert output.count("\n") == 1 and not (tmp_path / "data").exists()
-
-
-def test_taken_port_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        port = listener.getsockname()[1]
-        assert main(["serve", "--port", str(port), "--data", str(tmp_path / "data")]) == 2
-    assert "free port" in capsys.readouterr().err
 
 
 def test_variable_that_is_no_json_is_one_line(
@@ -224,13 +122,6 @@ def test_default_encoder_stands_in_for_other_spaces_only_where_the_operator_chos
     assert encoder_spec(server_settings, "dino", None) == encoder_spec(server_settings, "", None) == "minilm"
     with pytest.raises(InvalidRequest, match="none"):
         encoder_spec(server_settings, "none", None)
-
-
-def test_label_of_an_encoder_hides_its_file() -> None:
-    assert encoder_label("minilm") == "minilm"
-    assert encoder_label("table:/private/words.safetensors") == encoder_label("/private/w.safetensors") == "table"
-    assert encoder_label("open_clip:ViT-B-32/laion2b") == "open_clip:ViT-B-32/laion2b"
-    assert encoder_label("open_clip:RN50@/private/w.pt") == "open_clip:RN50"
 
 
 def test_built_page_is_of_these_sources() -> None:
@@ -383,14 +274,6 @@ def test_view_removes_no_folder_that_show_did_not_make(
         monkeypatch.setenv("SPLATLIFT_SHOW_FOLDER", str(folder))
         assert main(["view", lift, "--no-browser"]) == 2
         assert "SPLATLIFT_SHOW_FOLDER" in capsys.readouterr().err and folder.is_dir()
-
-
-def test_view_tells_of_a_port_or_a_folder_that_cannot_be(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    lift = str(folder / "l.safetensors")
-    for arguments, messages in (([lift, "--port", "99999"], "port"), ([str(folder)], "a folder")):
-        assert main(["view", *arguments, "--no-browser"]) == 2
-        output = capsys.readouterr().err
-        assert messages in output and output.count("\n") == 1
 
 
 def _answers(host: str, port: int) -> bool:

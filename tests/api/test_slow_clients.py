@@ -6,9 +6,8 @@ import contextlib
 import itertools
 import json
 import socket
-import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -25,14 +24,11 @@ from service.supervisor import Supervisor
 from tests.crash.conftest import address_of, listening, until
 from tests.crash.server import NoQueries
 
-TRIES = 10
 PATIENCE_SECONDS = 60.0  # for what takes half a second; the machine may be busy
-HEALTH = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"
 HEAD = b"PUT /assets/splats HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5000\r\n\r\n"
 JSON_HEAD = (
     b"POST /lift HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 5000\r\n\r\n"
 )
-Serve = Callable[..., AbstractContextManager[tuple[str, int]]]
 
 
 @contextmanager
@@ -113,90 +109,12 @@ def test_clients_that_trickle_slow_nobody_and_leave_nothing(live: tuple[str, int
     until(lambda: not list((data / "tmp").iterdir()))
 
 
-def test_upload_that_breaks_off_leaves_nothing(live: tuple[str, int], data: Path) -> None:
-    with client_of(live) as client:
-        client.sendall(HEAD.replace(b"5000", b"9000000") + b"p" * 2_000_000)
-        until(lambda: any((data / "tmp").iterdir()))
-    until(lambda: not any((data / "tmp").iterdir()))
-    assert httpx.get(f"http://127.0.0.1:{live[1]}/assets").json()["assets"] == []
-
-
-def test_requests_over_more_connections_than_allowed_are_503_until_one_ends(tmp_path: Path) -> None:
-    with running(tmp_path / "data", max_connections=2) as server, contextlib.ExitStack() as stack:
-        address = address_of(server)
-        with client_of(address) as first, client_of(address) as second:
-            first.sendall(HEAD)
-            second.sendall(JSON_HEAD)
-            until(lambda: len(server.server_state.tasks) == 2)
-            third = stack.enter_context(client_of(address))
-            third.sendall(HEALTH)
-            assert third.recv(1 << 16).startswith(b"HTTP/1.1 503 ")
-        until(lambda: answers(address))
-
-
-def answers(address: tuple[str, int]) -> bool:
-    """Return True if the service accepts a new connection and answers it."""
-    with contextlib.suppress(httpx.TransportError):  # its connection may be one of those that are closed
-        return httpx.get(f"http://{address[0]}:{address[1]}/healthz").status_code == 200
-    return False
-
-
-def test_connections_without_a_request_make_room_for_others(tmp_path: Path) -> None:
-    with contextlib.ExitStack() as stack, running(tmp_path / "data", max_connections=3) as server:
-        address = address_of(server)
-        busy = stack.enter_context(client_of(address))
-        busy.sendall(JSON_HEAD)
-        until(lambda: server.server_state.tasks)
-        idle = [stack.enter_context(client_of(address)) for _ in range(20)]
-        for client in idle[::2]:
-            client.sendall(b"GET / HTTP/1.1\r\nX: ")
-        # Not all may have been accepted yet, so that the first answers may be 503.
-        until(lambda: answers(address))
-        busy.sendall(b"{}".ljust(5000))
-        assert busy.recv(1 << 16).startswith(b"HTTP/1.1 422 ")
-
-
-def test_connection_that_is_used_again_and_again_is_not_closed_for_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("service.commands.serve.IDLE_SECONDS", 0.25)
-    with contextlib.ExitStack() as stack, running(tmp_path / "data", max_connections=3) as server:
-        address = address_of(server)
-        busy = stack.enter_context(client_of(address))
-        time.sleep(0.15)  # so that it is the oldest
-        for _ in range(2):  # the next one is one too many
-            stack.enter_context(client_of(address))
-        for _ in range(8):  # each is over between two looks of the server, ten of which come in a second
-            busy.sendall(HEALTH)
-            response = b""
-            while not response.endswith(b'{"status":"ok"}'):
-                piece = busy.recv(1 << 16)
-                assert piece, "the connection was closed"
-                response += piece
-            time.sleep(0.08)
-        until(lambda: len(server.server_state.connections) < 3)
-
-
-def test_connections_outlive_the_pools_of_clients(tmp_path: Path) -> None:
-    with running(tmp_path / "data") as server:
-        assert server.config.timeout_keep_alive > 60 > 2 * cast("float", httpx.Limits().keepalive_expiry)
-
-
 def test_no_answer_waits_for_the_client_to_confirm_the_one_before(tmp_path: Path) -> None:
     with running(tmp_path / "data") as server, client_of(address_of(server)):
         until(lambda: server.server_state.connections)
         [connection] = server.server_state.connections
         served_by = cast("Any", connection).transport.get_extra_info("socket")
         assert served_by.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
-
-
-def test_two_lengths_of_a_body_are_refused_and_the_connection_is_closed(live: tuple[str, int]) -> None:
-    with client_of(live) as client:
-        two_lengths = b"Content-Length: 4\r\nTransfer-Encoding: chunked\r\nContent-Type: application/json\r\n\r\n"
-        client.sendall(b"POST /lift HTTP/1.1\r\nHost: localhost\r\n" + two_lengths + b"0\r\n\r\n" + HEALTH)
-        head, body = answer(client)
-    assert head.startswith(b"HTTP/1.1 422 ") and b"connection: close" in head.lower()
-    assert json.loads(body)["argument"] == "Content-Length"  # and nothing comes after it
 
 
 def test_body_a_few_times_too_long_is_answered(live: tuple[str, int]) -> None:

@@ -30,8 +30,9 @@ from service.store.owners import SERVICE
 from service.store.store import Store
 from tests.benchmarks.base import machine
 from tests.crash.server import POINTS
-from tests.crash.service_process import ServiceProcess, kill_processes_of, usage
+from tests.crash.service_process import ServiceProcess, kill_processes_of
 from tests.scenes import centred, random_camera, random_regions, random_splats
+from tests.server import usage
 
 KILLS_A_JOB = 2  # the third attempt is the last
 POOLED = 6  # descriptors of read connections that a server may come to hold later; a leak has one a job
@@ -71,7 +72,7 @@ def insist(service: ServiceProcess, body: dict[str, Any], key: str) -> str:
     """Order a lift as a client does that was cut off: again with the same key, when the server is back."""
     job = service.order(body, key)
     while job is None:
-        if service.has_died():
+        if not service.is_alive():
             service.wait()
             service.start()
         job = service.order(body, key)

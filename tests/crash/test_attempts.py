@@ -178,12 +178,6 @@ def test_canceled_job_has_no_live_process(store: Store, supervising: Supervising
     assert states(store, job) == ["queued", "running", "canceling", "canceled"]
 
 
-def test_lifts_run_side_by_side_when_the_operator_says_so(store: Store, supervising: Supervising) -> None:
-    jobs = [submit(store), submit(store)]
-    with supervising("meet", parallel=2):
-        assert [wait_until_ended(store, job).state for job in jobs] == [JobState.SUCCEEDED] * 2
-
-
 def test_job_interrupted_by_a_stop_goes_on_where_the_data_directory_is_next(tmp_path: Path) -> None:
     with closing(Store.open(tmp_path / "data")) as store:
         job = submit(store)
@@ -307,22 +301,6 @@ def test_check_may_take_memory_by_the_size_of_its_upload(
 def claim(store: Store) -> str | None:
     job = store.jobs.claim()
     return None if job is None else job.id
-
-
-def test_owners_take_turns_whoever_came_first_with_how_many(store: Store) -> None:
-    owners = [Owner(name, sees_all=False) for name in "abc"]
-    jobs = {}
-    for owner, count in zip(owners, (4, 2, 1), strict=True):
-        jobs |= {store.jobs.submit(owner, order(store, owner))[0]: f"{owner.key}{n}" for n in range(count)}
-    order_of_owners = []
-    while (job := claim(store)) is not None:
-        order_of_owners.append(jobs[job])
-        store.jobs.lose(job, 1, "to be claimed again") if order_of_owners == ["a0"] else store.jobs.fail(job, 1, {})
-        if order_of_owners == ["a0", "b0"]:  # who deletes what has ended does not come first for it
-            for ended_job in store.jobs.all(owners[1]):
-                if ended_job.state is JobState.FAILED:
-                    store.jobs.delete(owners[1], ended_job.id)
-    assert order_of_owners == ["a0", "b0", "c0", "a0", "b1", "a1", "a2", "a3"]
 
 
 @pytest.mark.parametrize("expired", [True, False])

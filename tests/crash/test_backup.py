@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
-import stat
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from liftcore.cli import main
 from service.errors import Misconfigured
 from service.models import AssetKind, JobState
 from service.store import recovery
@@ -122,43 +119,3 @@ def test_damaged_file_is_reported_and_not_restored(
     with pytest.raises(Misconfigured, match="files as they were stored"):
         restore(tmp_path / "backup", tmp_path / "again")
     assert not (tmp_path / "again").exists() and not (tmp_path / ".again.part").exists()
-
-
-def test_backup_replaces_nothing_and_leaves_no_half_of_one(filled_store: Store, tmp_path: Path) -> None:
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "letter").write_text("to keep")
-    with pytest.raises(Misconfigured, match="not there yet"):
-        back_up(filled_store.files.root, tmp_path / "full")
-    next((filled_store.files.root / "lifts").iterdir()).unlink()
-    with pytest.raises(Misconfigured, match="1 lost"):
-        back_up(filled_store.files.root, tmp_path / "half")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "full"]
-
-
-def test_data_directory_is_its_owners_alone(tmp_path: Path) -> None:
-    (tmp_path / "data").mkdir(mode=0o755)
-    before = os.umask(0o022)
-    store = Store.open(tmp_path / "data")
-    asset_of(store, AssetKind.SPLATS, {})
-    modes = {path: stat.S_IMODE(path.stat().st_mode) for path in [store.files.root, *store.files.root.rglob("*")]}
-    store.close()
-    os.umask(before)
-    wrong = {str(path): oct(mode) for path, mode in modes.items() if mode != (0o700 if path.is_dir() else 0o600)}
-    assert wrong == {}
-
-
-def test_commands_back_up_verify_and_restore(
-    filled_store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    data, copy, restored = (str(tmp_path / name) for name in ("data", "backup", "again"))
-    assert main(["store", "backup", copy, "--data", data]) == 0
-    assert main(["store", "verify", "--data", data]) == 0
-    assert main(["store", "restore", copy, "--data", restored]) == 0
-    assert main(["store", "restore", copy, "--data", restored]) == 2  # it replaces nothing
-    output = capsys.readouterr()
-    assert "4 files" in output.out and "every file is as it was stored" in output.out and "move it away" in output.err
-    (lift,) = (tmp_path / "again" / "lifts").iterdir()
-    flip(lift)
-    assert main(["store", "verify", "--data", restored, "--json"]) == 1
-    (damage,) = json.loads(capsys.readouterr().out)["damage"]
-    assert damage.startswith("lifts/")

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import sqlite3
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
@@ -239,19 +237,6 @@ def test_file_that_is_no_database_is_a_misconfiguration(tmp_path: Path, capsys: 
         assert main(["serve", "--data", str(tmp_path), "--host", host, "--port", "0"]) == 2
         stderr = capsys.readouterr().err
         assert stderr.startswith("splatlift: data: expected a database") and stderr.count("\n") <= 2
-
-
-def test_directory_has_one_server_and_a_look_at_its_lock_keeps_none_from_starting(tmp_path: Path) -> None:
-    store = Store.open(tmp_path)
-    with pytest.raises(Misconfigured, match="no other server"):
-        Store.open(tmp_path)
-    store.close()
-    with (tmp_path / "lock").open("a") as looking:
-        fcntl.flock(looking, fcntl.LOCK_SH)
-        timer = threading.Timer(0.1, fcntl.flock, (looking, fcntl.LOCK_UN))
-        timer.start()
-        Store.open(tmp_path).close()
-        timer.join()
 
 
 def test_too_few_files_for_the_connections_are_one_line(

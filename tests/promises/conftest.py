@@ -33,7 +33,7 @@ def server(encoder: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[S
     """A server for all tests that leave it as they found it."""
     spaces = {"narrow": encoder.replace("table.safetensors", "narrow.safetensors")}
     data = tmp_path_factory.mktemp("service") / "data"
-    with Server(data, encoder=encoder, text_spaces=spaces, upload_bytes=200_000) as server:
+    with Server(data, encoder=encoder, text_spaces=spaces, upload_bytes=200_000, max_queued=6) as server:
         yield server
 
 

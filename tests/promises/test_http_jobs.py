@@ -14,7 +14,7 @@ import pytest
 from tests.server import Server, until, wait_for_end
 from tests.tiny_scene import TinyScene, cameras_document, codebook, labels, masks, pack
 
-from .over_http import NO_ASSET, NO_ID, assert_problem, delete_lift, events_of, upload, upload_scene
+from .over_http import NO_ASSET, NO_ID, assert_problem, delete_lift, events_of, upload
 
 LONG_BUDGET_S = 600  # of a trade-off, which runs for as long as somebody is to cancel it
 
@@ -64,6 +64,20 @@ def test_order_is_a_job_at_once_and_repeated_the_same_one(
     for identifier in (job["id"], other["id"], *keyless):
         assert client.post(f"/jobs/{identifier}/cancel").json()["state"] == "canceled"
         assert client.delete(f"/jobs/{identifier}").status_code == 204
+
+
+def test_full_line_is_refused_for_a_while_and_known_keys_are_not(
+    client: httpx.Client, order: dict[str, Any], busy: str
+) -> None:
+    del busy
+    replies = [order_job(client, order, f"line {number}") for number in range(7)]
+    assert [reply.status_code for reply in replies] == [202] * 6 + [503]
+    assert_problem(replies[-1], 503)
+    assert int(replies[-1].headers["retry-after"]) > 0
+    assert order_job(client, order, "line 0").status_code == 200
+    for reply in replies[:-1]:
+        client.post(f"{reply.headers['location']}/cancel")
+        assert client.delete(reply.headers["location"]).status_code == 204
 
 
 @pytest.mark.parametrize("key", ["", "x" * 256])
@@ -221,18 +235,6 @@ def test_plan_counts_and_makes_no_job(client: httpx.Client, order: dict[str, Any
     assert plan["summary"] and plan["memory_bytes"] > 0
     assert plan["summary"][0] == client.get(lift["links"]["job"]).json()["plan"]["summary"][0]
     assert client.get("/jobs").json() == before
-
-
-def test_full_line_is_refused_for_a_while_and_known_keys_are_not(tmp_path: Any, tiny: TinyScene) -> None:
-    with Server(tmp_path / "data", max_queued=1) as server:
-        client, body = server.client, upload_scene(server.client, tiny)
-        long = order_job(client, body | {"budget_s": LONG_BUDGET_S}, route="/tradeoff").headers["location"]
-        until(lambda: client.get(long).json()["state"] == "running")
-        assert order_job(client, body, "k").status_code == 202
-        reply = order_job(client, body)
-        assert_problem(reply, 503)
-        assert int(reply.headers["retry-after"]) > 0
-        assert order_job(client, body, "k").status_code == 200
 
 
 # Trade-offs
