@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import io
 import json
 import os
 import re
@@ -24,6 +25,7 @@ import httpx
 from fastapi.testclient import TestClient
 from safetensors.numpy import load
 
+from liftcore.cli import main
 from service.app import assemble
 from service.settings import ServiceSettings
 from service.store.store import Store
@@ -101,11 +103,25 @@ def digest_of_lift(client: Client, lift: str) -> str:
 
 
 def run_command(*arguments: str, data: Path, status: int = 0) -> str:
-    """Run `splatlift ARGUMENTS --data DATA`, which must exit with a status; return what it prints."""
-    command = [sys.executable, "-m", "liftcore.cli", *arguments, "--data", str(data)]
-    process = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
-    assert process.returncode == status, process.stdout + process.stderr
-    return process.stdout + (process.stderr if status else "")
+    """Run `splatlift ARGUMENTS --data DATA` in this process; it must end with a status; return what it prints."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            ended_with: Any = main([*arguments, "--data", str(data)])
+        except SystemExit as error:
+            ended_with = error.code
+    assert ended_with == status, out.getvalue() + err.getvalue()
+    return out.getvalue() + (err.getvalue() if status else "")
+
+
+def refused_start(*options: str, data: Path) -> str:
+    """Run `splatlift serve OPTIONS --data DATA`, which must end with status 2; return what it says."""
+    command = [sys.executable, "-m", "liftcore.cli", "serve", "--port", "0", *options, "--data", str(data)]
+    process = subprocess.run(
+        command, capture_output=True, text=True, cwd=ROOT, check=False, timeout=PATIENCE_SECONDS
+    )  # fmt: skip
+    assert process.returncode == 2, process.stdout + process.stderr
+    return process.stderr
 
 
 class Server:

@@ -204,7 +204,6 @@ BAD_ORDERS: dict[str, tuple[dict[str, Any], int, str]] = {
     "no features": ({"features": []}, 422, "features"),
     "no digest": ({"cameras": "sha256:short"}, 422, "cameras"),
     "an unknown field": ({"extra": 1}, 422, "extra"),
-    "a table that is none": ({"table": NO_ASSET}, 404, "table"),
 }
 
 
