@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,37 +14,22 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
 from service import tasks
-from service.app import assemble
 from service.models import AssetKind
-from service.settings import ServiceSettings
 from service.state import AppState
 from service.store.assets import CheckedUpload
 from service.store.owners import SERVICE
 from service.store.store import Store
+from tests import server
 from tests.server import wait_for_end
 from tests.tiny_scene import CHANNELS, TinyScene, make_scene, text_table
 
 LIFT_REQUEST = "the-request-of-the-lift"
-ADDRESS = "http://127.0.0.1"
 
 
-@contextmanager
-def serving(data: Path, table: Path, **settings: Any) -> Iterator[TestClient]:
+def serving(data: Path, table: Path, **settings: Any) -> AbstractContextManager[TestClient]:
     """The application over a data directory, with the text table of the tiny scene."""
-    server_settings = ServiceSettings.model_validate(
-        {
-            "data": data,
-            "encoder": f"table:{table}",
-            "text_spaces": {"spare": f"table:{table.with_name('narrow.safetensors')}"},
-            **settings,
-        }
-    )
-    store = Store.open(server_settings.data, floor_bytes=server_settings.disk_floor_bytes)
-    try:
-        with TestClient(assemble(server_settings, store), ADDRESS, raise_server_exceptions=False) as client:
-            yield client
-    finally:
-        store.close()
+    spaces = {"spare": f"table:{table.with_name('narrow.safetensors')}"}
+    return server.serving(data, encoder=f"table:{table}", text_spaces=spaces, **settings)
 
 
 def app_of(client: TestClient) -> FastAPI:

@@ -25,8 +25,7 @@ from service.store.store import Store
 from service.supervisor import Supervisor
 from tests.crash.conftest import order
 from tests.crash.server import NoQueries
-
-from .conftest import ADDRESS
+from tests.server import ADDRESS
 
 SCOPES = {"alice": "read write", "bob": "read write", "boss": "admin"}
 METADATA = {
