@@ -110,7 +110,7 @@ def request_to(client: Any, path: str, described: dict[str, Any], values: dict[s
     """Return the parameters and the JSON body of a request to an operation that names a lift and assets."""
     values = VALUES | values
     names = [entry["name"] for entry in described.get("parameters", ()) if entry["in"] == "query"]
-    options = {"params": {name: values[name] for name in names if name in values}}
+    options = {"params": {name: values[name] for name in names if name in VALUES or name == "lift"}}
     content = described.get("requestBody", {}).get("content", {})
     if "application/json" in content:
         schema = content["application/json"]["schema"]

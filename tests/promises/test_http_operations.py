@@ -175,7 +175,7 @@ def test_damage_of_a_file_is_found(backup: Path, order: dict[str, Any]) -> None:
     digest = order["splats"].removeprefix("sha256:")
     (file,) = (path for path in backup.rglob("*") if digest in path.name)
     content = file.read_bytes()
-    for damage in (content[:-1], content[:-1] + b"\0", None):
+    for damage in (content[:-1], content[:-1] + b"\1", None):
         file.unlink()  # and not the server's file, which it may be a link to
         if damage is not None:
             file.write_bytes(damage)
