@@ -110,7 +110,7 @@ def test_bad_file_is_refused_with_reasons_and_leaves_nothing(client: httpx.Clien
     assert str(server.data) not in json.dumps(problem)
     assert client.get("/assets").json() == before
     assert_problem(client.get(f"/assets/sha256:{hashlib.sha256(content).hexdigest()}"), 404)
-    until(lambda: stored_files(server) == stored)
+    until(lambda: stored_files(server) == stored, seconds=120)
 
 
 def stored_files(server: Server) -> int:
@@ -136,7 +136,7 @@ def test_body_that_is_too_large_is_413_and_leaves_nothing(client: httpx.Client, 
             assert server.is_alive()
     assert_problem(client.post("/lift", content=b" " * (3 << 20), headers={"Content-Type": "application/json"}), 413)
     assert_problem(client.get(f"/assets/sha256:{hashlib.sha256(content).hexdigest()}"), 404)
-    until(lambda: stored_files(server) == stored)
+    until(lambda: stored_files(server) == stored, seconds=120)
 
 
 @pytest.mark.parametrize("length", ["Content-Length: 100000", "Transfer-Encoding: chunked"])
@@ -146,7 +146,7 @@ def test_upload_that_is_cut_off_leaves_nothing(client: httpx.Client, server: Ser
     with socket.create_connection((url.host, url.port or 80)) as connection:
         head = f"PUT /assets/splats HTTP/1.1\r\nHost: 127.0.0.1\r\n{length}\r\n\r\n"
         connection.sendall(head.encode() + b"10\r\n" * ("chunked" in length) + ply(splat_rows())[:2000])
-    until(lambda: stored_files(server) == stored)
+    until(lambda: stored_files(server) == stored, seconds=120)
     assert client.get("/assets").json() == before
     assert client.get("/healthz").status_code == 200
 
