@@ -1,0 +1,369 @@
+"""Python, the command line, GET and POST answer alike, field by field: each is a view of the same library."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import liftcore as lc
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from liftcore import cli
+from PIL import Image
+
+from tests.promises.tiny_files import write_files
+from tests.server import serving, wait_for_end
+from tests.tiny_scene import HEIGHT, VIEWS, WORDS
+
+EXAMPLES = (
+    "middle:6,12", f"middle:26,{HEIGHT // 2}", "splat:0", "splat:47", "region:left:0:1", "middle:box:3,4,10,20",
+    "middle:stroke:26,5,26,12,27,19", "object:1", "splat:60", "middle:box:9,9,3,3", "none",
+)  # the last three are refused  # fmt: skip
+FIELDS: dict[str, st.SearchStrategy[Any]] = {
+    "text": st.lists(st.sampled_from((*WORDS, "apples", "zeppelin")), min_size=1, max_size=1),
+    "like": st.lists(st.sampled_from(EXAMPLES), min_size=1, max_size=2, unique=True),
+    "negatives": st.lists(st.sampled_from((*WORDS, "zeppelin")), max_size=2, unique=True),
+    "unlike": st.lists(st.sampled_from(EXAMPLES), max_size=1),
+    "sets": st.lists(st.sampled_from(("object:0", "object:2", "object:9", "none")), max_size=2),
+    "threshold": st.sampled_from(("auto", "paper", "best")) | st.floats(-1, 1).map(lambda cut: round(cut, 3)),
+    "instances": st.integers(1, 4),
+    "min_size": st.integers(1, 25),
+    "keep": st.sampled_from(("all", "largest", "some")),
+    "absent": st.sampled_from(("drop", "keep")),
+}
+ROWS: list[dict[str, Any]] = [
+    {"text": ["apple"]},
+    {"text": ["apple"], "negatives": ["lamp"], "threshold": 0.25, "top": 3},
+    {"like": ["middle:6,12"], "unlike": ["splat:47"]},
+    {"like": ["middle:box:3,4,10,20"]},
+    {"like": ["middle:stroke:26,5,26,12,27,19"], "keep": "largest"},
+    {"like": ["region:left:0:1"], "instances": 1},
+    {"like": ["splat:47"], "threshold": -1.0, "min_size": 21},
+    {"sets": ["object:0", "object:2"]},
+    {"text": ["book"], "threshold": "paper", "absent": "keep"},
+]
+
+
+def questions_with(name: str) -> st.SearchStrategy[dict[str, Any]]:
+    """Return questions that have a field, and some of the others."""
+    others = {other: values for other, values in FIELDS.items() if other != name}
+    return st.fixed_dictionaries({name: FIELDS[name]}, optional={**others, "top": st.integers(0, 9)})
+
+
+def document_of(*models: Any) -> dict[str, Any]:
+    """Return the fields of models, as JSON has them."""
+    return {name: value for model in models for name, value in model.model_dump(mode="json").items()}
+
+
+def pixels_of(content: bytes) -> np.ndarray:
+    with Image.open(io.BytesIO(content)) as picture:
+        return np.asarray(picture)
+
+
+class Interfaces:
+    """One lift, which the service made of uploads, and which all others read by its downloaded file."""
+
+    def __init__(self, client: TestClient, folder: Path) -> None:
+        self.client, self.folder = client, folder
+        self.files = write_files(folder)
+        assets = {}
+        for kind, path in self.files.items():
+            reply = client.put(f"/assets/{kind}", content=path.read_bytes())
+            assert reply.status_code == 201, reply.text
+            assets[kind] = reply.json()["id"]
+        self.table, self.encoder = assets["table"], f"table:{self.files['table']}"
+        order = {**assets, "features": [assets["features"]], "settings": {"preset": "row-sum"}}
+        job = wait_for_end(client, client.post("/lift", json=order).headers["location"])
+        assert job["state"] == "succeeded", job
+        self.lift = client.get(job["links"]["lift"]).json()
+        self.path = folder / "downloaded.lift.safetensors"
+        self.path.write_bytes(client.get(job["links"]["features"]).content)
+        self.scene = lc.Scene(self.path, self.files["splats"], self.files["cameras"])
+        self.scene.find_packs([self.files["features"]])
+
+    def get(self, path: str, **parameters: Any) -> Any:
+        """Return the reply to a GET about the lift."""
+        return self.client.get(path, params={"lift": self.lift["id"], **parameters})
+
+    def post(self, path: str, **body: Any) -> Any:
+        """Return the reply to a POST about the lift."""
+        return self.client.post(path, json={"lift": self.lift["id"], **body})
+
+    def of_lift(self, path: str, **parameters: Any) -> Any:
+        """Return the reply to a GET below the lift's own path."""
+        return self.client.get(f"/lifts/{self.lift['id']}/{path}", params=parameters)
+
+    def command(self, name: str, *words: object) -> dict[str, Any] | None:
+        """Return the JSON that a command about the lift prints; None where it is refused."""
+        lift = [self.path, "--splats", self.files["splats"]]
+        lift += [] if name == "objects" else ["--cameras", self.files["cameras"]]
+        output = io.StringIO()
+        with contextlib.redirect_stdout(output), contextlib.redirect_stderr(io.StringIO()):
+            status = cli.main([name, *map(str, (*lift, *words)), "--json"])
+        assert status in (0, cli.BAD_INPUT)
+        return json.loads(output.getvalue()) if status == 0 else None
+
+    def written(self, name: str, option: str, file: str, *words: object) -> bytes:
+        """Return the file that an option of a command writes."""
+        path = self.folder / file
+        assert self.command(name, *words, option, path) is not None
+        return path.read_bytes()
+
+    def exported(self, file: str, source: Any, what: str = "", **options: Any) -> bytes:
+        """Return the file that the library writes."""
+        self.scene.export(self.folder / file, source, what, **options)
+        return (self.folder / file).read_bytes()
+
+    def ask(self, fields: dict[str, Any]) -> lc.Answer | None:
+        """Return the library's answer; None where it is refused."""
+        try:
+            return self.scene.ask(lc.Query(**fields), encoder=self.encoder, places=True)
+        except lc.SplatliftError:
+            return None
+
+
+def words_of(fields: dict[str, Any]) -> list[object]:
+    """Return the options of a question; a text stands first."""
+    words: list[object] = list(fields.get("text", []))
+    for name, value in fields.items():
+        flag = {"negatives": "--negative"}.get(name, f"--{name.replace('_', '-')}")
+        for item in (value if isinstance(value, list) else [value]) if name != "text" else []:
+            words += [flag, item]
+    return words
+
+
+@pytest.fixture(scope="module")
+def interfaces(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Interfaces]:
+    folder = tmp_path_factory.mktemp("interfaces")
+    with serving(folder / "data") as client:
+        yield Interfaces(client, folder)
+
+
+def assert_equal_answers(interfaces: Interfaces, fields: dict[str, Any]) -> None:
+    """Ask by all four ways, and compare the answers with their objects; or all four refuse."""
+    answer = interfaces.ask(fields)
+    expected = None if answer is None else document_of(answer, interfaces.scene.objects(answer))
+    asked = {name: value for name, value in fields.items() if name != "top"}
+    for send in (interfaces.get, interfaces.post):
+        replies = [send("/query", **fields), send("/query/objects", **asked)]
+        assert {reply.status_code for reply in replies} <= ({404, 422} if expected is None else {200})
+        if expected is not None:
+            document = {name: value for reply in replies for name, value in reply.json().items()}
+            assert {name: document[name] for name in expected} == expected
+    if not any(str(example).startswith("region:") for example in fields.get("like", []) + fields.get("unlike", [])):
+        # a command finds packs only where the lift remembers them
+        top = [] if "top" in fields else ["--top", "10"]
+        document = interfaces.command("query", *words_of(fields), *top, "--objects", *encoder_of(interfaces, fields))
+        assert (document and document["answer"]) == expected
+
+
+def encoder_of(interfaces: Interfaces, fields: dict[str, Any]) -> list[object]:
+    """Return the option of the text table, which only questions with words need."""
+    return ["--table", interfaces.files["table"]] if {"text", "negatives"} & set(fields) else []
+
+
+@pytest.mark.parametrize("fields", ROWS, ids="-".join)
+def test_each_field_of_a_question_has_the_same_answer(interfaces: Interfaces, fields: dict[str, Any]) -> None:
+    assert interfaces.ask(fields) is not None
+    assert_equal_answers(interfaces, fields)
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(fields=st.one_of(questions_with("text"), questions_with("like")))
+def test_any_fields_of_a_question_have_the_same_answer(interfaces: Interfaces, fields: dict[str, Any]) -> None:
+    assert_equal_answers(interfaces, fields)
+
+
+@pytest.mark.parametrize("fields", [ROWS[1], ROWS[4]], ids=["words", "click"])
+def test_scores_and_selections_are_the_same_arrays(interfaces: Interfaces, fields: dict[str, Any]) -> None:
+    answer = interfaces.ask(fields)
+    assert answer is not None
+    words, asked = (
+        [*words_of(fields), *encoder_of(interfaces, fields)],
+        {k: v for k, v in fields.items() if k != "top"},
+    )
+    scores = [np.load(io.BytesIO(interfaces.written("query", "--scores", "scores.npy", *words)))]
+    for send in (interfaces.get, interfaces.post):
+        scores.append(np.load(io.BytesIO(send("/query/scores", **asked).content)))
+        selected = np.load(io.BytesIO(send("/query/selection", **asked).content))
+        assert selected.dtype == np.bool_ and np.array_equal(selected, answer.selected)
+    assert all(array.dtype == np.float32 and np.array_equal(array, answer.scores) for array in scores)
+    assert 0 < answer.count < len(answer.scores)
+
+
+@pytest.mark.parametrize("fields", [ROWS[1], ROWS[4]], ids=["words", "click"])
+def test_masks_and_attention_of_a_view_are_the_same_pictures(interfaces: Interfaces, fields: dict[str, Any]) -> None:
+    answer = interfaces.ask(fields)
+    words, asked = (
+        [*words_of(fields), *encoder_of(interfaces, fields)],
+        {k: v for k, v in fields.items() if k != "top"},
+    )
+    views = []
+    for kind in ("mask", "attention"):
+        for view in ("left", "right"):
+            pictures = [interfaces.exported("picture.png", answer, kind, view=view)]
+            pictures += [
+                send(f"/query/{kind}", view=view, **asked).content for send in (interfaces.get, interfaces.post)
+            ]
+            pictures.append(interfaces.written("query", f"--{kind}", "picture.png", *words, "--view", view))
+            assert all(np.array_equal(pixels_of(picture), pixels_of(pictures[0])) for picture in pictures)
+            views.append(pixels_of(pictures[0]))
+        assert not np.array_equal(*views[-2:])
+    assert answer is not None and np.array_equal(views[0] > 0, interfaces.scene.mask(answer, "left"))
+
+
+def test_a_camera_of_no_file_sees_the_same_everywhere(interfaces: Interfaces) -> None:
+    camera = lc.read_cameras(interfaces.files["cameras"])["middle"]
+    moved = lc.Camera(np.eye(4) @ camera.viewmat, camera.K * [[2], [2], [1]], 2 * camera.width, 2 * camera.height)
+    body = {"width": moved.width, "height": moved.height, "fx": moved.fx, "viewmat": moved.viewmat.tolist()}
+    frame = {"w": moved.width, "h": moved.height, "fl_x": moved.fx, "fl_y": moved.fy, "file_path": "mine.png"}
+    turned = np.linalg.inv(moved.viewmat) @ np.diag([1.0, -1, -1, 1])
+    (interfaces.folder / "mine.json").write_text(
+        json.dumps({"frames": [frame | {"transform_matrix": turned.tolist()}]})
+    )
+    answer = interfaces.ask({"like": ["splat:0"]})
+    assert answer is not None
+    expected = interfaces.scene.mask(answer, moved)
+    over_http = interfaces.post("/query/mask", like=["splat:0"], camera=body)
+    options = ("--like", "splat:0", "--camera", interfaces.folder / "mine.json")
+    for content in (over_http.content, interfaces.written("query", "--mask", "mine.png", *options)):
+        assert np.array_equal(pixels_of(content) > 0, expected)
+    assert expected.shape == (2 * HEIGHT, 64) and 0 < expected.mean() < 0.5
+
+
+@pytest.mark.parametrize("channel", lc.Picture.model_json_schema()["properties"]["channel"]["enum"])
+def test_renders_of_each_channel_are_the_same_pictures(interfaces: Interfaces, channel: str) -> None:
+    options = ("--view", "middle", "--channel", channel)
+    try:
+        picture = pixels_of(interfaces.exported("render.png", None, channel, view="middle"))
+    except lc.InvalidQuery:  # the lift has no such values
+        assert interfaces.get("/render", view="middle", channel=channel).status_code == 422
+        assert interfaces.command("render", *options, "-o", interfaces.folder / "render.png") is None
+        return
+    over_http = [
+        send("/render", view="middle", channel=channel).content for send in (interfaces.get, interfaces.post)
+    ]
+    for content in (*over_http, interfaces.written("render", "-o", "render.png", *options)):
+        assert np.array_equal(pixels_of(content), picture)
+    if channel != "depth":
+        assert np.array_equal(picture, interfaces.scene.render("middle", channel))
+
+
+def test_splats_of_an_answer_are_the_same_files(interfaces: Interfaces) -> None:
+    fields = {"text": ["lamp"], "threshold": 0.5}
+    answer, words = interfaces.ask(fields), [*words_of(fields), *encoder_of(interfaces, fields)]
+    for what, option, kind in (("object", "--object", "object"), ("scores", "--coloured", "coloured")):
+        expected = interfaces.exported("out.ply", answer, kind)
+        assert interfaces.written("query", option, "out.ply", *words) == expected
+        for send in (interfaces.get, interfaces.post):
+            path = "/query/splats" if send == interfaces.get else f"/query/splats?what={what}"
+            parameters = fields | ({"what": what} if send == interfaces.get else {})
+            assert send(path, **parameters).content == expected
+    count = len(lc.read_splats(interfaces.folder / "out.ply").means)
+    assert count == len(interfaces.scene.features)
+
+
+def test_objects_and_their_tree_are_the_same_lists(interfaces: Interfaces) -> None:
+    words = interfaces.scene.words(interfaces.encoder)
+    expected = document_of(interfaces.scene.tree(words, encoder=interfaces.encoder))
+    document = interfaces.of_lift("tree", table=interfaces.table).json()
+    assert {name: document[name] for name in expected} == expected
+    output = interfaces.command("objects", "--tree", "--table", interfaces.files["table"])
+    assert output is not None and output["answer"] == expected
+    assert sorted(node["name"] for node in expected["nodes"]) == sorted(WORDS)
+    page = interfaces.of_lift("objects", table=interfaces.table).json()["objects"]
+    output = interfaces.command("objects", "--table", interfaces.files["table"])
+    assert output is not None
+    for listed in (page, output["answer"]["objects"]):
+        nodes = [
+            {name: node[name] for name in entry if name in node}
+            for entry, node in zip(listed, expected["nodes"], strict=True)
+        ]
+        assert [{name: entry[name] for name in node} for entry, node in zip(listed, nodes, strict=True)] == nodes
+        assert {"id", "name", "splats", "box", "views"} <= set(nodes[0])
+
+
+def test_splats_of_an_object_are_the_same_file(interfaces: Interfaces) -> None:
+    expected = interfaces.exported("object.ply", 1)
+    assert interfaces.of_lift("objects/1/splats").content == expected
+    assert interfaces.written("export", "-o", "object.ply", "--object", 1) == expected
+    assert len(lc.read_splats(interfaces.folder / "object.ply").means) == interfaces.scene.members(1).sum() > 0
+
+
+@pytest.mark.parametrize("words", [list(WORDS), ["lamp", "apple"]], ids=["all", "two"])
+def test_labels_of_many_words_are_the_same(interfaces: Interfaces, words: list[str]) -> None:
+    segmentation = interfaces.scene.segment(words, encoder=interfaces.encoder)
+    expected = document_of(segmentation.summary)
+    body = {"words": words, "table": interfaces.table}
+    document = interfaces.post("/query/segment", **body).json()
+    assert {name: document[name] for name in expected} == expected
+    (interfaces.folder / "words.txt").write_text("\n".join(words))
+    options = ["--words", interfaces.folder / "words.txt", "--table", interfaces.files["table"]]
+    output = interfaces.command("segment", *options)
+    assert output is not None and output["answer"] == expected
+    labels = [interfaces.post("/query/segment/labels", **body).content]
+    labels.append(interfaces.written("segment", "--splat-labels", "labels.npy", *options))
+    assert all(np.array_equal(np.load(io.BytesIO(content)), segmentation.values) for content in labels)
+    assert len(set(segmentation.values.tolist())) >= len(words)
+    maps = [interfaces.post("/query/segment/map", view="left", **body).content]
+    maps.append(interfaces.written("segment", "--labels", "map.png", *options, "--view", "left"))
+    maps.append(interfaces.exported("map.png", segmentation, "labels", view="left"))
+    assert all(np.array_equal(pixels_of(content), pixels_of(maps[0])) for content in maps)
+
+
+@pytest.mark.parametrize("example", ["splat:0", "middle:16,12"])
+def test_nearest_words_of_an_example_are_the_same(interfaces: Interfaces, example: str) -> None:
+    nearest = interfaces.scene.nearest_words(example, encoder=interfaces.encoder)
+    expected = [document_of(word) for word in nearest]
+    assert interfaces.post("/query/what", example=example, table=interfaces.table).json()["words"] == expected
+    options = ("--example", example, "--table", interfaces.files["table"])
+    output = interfaces.command("segment", *options)
+    assert output is not None and output["examples"] == [{"example": example, "words": expected}]
+    assert expected[0]["word"] == {"splat:0": "apple"}.get(example, "book")
+
+
+def test_regions_at_a_pixel_are_the_same(interfaces: Interfaces) -> None:
+    expected = [document_of(region) for region in interfaces.scene.regions("left", 20, 12)]
+    assert interfaces.of_lift("regions", view="left", x=20, y=12).json()["regions"] == expected
+    (region,) = expected
+    reply = interfaces.of_lift("regions/mask", view="left", level=region["level"], region=region["region"])
+    assert np.array_equal(pixels_of(reply.content) > 0, interfaces.scene.region_mask("left", 0, region["region"]))
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".glb", ".json"])
+@pytest.mark.parametrize("source", ["tree", "answer", "labels"])
+def test_exports_with_labels_are_those_of_the_library(interfaces: Interfaces, source: str, suffix: str) -> None:
+    scene, encoder = interfaces.scene, interfaces.encoder
+    (interfaces.folder / "two.txt").write_text("book\nlamp\n")
+
+    def label_two() -> lc.Segmentation:
+        return scene.segment(["book", "lamp"], encoder=encoder)
+
+    options, labelled = {
+        "tree": ([], lambda: scene.tree(scene.words(encoder), encoder=encoder)),
+        "answer": (["--text", "apple", "--text", "lamp"], lambda: interfaces.ask({"text": ["apple", "lamp"]})),
+        "labels": (
+            ["--words", interfaces.folder / "two.txt"],
+            lambda: scene.segment(["book", "lamp"], encoder=encoder),
+        ),
+    }[source]
+    expected = interfaces.exported(f"out{suffix}", labelled(), "masks" if suffix == ".json" else "labelled")
+    table = ("--table", interfaces.files["table"])
+    assert interfaces.written("export", "-o", f"out{suffix}", *options, *table) == expected
+    if suffix == ".json":
+        assert {Path(image["file_name"]).stem for image in json.loads(expected)["images"]} == set(VIEWS)
+    else:
+        assert len(lc.read_splats(interfaces.folder / f"out{suffix}").means) == len(scene.features)
+
+
+def test_splats_for_a_viewer_are_the_same_file(interfaces: Interfaces) -> None:
+    expected = interfaces.exported("viewer.splat", None, "splats")
+    assert interfaces.of_lift("splats").content == expected
+    assert interfaces.written("export", "-o", "viewer.splat") == expected
