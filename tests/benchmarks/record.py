@@ -1,6 +1,6 @@
 """The recorded run: what lifts of two real scenes answer, and what of it a checkout changes.
 
-    python -m tests.benchmarks.record [--scenes NAME ...] [--threads N] [--bits] [--gone TEXT ...]
+    python -m tests.benchmarks.record [--only TEXT ...] [--gone TEXT ...] [--bits] [--threads N]
     python -m tests.benchmarks.record --write
     python -m tests.benchmarks.record --seconds OTHER_CHECKOUT [--turns N] [--room FOLDER]
 
@@ -15,8 +15,9 @@ another BLAS or another order of sums may change last bits. Figures have four di
 printed, and never compared.
 
 A figure is ``moved`` beyond its tolerance. It is ``gone`` if the code refuses its setting or question, or lacks a
-name: ``--gone TEXT`` expects that of figures whose path begins with TEXT. The status is 1 if a figure moved, or is
-gone unexpectedly; with ``--bits`` also if bits moved. It is 2 if nothing could be compared.
+name: ``--gone TEXT`` expects that of paths that begin with TEXT, and ``--only TEXT`` compares lifts of such paths
+alone ("tabletop / hard 13"). The status is 1 if a figure moved, or is gone unexpectedly; with ``--bits`` also if bits
+moved. It is 2 if nothing could be compared.
 
 ``--seconds`` lifts from files by the command line, in turns with another checkout: user and system seconds of the
 whole process, the ratio of medians, and the peak memory. ``--room`` adds a folder that
@@ -26,6 +27,7 @@ whole process, the ratio of medians, and the peak memory. ``--room`` adds a fold
 import argparse
 import hashlib
 import json
+import math
 import os
 import platform
 import re
@@ -119,7 +121,7 @@ def attempt(compute: Callable[[], Any]) -> Any:
 
 def rounded(value: Any) -> float | None:
     """Four digits after the point; None of None and of infinity."""
-    return round(float(value), 4) if value is not None and np.isfinite(value) else None
+    return round(float(value), 4) if value is not None and math.isfinite(value) else None
 
 
 def columns(real: RealScene, lift: lc.LiftResult, _: lc.Scene) -> Figures:
@@ -142,12 +144,12 @@ def columns(real: RealScene, lift: lc.LiftResult, _: lc.Scene) -> Figures:
 
 
 def classes(real: RealScene, lift: lc.LiftResult, _: lc.Scene) -> Figures:
-    """Accuracy of the nearest class over splats, and mIoU of rendered classes over the held-out views."""
+    """Accuracy of the nearest class over splats, and mIoU of rendered classes over every other held-out view."""
     assert real.encoder is not None
     vectors = torch.from_numpy(np.asarray(real.encoder.encode(real.words), np.float32))
     scores = lift.features.float() @ vectors.T
     shared, union = np.zeros(len(real.words)), np.zeros(len(real.words))
-    for view, truth in real.truths.items():
+    for view, truth in list(real.truths.items())[::2]:
         best = real.render(real.cameras[view], scores, lift).argmax(dim=2).numpy()
         best[truth < 0] = -1  # rays that meet nothing show no class
         for k in range(len(real.words)):
@@ -232,20 +234,20 @@ PARTS = {
 
 
 def run_scene(real: RealScene, threads: int | None) -> Figures:
-    """Figures of all lifts of a scene; prints what the lifts cost."""
+    """Figures of the lifts of a scene by their paths; prints what the lifts cost."""
     figures = Figures()
-    for name, entry in real.recorded["lifts"].items():
+    for path, entry in real.recorded["lifts"].items():
         with suppress(OSError):  # the peak begins anew, where Linux lets it
             Path("/proc/self/clear_refs").write_text("5")
         start = time.process_time()
         lift = attempt(partial(real.lift, entry, threads))
         seconds = time.process_time() - start
-        print(f"{real.folder.name} / {name}: {seconds:.1f} s of processors, peak {_peak_mib()} MiB", flush=True)
+        print(f"{path}: {seconds:.1f} s of processors, peak {_peak_mib()} MiB", flush=True)
         if isinstance(lift, dict):
-            figures[name] = lift
+            figures[path] = lift
             continue
         scene = lc.Scene(lift, real.splats, real.cameras)
-        figures[name] = {part: attempt(partial(PARTS[part], real, lift, scene)) for part in entry["parts"]}
+        figures[path] = {part: attempt(partial(PARTS[part], real, lift, scene)) for part in entry["parts"]}
     return figures
 
 
@@ -296,15 +298,11 @@ def machine() -> dict[str, str]:
     return {"processor": cpu.partition(": ")[2] or platform.processor(), **libraries}
 
 
-def json_lines(value: Any, depth: int = 0, deepest: int = 6) -> str:
-    """JSON with a line an entry down to a depth, so that a change of the record is read by lines."""
-    if not isinstance(value, dict | list) or depth == deepest or len(text := json.dumps(value)) < 100:
+def json_lines(value: Any, depth: int = 6) -> str:
+    """JSON with a line for each short entry of a dict, so that a change of the record is read by lines."""
+    if not isinstance(value, dict) or not depth or len(json.dumps(value)) < 100:
         return json.dumps(value)
-    if isinstance(value, list):
-        if not isinstance(value[0], dict):
-            return text
-        return "[\n" + ",\n".join(json_lines(entry, depth + 1) for entry in value) + "\n]"
-    rows = (f"{json.dumps(key)}: {json_lines(entry, depth + 1)}" for key, entry in value.items())
+    rows = (f"{json.dumps(key)}: {json_lines(entry, depth - 1)}" for key, entry in value.items())
     return "{\n" + ",\n".join(rows) + "\n}"
 
 
@@ -313,14 +311,16 @@ def compare(recorded: Mapping[str, Any], figures: Figures, options: argparse.Nam
     if (here := machine()) != recorded["machine"]:
         print(f"Bits may move: the record was made by {recorded['machine']}, not by {here}.")
     counts = Counter[str]()
-    for scene in options.scenes:
-        for kind, path, text in differences(recorded["scenes"][scene]["figures"], figures[scene], scene):
-            is_expected = kind == "gone" and path.startswith(tuple(options.gone))
+    for path, new in figures.items():
+        for kind, part, text in differences(recorded["figures"][path], new, path):
+            is_expected = kind == "gone" and part.startswith(tuple(options.gone))
             counts["expectedly gone" if is_expected else kind] += 1
             if kind != "bits moved" or options.bits:
-                print(f"{kind}: {path}: {text}")
-    summary = ", ".join(f"{counts[kind]} {kind}" for kind in ("moved", "gone", "expectedly gone", "bits moved"))
-    print(f"Beside {recorded['commit']}: {summary}{'' if options.bits else ' (--bits lists them)'}.")
+                print(f"{kind}: {part}: {text}")
+    totals = ", ".join(f"{counts[kind]} {kind}" for kind in ("moved", "gone", "expectedly gone", "bits moved"))
+    print(
+        f"{len(figures)} lifts beside {recorded['commit']}: {totals}.{'' if options.bits else ' --bits lists bits.'}"
+    )
     return int(bool(counts["moved"] or counts["gone"] or (options.bits and counts["bits moved"])))
 
 
@@ -330,9 +330,9 @@ def write(recorded: dict[str, Any], figures: Figures) -> int:
     if git(["git", "status", "--porcelain", "liftcore"]).stdout:
         print("liftcore differs from its last commit, which names the record: commit it first.", file=sys.stderr)
         return 2
-    commit = git(["git", "log", "-1", "--format=%h", "--", "liftcore"]).stdout.strip()
-    scenes = {name: scene | {"figures": figures[name]} for name, scene in recorded["scenes"].items()}
-    RECORD.write_text(json_lines({"commit": commit, "machine": machine(), "scenes": scenes}) + "\n")
+    recorded |= {"commit": git(["git", "log", "-1", "--format=%h", "--", "liftcore"]).stdout.strip()}
+    recorded |= {"machine": machine(), "figures": figures}
+    RECORD.write_text(json_lines(recorded) + "\n")
     return 0
 
 
@@ -354,7 +354,7 @@ def lift_in_process(checkout: Path, folder: Path, pack: str, preset: str, thread
 
 def compare_seconds(options: argparse.Namespace) -> int:
     """Print medians of processor seconds and peaks of whole lifts, in turns with another checkout."""
-    packs = {options.data / name: TIMED_PACKS[name] for name in options.scenes}
+    packs = {options.data / name: pack for name, pack in TIMED_PACKS.items()}
     packs |= {options.room: "features"} if options.room else {}
     checkouts, threads = (ROOT, options.seconds.resolve()), options.threads or os.cpu_count() or 1
     print("| scene | preset | s here | s there | ratio | least, most ratio of a turn | MiB here | there |")
@@ -372,15 +372,11 @@ def compare_seconds(options: argparse.Namespace) -> int:
 
 def main() -> int:
     """Compare with the record, write it, or compare seconds."""
-    parser = argparse.ArgumentParser(
-        prog="python -m tests.benchmarks.record",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = argparse.ArgumentParser("python -m tests.benchmarks.record", description=__doc__)
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     recorded = json.loads(RECORD.read_text())
-    names = tuple(recorded["scenes"])
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="the folder of the scenes")
-    parser.add_argument("--scenes", nargs="+", choices=names, default=names)
+    parser.add_argument("--only", nargs="+", default=(), metavar="TEXT", help="beginnings of paths of lifts")
     parser.add_argument("--threads", type=int, help="of lifts; default: the number of cores")
     parser.add_argument("--bits", action="store_true", help="list moved bits, and fail by them")
     parser.add_argument(
@@ -391,16 +387,18 @@ def main() -> int:
     parser.add_argument("--turns", type=int, default=5)
     parser.add_argument("--room", type=Path, metavar="FOLDER", help="a scene of --seconds")
     options = parser.parse_args()
-    if options.write and options.scenes != names:
-        parser.error("--write records all scenes: leave out --scenes")
-    if missing := [str(options.data / name) for name in options.scenes if not (options.data / name).is_dir()]:
+    if options.write and options.only:
+        parser.error("--write records all lifts: leave out --only")
+    if missing := [str(options.data / name) for name in recorded["scenes"] if not (options.data / name).is_dir()]:
         parser.error(f"the scenes are missing, so nothing was compared: {', '.join(missing)}")
     if options.seconds:
         return compare_seconds(options)
-    figures = {
-        name: run_scene(RealScene(options.data / name, recorded["scenes"][name]), options.threads)
-        for name in options.scenes
-    }
+    figures = Figures()
+    for name, scene in recorded["scenes"].items():
+        only, all_lifts = tuple(options.only or [name]), scene["lifts"]
+        if lifts := {path: entry for path, entry in all_lifts.items() if path.startswith(only)}:
+            first = dict(list(all_lifts.items())[:1])  # its total weights choose the splats that accuracy counts
+            figures |= run_scene(RealScene(options.data / name, scene | {"lifts": first | lifts}), options.threads)
     return write(recorded, figures) if options.write else compare(recorded, figures, options)
 
 
