@@ -15,9 +15,9 @@ another BLAS or another order of sums may change last bits. Figures have four di
 printed, and never compared.
 
 A figure is ``moved`` beyond its tolerance. It is ``gone`` if the code refuses its setting or question, or lacks a
-name: ``--gone TEXT`` expects that of paths that begin with TEXT, and ``--only TEXT`` compares lifts of such paths
-alone ("tabletop / hard 13"). The status is 1 if a figure moved, or is gone unexpectedly; with ``--bits`` also if bits
-moved. It is 2 if nothing could be compared.
+name: ``--gone TEXT`` expects that of paths that begin with TEXT. The status is 1 if a figure moved, or is gone
+unexpectedly; with ``--bits`` also if bits moved. It is 2 if nothing could be compared. ``--only TEXT`` chooses lifts
+by the beginnings of their paths, such as "tabletop / hard 13" or, of seconds, "plush / row-sum".
 
 ``--seconds`` lifts from files by the command line, in turns with another checkout: user and system seconds of the
 whole process, the ratio of medians, and the peak memory. ``--room`` adds a folder that
@@ -360,6 +360,8 @@ def compare_seconds(options: argparse.Namespace) -> int:
     print("| scene | preset | s here | s there | ratio | least, most ratio of a turn | MiB here | there |")
     print("|---|---|---|---|---|---|---|---|", flush=True)
     for (folder, pack), preset in product(packs.items(), TIMED_PRESETS):
+        if options.only and not f"{folder.name} / {preset}".startswith(tuple(options.only)):
+            continue
         lifts = partial(lift_in_process, folder=folder.resolve(), pack=pack, preset=preset, threads=threads)
         list(map(lifts, checkouts))  # compiles kernels and reads files, not counted
         turns = np.array([list(map(lifts, checkouts)) for _ in range(options.turns)])  # [turns, 2, 2]
