@@ -36,7 +36,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -243,12 +243,15 @@ def run_scene(real: RealScene, threads: int | None) -> Figures:
         lift = attempt(partial(real.lift, entry, threads))
         seconds = time.process_time() - start
         print(f"{path}: {seconds:.1f} s of processors, peak {_peak_mib()} MiB", flush=True)
-        if isinstance(lift, dict):
-            figures[path] = lift
-            continue
-        scene = lc.Scene(lift, real.splats, real.cameras)
-        figures[path] = {part: attempt(partial(PARTS[part], real, lift, scene)) for part in entry["parts"]}
+        figures[path] = lift if isinstance(lift, dict) else lift_figures(real, lift, entry["parts"])
+        del lift  # it is not to be in the peak of the next one
     return figures
+
+
+def lift_figures(real: RealScene, lift: lc.LiftResult, parts: Iterable[str]) -> Figures:
+    """Figures of a lift by their parts."""
+    scene = lc.Scene(lift, real.splats, real.cameras)
+    return {part: attempt(partial(PARTS[part], real, lift, scene)) for part in parts}
 
 
 def _peak_mib() -> str:
