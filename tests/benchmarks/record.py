@@ -1,7 +1,7 @@
 """The recorded run: what lifts of two real scenes answer, and what of it a checkout changes.
 
     python -m tests.benchmarks.record [--only TEXT ...] [--gone TEXT ...] [--bits] [--threads N]
-    python -m tests.benchmarks.record --write
+    python -m tests.benchmarks.record --write [--only TEXT ...]
     python -m tests.benchmarks.record --seconds OTHER_CHECKOUT [--turns N] [--room FOLDER]
 
 ``record.json`` beside this file has lifts of `tabletop` and `plush`, 60 questions over each, and all their figures
@@ -233,9 +233,8 @@ PARTS = {
 }  # what is recorded of a lift
 
 
-def run_scene(real: RealScene, threads: int | None) -> Figures:
-    """Figures of the lifts of a scene by their paths; prints what the lifts cost."""
-    figures = Figures()
+def run_scene(real: RealScene, threads: int | None) -> Iterator[tuple[str, Figures]]:
+    """Iterate over the lifts of a scene: their paths and figures; prints what the lifts cost."""
     for path, entry in real.recorded["lifts"].items():
         with suppress(OSError):  # the peak begins anew, where Linux lets it
             Path("/proc/self/clear_refs").write_text("5")
@@ -243,9 +242,8 @@ def run_scene(real: RealScene, threads: int | None) -> Figures:
         lift = attempt(partial(real.lift, entry, threads))
         seconds = time.process_time() - start
         print(f"{path}: {seconds:.1f} s of processors, peak {_peak_mib()} MiB", flush=True)
-        figures[path] = lift if isinstance(lift, dict) else lift_figures(real, lift, entry["parts"])
+        yield path, lift if isinstance(lift, dict) else lift_figures(real, lift, entry["parts"])
         del lift  # it is not to be in the peak of the next one
-    return figures
 
 
 def lift_figures(real: RealScene, lift: lc.LiftResult, parts: Iterable[str]) -> Figures:
@@ -315,28 +313,37 @@ def compare(recorded: Mapping[str, Any], figures: Figures, options: argparse.Nam
         print(f"Bits may move: the record was made by {recorded['machine']}, not by {here}.")
     counts = Counter[str]()
     for path, new in figures.items():
+        if path not in recorded["figures"]:
+            counts["not recorded"] += 1
+            continue
         for kind, part, text in differences(recorded["figures"][path], new, path):
             is_expected = kind == "gone" and part.startswith(tuple(options.gone))
             counts["expectedly gone" if is_expected else kind] += 1
             if kind != "bits moved" or options.bits:
                 print(f"{kind}: {part}: {text}")
-    totals = ", ".join(f"{counts[kind]} {kind}" for kind in ("moved", "gone", "expectedly gone", "bits moved"))
+    totals = ", ".join(
+        f"{counts[kind]} {kind}" for kind in ("moved", "gone", "expectedly gone", "not recorded", "bits moved")
+    )
     print(
         f"{len(figures)} lifts beside {recorded['commit']}: {totals}.{'' if options.bits else ' --bits lists bits.'}"
     )
     return int(bool(counts["moved"] or counts["gone"] or (options.bits and counts["bits moved"])))
 
 
-def write(recorded: dict[str, Any], figures: Figures) -> int:
-    """Write the figures, named by the last commit that changed the library; lifts and questions stay."""
+def library_commit() -> str:
+    """Return the last commit that changed the library, which names the record."""
     git = partial(subprocess.run, cwd=ROOT, capture_output=True, text=True, check=True)
     if git(["git", "status", "--porcelain", "liftcore"]).stdout:
-        print("liftcore differs from its last commit, which names the record: commit it first.", file=sys.stderr)
-        return 2
-    recorded |= {"commit": git(["git", "log", "-1", "--format=%h", "--", "liftcore"]).stdout.strip()}
-    recorded |= {"machine": machine(), "figures": figures}
+        sys.exit("liftcore differs from its last commit, which is to name the record: commit it first.")
+    return git(["git", "log", "-1", "--format=%h", "--", "liftcore"]).stdout.strip()
+
+
+def write(recorded: dict[str, Any], figures: Figures) -> None:
+    """Add figures to the record; those of another commit or machine go."""
+    facts = {"commit": library_commit(), "machine": machine()}
+    same = all(recorded[name] == value for name, value in facts.items())
+    recorded |= facts | {"figures": (recorded["figures"] if same else {}) | figures}
     RECORD.write_text(json_lines(recorded) + "\n")
-    return 0
 
 
 def lift_in_process(checkout: Path, folder: Path, pack: str, preset: str, threads: int) -> tuple[float, float]:
@@ -387,13 +394,11 @@ def main() -> int:
     parser.add_argument(
         "--gone", nargs="+", default=(), metavar="TEXT", help="beginnings of paths that are to be gone"
     )
-    parser.add_argument("--write", action="store_true", help="write the record of this checkout")
+    parser.add_argument("--write", action="store_true", help="write figures of this checkout into the record")
     parser.add_argument("--seconds", type=Path, metavar="CHECKOUT", help="compare seconds with another checkout")
     parser.add_argument("--turns", type=int, default=5)
     parser.add_argument("--room", type=Path, metavar="FOLDER", help="a scene of --seconds")
     options = parser.parse_args()
-    if options.write and options.only:
-        parser.error("--write records all lifts: leave out --only")
     if missing := [str(options.data / name) for name in recorded["scenes"] if not (options.data / name).is_dir()]:
         parser.error(f"the scenes are missing, so nothing was compared: {', '.join(missing)}")
     if options.seconds:
@@ -403,8 +408,12 @@ def main() -> int:
         only, all_lifts = tuple(options.only or [name]), scene["lifts"]
         if lifts := {path: entry for path, entry in all_lifts.items() if path.startswith(only)}:
             first = dict(list(all_lifts.items())[:1])  # its total weights choose the splats that accuracy counts
-            figures |= run_scene(RealScene(options.data / name, scene | {"lifts": first | lifts}), options.threads)
-    return write(recorded, figures) if options.write else compare(recorded, figures, options)
+            real = RealScene(options.data / name, scene | {"lifts": first | lifts})
+            for path, parts in run_scene(real, options.threads):
+                figures[path] = parts
+                if options.write:  # a run that is cut short leaves what it has
+                    write(recorded, figures)
+    return 0 if options.write else compare(recorded, figures, options)
 
 
 if __name__ == "__main__":
