@@ -1,0 +1,1 @@
+"""The service's gate: attacks on a running service by its commands and public HTTP alone. Its figures: record.md."""

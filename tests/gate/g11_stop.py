@@ -1,0 +1,156 @@
+"""Stops and deaths as a client sees them: SIGTERM in a lift, an order sent again over a kill, a stream taken up again.
+
+python -m tests.gate.g11_stop [--stops N] [--replays N]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import signal
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import httpx
+
+from tests.gate.running import Service, Verdicts, run_gate
+from tests.gate.scenes import long_scene, small_scene
+
+QUICK_SECONDS = 5.0  # to end where no request is open; a check, a busy machine and a job's end included
+GRACE_SECONDS = 1.0  # for the children of a server that has ended
+OPEN_SECONDS = 15.0  # where a stream and half an upload are open
+
+
+def gate(options: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
+    """Stop, kill and replay."""
+    chance = random.Random(options.seed)
+    with Service(folder / "data") as service:
+        body = service.upload(long_scene())
+        start = time.monotonic()
+        reference = service.order(body)
+        service.wait_for(reference)
+        duration, digest = time.monotonic() - start, service.digest(reference)
+        stop_in_lifts(service, body, [chance.uniform(0, duration / 4) for _ in range(options.stops)], digest, verdicts)
+        stop_beside_open_requests(service, body, verdicts)
+        small = service.upload(small_scene())
+        replay_over_kills(service, small, [chance.uniform(0, 0.1) for _ in range(options.replays)], verdicts)
+        resume_stream(service, body, verdicts)
+        verdicts.check("nothing lies in the scratch folders", not service.scratch(), service.scratch())
+
+
+def stop_in_lifts(service: Service, body: dict, moments: list[float], digest: str, verdicts: Verdicts) -> None:
+    """SIGTERM in one lift, more often than it has attempts, and with another job in line."""
+    jobs = [service.order(body) for _ in range(2)]
+    ends, orphans = [], 0
+    for moment in moments:
+        service.wait_for(jobs[0], "running")
+        time.sleep(moment)
+        ends.append(service.end(signal.SIGTERM))
+        time.sleep(GRACE_SECONDS)
+        orphans += len(service.children())
+        service.start()
+    slowest = max(seconds for _, seconds in ends)
+    quick = all(status == 0 and seconds < QUICK_SECONDS for status, seconds in ends)
+    verdicts.check("SIGTERM in a lift: status 0, within 5 s", quick, f"{len(ends)} stops, slowest {slowest:.2f} s")
+    verdicts.check("no process is left within 1 s", not orphans, orphans)
+    records = [service.wait_for(job) for job in jobs]
+    wrong = sum(record["state"] != "succeeded" or service.digest(record["id"]) != digest for record in records)
+    verdicts.check("stops do not count: both jobs succeed with the same bits", not wrong, f"{wrong} of {len(jobs)} wrong")
+
+
+def stop_beside_open_requests(service: Service, body: dict, verdicts: Verdicts) -> None:
+    """SIGTERM while an event stream and half an upload are open."""
+    job = service.order(body)
+
+    def half_upload():
+        yield b"ply\n"
+        time.sleep(OPEN_SECONDS)
+        yield b"format"
+
+    def send_slowly() -> None:
+        try:
+            service.put("/assets/splats", content=half_upload())
+        except httpx.TransportError:
+            pass
+
+    with ThreadPoolExecutor(2) as pool:
+        upload = pool.submit(send_slowly)
+        stream = pool.submit(follow, service, job)
+        time.sleep(1)
+        status, seconds = service.end(signal.SIGTERM)
+        stream.result()
+        upload.result()
+    is_ended = status == 0 and seconds < OPEN_SECONDS
+    verdicts.check("SIGTERM beside a stream and half an upload: status 0, within 15 s", is_ended, f"{seconds:.1f} s")
+    service.start()
+    verdicts.check("its job succeeds", service.wait_for(job)["state"] == "succeeded")
+
+
+def replay_over_kills(service: Service, body: dict, moments: list[float], verdicts: Verdicts) -> None:
+    """SIGKILL beside four clients that send one order with one Idempotency-Key, and send it again afterwards."""
+    before = len(service.get("/jobs", params={"limit": 1000}).json()["jobs"])
+    changed, doubled, unfinished = 0, 0, 0
+    for number, moment in enumerate(moments):
+
+        def send(_: int, key: str = f"replay {number}") -> str | None:
+            try:
+                return service.order(body, key)
+            except httpx.TransportError:
+                return None
+
+        with ThreadPoolExecutor(4) as pool:
+            answers = pool.map(send, range(4))
+            time.sleep(moment)
+            service.end(signal.SIGKILL)
+            acknowledged = {job for job in answers if job}
+        service.start()
+        job = service.order(body, f"replay {number}")
+        doubled += len(acknowledged | {job}) > 1
+        other = {**body, "settings": {"preset": "row-sum"}}
+        headers = {"Idempotency-Key": f"replay {number}"}
+        changed += service.post("/lift", json=other, headers=headers).status_code != 422
+        unfinished += service.wait_for(job)["state"] != "succeeded"
+    count = len(service.get("/jobs", params={"limit": 1000}).json()["jobs"]) - before
+    figures = f"{len(moments)} keys, {count} jobs, {doubled} doubled, {unfinished} unfinished"
+    verdicts.check("one key over a kill is one job", count == len(moments) and not doubled + unfinished, figures)
+    verdicts.check("the key with another order is 422 after the kill", not changed, changed)
+
+
+def resume_stream(service: Service, body: dict, verdicts: Verdicts) -> None:
+    """Follow a job, be cut off by a kill, and go on after the last event."""
+    job = service.order(body)
+    service.wait_for(job, "running")
+    with ThreadPoolExecutor(1) as pool:
+        stream = pool.submit(follow, service, job)
+        time.sleep(2)
+        service.end(signal.SIGKILL)
+        first = stream.result()
+    service.start()
+    second = follow(service, job, first[-1][0] if first else None)
+    numbers = [int(number) for number, _ in first + second]
+    verdicts.check("a stream goes on after Last-Event-ID over a kill", numbers == sorted(set(numbers)), len(numbers))
+    whole = follow(service, job)
+    ends = [event.get("state") for _, event in whole].count("succeeded")
+    verdicts.check("it ends with the last state, once", whole[-1][1].get("state") == "succeeded" and ends == 1, ends)
+
+
+def follow(service: Service, job: str, after: str | None = None) -> list[tuple[str, dict]]:
+    """Number and data of a job's events, until the stream ends or breaks."""
+    events, number = [], ""
+    try:
+        headers = {"Last-Event-ID": after} if after else {}
+        with service.stream("GET", f"/jobs/{job}/events", headers=headers) as reply:
+            for line in reply.iter_lines():
+                name, _, value = line.partition(":")
+                number = value.strip() if name == "id" else number
+                if name == "data":
+                    events.append((number, json.loads(value)))
+    except httpx.TransportError:
+        pass
+    return events
+
+
+if __name__ == "__main__":
+    run_gate(gate, __doc__, stops=4, replays=2)

@@ -1,0 +1,85 @@
+"""SIGKILL to the server or to all its children, at random moments of a line of lifts.
+
+python -m tests.gate.g12_kills [--kills N] [--jobs N]
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import signal
+import time
+from collections import Counter
+from pathlib import Path
+
+from tests.gate.running import Service, Verdicts, run_gate, send_signal
+from tests.gate.scenes import long_scene, small_scene
+
+ATTEMPTS = 3
+
+
+def gate(options: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
+    """Kill, until all jobs have ended and all kills are spent."""
+    chance, victims = random.Random(options.seed), Counter[str]()
+    with Service(folder / "data") as service:
+        body = service.upload(long_scene())
+        start = time.monotonic()
+        reference = service.order(body)
+        service.wait_for(reference)
+        duration, digest = time.monotonic() - start, service.digest(reference)
+        jobs = {f"job {number}": service.order(body, f"job {number}") for number in range(options.jobs)}
+        child_kills, orphans = Counter[str](), 0
+        while victims.total() < options.kills:
+            time.sleep(chance.uniform(0, duration))
+            records = {record["id"]: record["state"] for record in list_all(service, "jobs")}
+            running = [job for job in jobs.values() if records.get(job) == "running"]
+            if all(records.get(job) in ("succeeded", "failed") for job in jobs.values()):
+                name = f"job {len(jobs)}"
+                jobs[name] = service.order(body, name)
+            elif chance.random() < 0.5 and running and child_kills[running[0]] < ATTEMPTS - 1:
+                child_kills[running[0]] += 1
+                victims["children"] += 1
+                send_signal(service.children(), signal.SIGKILL)
+            else:
+                victims["server"] += 1
+                service.end(signal.SIGKILL)
+                time.sleep(0.5)
+                orphans += len(service.children())
+                service.start()
+        states = Counter(service.wait_for(job)["state"] for job in jobs.values())
+        lost = sum(service.order(body, name) != job for name, job in jobs.items())
+        unlike = sum(service.digest(job) != digest for job in jobs.values() if service.job(job)["state"] == "succeeded")
+        counts = {name: len(list_all(service, name)) for name in ("jobs", "lifts")}
+        figures = f"{victims.total()} kills {dict(victims)}, {len(jobs)} jobs"
+        verdicts.check("all jobs succeed", states == {"succeeded": len(jobs)}, f"{figures}, {dict(states)}")
+        verdicts.check("none is lost: each key brings its job", not lost, lost)
+        verdicts.check("none is doubled", set(counts.values()) == {len(jobs) + 1}, counts)
+        verdicts.check("all have the same bits", not unlike, unlike)
+        verdicts.check("no child outlives its server by half a second", not orphans, orphans)
+        verdicts.check("nothing lies in the scratch folders", not service.scratch(), service.scratch())
+        kill_each_attempt(service, body, verdicts)
+
+
+def kill_each_attempt(service: Service, body: dict, verdicts: Verdicts) -> None:
+    """SIGKILL to the children in each attempt at one job."""
+    job = service.order(body)
+    for number in range(1, ATTEMPTS + 1):
+        while service.job(job)["attempt"] < number or service.job(job)["state"] == "queued":
+            time.sleep(0.02)
+        time.sleep(0.5)
+        send_signal(service.children(), signal.SIGKILL)
+    record = service.wait_for(job)
+    is_failed = record["state"] == "failed" and record["attempt"] == ATTEMPTS and record["problem"]
+    verdicts.check("a job whose process dies three times fails with a problem", is_failed, record["problem"])
+    verdicts.check("it has no lift", service.get(f"/lifts/{job}").status_code == 404)
+    small = service.wait_for(service.order(service.upload(small_scene())))
+    verdicts.check("the next job succeeds", small["state"] == "succeeded")
+
+
+def list_all(service: Service, name: str) -> list[dict]:
+    """All rows of /jobs or /lifts, of up to 1,000."""
+    return service.get(f"/{name}", params={"limit": 1000}).json()[name]
+
+
+if __name__ == "__main__":
+    run_gate(gate, __doc__, kills=10, jobs=2)
