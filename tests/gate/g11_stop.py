@@ -1,4 +1,4 @@
-"""Stops and deaths as a client sees them: SIGTERM in a lift, an order sent again over a kill, a stream taken up again.
+"""Stops and deaths as a client sees them: SIGTERM in a lift, an order repeated over a kill, a stream taken up again.
 
 python -m tests.gate.g11_stop [--stops N] [--replays N]
 """
@@ -6,6 +6,7 @@ python -m tests.gate.g11_stop [--stops N] [--replays N]
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import random
 import signal
@@ -32,7 +33,9 @@ def gate(options: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
         reference = service.order(body)
         service.wait_for(reference)
         duration, digest = time.monotonic() - start, service.digest(reference)
-        stop_in_lifts(service, body, [chance.uniform(0, duration / 4) for _ in range(options.stops)], digest, verdicts)
+        stop_in_lifts(
+            service, body, [chance.uniform(0, duration / 4) for _ in range(options.stops)], digest, verdicts
+        )
         stop_beside_open_requests(service, body, verdicts)
         small = service.upload(small_scene())
         replay_over_kills(service, small, [chance.uniform(0, 0.1) for _ in range(options.replays)], verdicts)
@@ -57,7 +60,9 @@ def stop_in_lifts(service: Service, body: dict, moments: list[float], digest: st
     verdicts.check("no process is left within 1 s", not orphans, orphans)
     records = [service.wait_for(job) for job in jobs]
     wrong = sum(record["state"] != "succeeded" or service.digest(record["id"]) != digest for record in records)
-    verdicts.check("stops do not count: both jobs succeed with the same bits", not wrong, f"{wrong} of {len(jobs)} wrong")
+    verdicts.check(
+        "stops do not count: both jobs succeed with the same bits", not wrong, f"{wrong} of {len(jobs)} wrong"
+    )
 
 
 def stop_beside_open_requests(service: Service, body: dict, verdicts: Verdicts) -> None:
@@ -70,10 +75,8 @@ def stop_beside_open_requests(service: Service, body: dict, verdicts: Verdicts) 
         yield b"format"
 
     def send_slowly() -> None:
-        try:
+        with contextlib.suppress(httpx.TransportError):
             service.put("/assets/splats", content=half_upload())
-        except httpx.TransportError:
-            pass
 
     with ThreadPoolExecutor(2) as pool:
         upload = pool.submit(send_slowly)

@@ -48,7 +48,9 @@ def gate(options: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
                 service.start()
         states = Counter(service.wait_for(job)["state"] for job in jobs.values())
         lost = sum(service.order(body, name) != job for name, job in jobs.items())
-        unlike = sum(service.digest(job) != digest for job in jobs.values() if service.job(job)["state"] == "succeeded")
+        unlike = sum(
+            service.digest(job) != digest for job in jobs.values() if service.job(job)["state"] == "succeeded"
+        )
         counts = {name: len(list_all(service, name)) for name in ("jobs", "lifts")}
         figures = f"{victims.total()} kills {dict(victims)}, {len(jobs)} jobs"
         verdicts.check("all jobs succeed", states == {"succeeded": len(jobs)}, f"{figures}, {dict(states)}")

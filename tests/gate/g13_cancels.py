@@ -34,7 +34,9 @@ def gate(options: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
             is_tradeoff = kind == "tradeoff"
             order = body | {"budget_s": 10} if is_tradeoff else body
             order = {name: order[name] for name in order if not (is_tradeoff and name == "table")}
-            job = service.post(f"/{'tradeoff' if is_tradeoff else 'lift'}", json=order).raise_for_status().json()["id"]
+            job = (
+                service.post(f"/{'tradeoff' if is_tradeoff else 'lift'}", json=order).raise_for_status().json()["id"]
+            )
             time.sleep(chance.uniform(0, duration))
             start = time.monotonic()
             reply = service.post(f"/jobs/{job}/cancel")

@@ -55,7 +55,9 @@ class Service(httpx.Client):
         """Start it; None once it listens, or the status with which it refused to."""
         with self.log.open("ab") as log:
             command = [*COMMAND, "serve", "--data", str(self.data), "--port", "0"]
-            self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, env=self.variables)
+            self.process = subprocess.Popen(
+                command, stdout=subprocess.PIPE, stderr=log, text=True, env=self.variables
+            )
         assert self.process.stdout is not None
         if not (line := self.process.stdout.readline()).startswith("listening on "):
             return self.process.wait(PATIENCE_SECONDS)
@@ -81,7 +83,9 @@ class Service(httpx.Client):
 
     def upload(self, files: dict[str, bytes], **headers: str) -> dict[str, Any]:
         """Upload a scene; the body of an order of its lift."""
-        replies = {kind: self.put(f"/assets/{kind}", content=content, headers=headers) for kind, content in files.items()}
+        replies = {
+            kind: self.put(f"/assets/{kind}", content=content, headers=headers) for kind, content in files.items()
+        }
         ids = {kind: reply.raise_for_status().json()["id"] for kind, reply in replies.items()}
         return ids | {"features": [ids["features"]]}
 
@@ -147,7 +151,9 @@ def send_signal(pids: set[int], number: signal.Signals) -> None:
             os.kill(pid, number)
 
 
-def run_gate(script: Callable[[argparse.Namespace, Path, Verdicts], None], doc: str | None, **counts: int) -> NoReturn:
+def run_gate(
+    script: Callable[[argparse.Namespace, Path, Verdicts], None], doc: str | None, **counts: int
+) -> NoReturn:
     """Run a script in a folder of its own, with counts as options; exit with 1 where a promise was broken."""
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     for name, count in {**counts, "seed": 0}.items():

@@ -16,7 +16,7 @@ def small_scene() -> dict[str, bytes]:
 
 def long_scene() -> dict[str, bytes]:
     """A scene whose lift takes seconds."""
-    return scene(splats=30_000, views=16, width=320, channels=32)
+    return scene(splats=20_000, views=16, width=240, channels=32)
 
 
 def scene(*, splats: int, views: int, width: int, channels: int) -> dict[str, bytes]:

@@ -1,0 +1,88 @@
+"""Children that eat memory, take too long or hang: each ends at its limit, and the HTTP process goes on.
+
+python -m tests.gate.g14_limits
+"""
+
+from __future__ import annotations
+
+import argparse
+import gzip
+import signal
+import struct
+import time
+from pathlib import Path
+
+from tests.gate.running import PATIENCE_SECONDS, Service, Verdicts, run_gate, send_signal
+from tests.gate.scenes import long_scene, scene, small_scene
+
+JOB_MEMORY, JOB_TIME = "lift_memory_bytes", "lift_seconds"  # settings of the service
+CHECK_MEMORY, CHECK_TIME, SILENCE = "check_memory_bytes", "check_seconds", "lease_seconds"
+MIB = 1 << 20
+BOMB_SPLATS = 40_000_000  # as its header says; 2 GB of zeros
+
+
+def gate(_: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
+    """Meet each limit on a server of its own."""
+    with Service(folder / "memory", **{JOB_MEMORY: 700 * MIB}) as service:
+        body = service.upload(scene(splats=300_000, views=3, width=32, channels=512))
+        record = service.wait_for(service.order(body))
+        judge_failure(service, record, "memory", verdicts)
+    with Service(folder / "time", **{JOB_TIME: 1}) as service:
+        record = service.wait_for(service.order(service.upload(long_scene())))
+        judge_failure(service, record, "s", verdicts)
+    with Service(folder / "hang", **{SILENCE: 4, JOB_TIME: 120}) as service:
+        job = service.order(service.upload(long_scene()))
+        service.wait_for(job, "running")
+        time.sleep(1)
+        stopped = service.children()
+        send_signal(stopped, signal.SIGSTOP)
+        state = service.wait_for(job)["state"]
+        verdicts.check("a job whose processes hang ends", state in ("succeeded", "failed"), state)
+        send_signal(stopped, signal.SIGCONT)  # what serves questions may have been among them
+        record = service.wait_for(service.order(service.upload(small_scene())))
+        verdicts.check("the next job succeeds", record["state"] == "succeeded", record["state"])
+    header = struct.pack("<4sIIBBBB", b"NGSP", 3, BOMB_SPLATS, 0, 12, 0, 0)
+    bomb = gzip.compress(header) + gzip.compress(bytes(64 * MIB), 1) * 32
+    for name, settings in {"memory": {CHECK_MEMORY: 512 * MIB}, "time": {CHECK_TIME: 1}}.items():
+        with Service(folder / f"check-{name}", **settings) as service:
+            start = time.monotonic()
+            reply = service.put("/assets/splats", content=bomb)
+            seconds = time.monotonic() - start
+            is_refused = 400 <= reply.status_code < 500 and seconds < PATIENCE_SECONDS / 10
+            figures = f"{reply.status_code} in {seconds:.1f} s: {reply.json().get('detail', '')[:90]}"
+            verdicts.check(
+                f"a bomb of {len(bomb) / 1e6:.1f} MB under a limit of {name}: refused", is_refused, figures
+            )
+            verdicts.check("nothing of it is left", not service.scratch(), service.scratch())
+            status = service.put("/assets/cameras", content=small_scene()["cameras"]).status_code
+            verdicts.check("the next upload is accepted or meets the limit itself", status in (201, 422), status)
+
+
+def judge_failure(service: Service, record: dict, word: str, verdicts: Verdicts) -> None:
+    """Judge a job that had to meet its limit."""
+    problem = record["problem"] or {}
+    is_failed = record["state"] == "failed" and word in problem.get("detail", "")
+    verdicts.check(
+        f"a job over its limit fails, and says so ({word})", is_failed, problem.get("detail", record["state"])
+    )
+    time.sleep(2)
+    at_work = [pid for pid in service.children() if is_computing(pid)]
+    verdicts.check("no process of it computes on", not at_work, len(at_work))
+    verdicts.check("the service is alive and ready", service.get("/readyz").status_code == 200)
+    verdicts.check("nothing lies in the scratch folders", not service.scratch(), service.scratch())
+
+
+def is_computing(pid: int) -> bool:
+    """Whether a process takes processor time within a second."""
+    path = Path(f"/proc/{pid}/stat")
+    try:
+        ticks = [path.read_text().rpartition(")")[2].split()[11:13]]
+        time.sleep(1)
+        ticks.append(path.read_text().rpartition(")")[2].split()[11:13])
+    except OSError:
+        return False
+    return int(ticks[1][0]) + int(ticks[1][1]) - int(ticks[0][0]) - int(ticks[0][1]) > 50
+
+
+if __name__ == "__main__":
+    run_gate(gate, __doc__)
