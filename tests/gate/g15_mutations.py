@@ -17,7 +17,7 @@ from typing import Any
 from urllib.parse import quote, urlencode
 
 from tests import tiny_scene
-from tests.gate.running import Service, Verdicts, run_gate
+from tests.gate.running import FINAL_STATES, Service, Verdicts, run_gate
 from tests.gate.scenes import small_scene
 
 CLIENTS = 2
@@ -56,8 +56,11 @@ def gate(options: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
                 cancel_all(service)
             return exchange(service, request, headers)
 
-        valid = Counter(exchange(service, request, {})[0] for request in requests)
-        verdicts.check("unchanged requests are answered 200 or 202", not set(valid) - {200, 202}, dict(valid))
+        answers = [exchange(service, request, {}) for request in requests]
+        wrong = [answer for answer in answers if answer[0] not in (200, 202)]
+        verdicts.check(
+            "unchanged requests are answered 200 or 202", not wrong, wrong[:2] or f"{len(requests)} of them"
+        )
         judge(f"{options.uploads} changed uploads", send_upload, range(options.uploads), verdicts)
         judge(f"{options.requests} changed requests", send_request, range(options.requests), verdicts)
         cancel_all(service)
@@ -119,8 +122,8 @@ def valid_requests(lift: str, body: dict[str, Any]) -> list[Request]:
     bodies = [
         ("/query", query | {"text": ["apple"]}), ("/query/mask", query | view | {"text": ["apple", "book"]}),
         ("/query/segment", {"lift": lift, "table": body["table"], "words": ["apple", "book"]}),
-        ("/query/export", query | {"text": ["apple"]}), ("/lift/plan", order | settings), ("/lift", order | settings),
-        ("/tradeoff", order | {"budget_s": 10}),
+        ("/query/export", {"lift": lift, "table": body["table"], "words": ["apple"]}),
+        ("/lift/plan", order | settings), ("/lift", order | settings), ("/tradeoff", order | {"budget_s": 10}),
     ]  # fmt: skip
     return [("GET", path, values, None) for path, values in reads] + [
         ("POST", path, {}, item) for path, item in bodies
@@ -187,10 +190,11 @@ def mutate_bytes(content: bytes, chance: random.Random, donors: list[bytes]) -> 
 
 
 def cancel_all(service: Service) -> None:
-    """Cancel the jobs that have not ended."""
-    for state in ("queued", "running"):
-        for record in service.get("/jobs", params={"state": state}).json().get("jobs", []):
+    """Cancel the jobs that have not ended, and wait for their ends."""
+    for record in service.get("/jobs", params={"limit": 1000}).json()["jobs"]:
+        if record["state"] not in FINAL_STATES:
             service.post(f"/jobs/{record['id']}/cancel")
+            service.wait_for(record["id"])
 
 
 if __name__ == "__main__":

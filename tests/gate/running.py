@@ -116,6 +116,13 @@ class Service(httpx.Client):
         """The living processes of this service without the HTTP process."""
         return processes(self.mark) - {self.process.pid}
 
+    def orphan_seconds(self) -> float:
+        """Seconds until the children of a server that has ended are gone; at most ten."""
+        start = time.monotonic()
+        while self.children() and time.monotonic() - start < 10:
+            time.sleep(0.05)
+        return time.monotonic() - start
+
     def scratch(self) -> list[str]:
         """Names of what lies in the folders for scratch, which are empty at rest."""
         return [path.name for name in ("tmp", "work") for path in (self.data / name).glob("*")]
