@@ -46,14 +46,14 @@ def gate(options: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
                 orphans.append(service.orphan_seconds())
                 service.start()
         states = Counter(service.wait_for(job)["state"] for job in jobs.values())
-        lost = sum(service.order(body, name) != job for name, job in jobs.items())
+        lost_count = sum(service.order(body, name) != job for name, job in jobs.items())
         unlike = sum(
             service.digest(job) != digest for job in jobs.values() if service.job(job)["state"] == "succeeded"
         )
         counts = {name: len(list_all(service, name)) for name in ("jobs", "lifts")}
         figures = f"{victims.total()} kills {dict(victims)}, {len(jobs)} jobs"
         verdicts.check("all jobs succeed", states == {"succeeded": len(jobs)}, f"{figures}, {dict(states)}")
-        verdicts.check("none is lost: each key brings its job", not lost, lost)
+        verdicts.check("none is lost: each key brings its job", not lost_count, lost_count)
         verdicts.check("none is doubled", set(counts.values()) == {len(jobs) + 1}, counts)
         verdicts.check("all have the same bits", not unlike, unlike)
         verdicts.check(

@@ -26,19 +26,19 @@ def gate(_: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
     with Service(folder / "memory", **{JOB_MEMORY: 700 * MIB}) as service:
         body = service.upload(scene(splats=300_000, views=3, width=32, channels=512))
         record = service.wait_for(service.order(body))
-        judge_failure(service, record, "memory", verdicts)
+        check_failure(service, record, "memory", verdicts)
     with Service(folder / "time", **{JOB_TIME: 1}) as service:
         record = service.wait_for(service.order(service.upload(long_scene())))
-        judge_failure(service, record, "s", verdicts)
+        check_failure(service, record, "s", verdicts)
     with Service(folder / "hang", **{SILENCE: 4, JOB_TIME: 120}) as service:
         job = service.order(service.upload(long_scene()))
         service.wait_for(job, "running")
         time.sleep(1)
-        stopped = service.children()
-        send_signal(stopped, signal.SIGSTOP)
+        hanging = service.children()
+        send_signal(hanging, signal.SIGSTOP)
         state = service.wait_for(job)["state"]
         verdicts.check("a job whose processes hang ends", state in ("succeeded", "failed"), state)
-        send_signal(stopped, signal.SIGCONT)  # what serves questions may have been among them
+        send_signal(hanging, signal.SIGCONT)  # what serves questions may have been among them
         record = service.wait_for(service.order(service.upload(small_scene())))
         verdicts.check("the next job succeeds", record["state"] == "succeeded", record["state"])
     header = struct.pack("<4sIIBBBB", b"NGSP", 3, BOMB_SPLATS, 0, 12, 0, 0)
@@ -58,7 +58,7 @@ def gate(_: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
             verdicts.check("the next upload is accepted or meets the limit itself", status in (201, 422), status)
 
 
-def judge_failure(service: Service, record: dict, word: str, verdicts: Verdicts) -> None:
+def check_failure(service: Service, record: dict, word: str, verdicts: Verdicts) -> None:
     """Judge a job that had to meet its limit."""
     problem = record["problem"] or {}
     is_failed = record["state"] == "failed" and word in problem.get("detail", "")
@@ -73,7 +73,7 @@ def judge_failure(service: Service, record: dict, word: str, verdicts: Verdicts)
 
 
 def is_computing(pid: int) -> bool:
-    """Whether a process takes processor time within a second."""
+    """Return True if a process takes processor time within a second."""
     path = Path(f"/proc/{pid}/stat")
     try:
         ticks = [path.read_text().rpartition(")")[2].split()[11:13]]

@@ -46,8 +46,8 @@ def gate(options: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
         def send_upload(number: int) -> tuple[int, str, str]:
             chance = random.Random(f"upload {options.seed} {number}")
             kind, content = contents[number % len(contents)]
-            changed = mutate_bytes(content, chance, [other for _, other in contents])
-            return exchange(service, ("PUT", f"/assets/{kind}", {}, changed), {})
+            mutated = mutate_bytes(content, chance, [other for _, other in contents])
+            return exchange(service, ("PUT", f"/assets/{kind}", {}, mutated), {})
 
         def send_request(number: int) -> tuple[int, str, str]:
             chance = random.Random(f"request {options.seed} {number}")
@@ -61,8 +61,8 @@ def gate(options: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
         verdicts.check(
             "unchanged requests are answered 200 or 202", not wrong, wrong[:2] or f"{len(requests)} of them"
         )
-        judge(f"{options.uploads} changed uploads", send_upload, range(options.uploads), verdicts)
-        judge(f"{options.requests} changed requests", send_request, range(options.requests), verdicts)
+        check_answers(f"{options.uploads} changed uploads", send_upload, range(options.uploads), verdicts)
+        check_answers(f"{options.requests} changed requests", send_request, range(options.requests), verdicts)
         cancel_all(service)
         verdicts.check("the service is ready", service.get("/readyz").status_code == 200)
         verdicts.check("nothing lies in the scratch folders", not service.scratch(), service.scratch())
@@ -70,7 +70,9 @@ def gate(options: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
         verdicts.check("the log has no traceback", not tracebacks, tracebacks)
 
 
-def judge(name: str, send: Callable[[int], tuple[int, str, str]], numbers: Iterable[int], verdicts: Verdicts) -> None:
+def check_answers(
+    name: str, send: Callable[[int], tuple[int, str, str]], numbers: Iterable[int], verdicts: Verdicts
+) -> None:
     """Send all, and judge the answers."""
     with ThreadPoolExecutor(CLIENTS) as pool:
         answers = list(pool.map(send, numbers))
@@ -78,8 +80,10 @@ def judge(name: str, send: Callable[[int], tuple[int, str, str]], numbers: Itera
     faults = [answer for answer in answers if answer[0] >= 500]
     verdicts.check(f"{name}: none is a 5xx", not faults, f"{statuses} {faults[:2]}")
     # uvicorn answers what is no HTTP by plain text
-    plain = [it for it in answers if 400 <= it[0] < 500 and "problem+json" not in it[1] and "text/plain" not in it[1]]
-    verdicts.check("their refusals are problems", not plain, plain[:2])
+    no_problems = [
+        it for it in answers if 400 <= it[0] < 500 and "problem+json" not in it[1] and "text/plain" not in it[1]
+    ]
+    verdicts.check("their refusals are problems", not no_problems, no_problems[:2])
 
 
 def exchange(service: Service, request: Request, headers: dict[str, str]) -> tuple[int, str, str]:

@@ -39,8 +39,10 @@ def gate(_: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
         verdicts.check("too large a body is 413 before it comes", set(sizes.values()) == {413}, sizes)
         before = service.get("/assets").json()
 
-        made = service.run("keys", "create", "--name", "r", "--scopes", "read", "--data", str(service.data), "--json")
-        secret = json.loads(made.stdout)["key"]
+        reader = service.run(
+            "keys", "create", "--name", "r", "--scopes", "read", "--data", str(service.data), "--json"
+        )
+        secret = json.loads(reader.stdout)["key"]
         absent = {head: status_of(service, head) for head in heads}
         verdicts.check("without a key: 401 before the body", set(absent.values()) == {401}, absent)
         writes = {head: status_of(service, head, Authorization=f"Bearer {secret}") for head in heads[:4]}

@@ -97,7 +97,7 @@ def leak(service: Service, jobs: int, verdicts: Verdicts) -> None:
 
 
 def usage(service: Service) -> dict[str, int]:
-    """What the HTTP process holds, its children, and the files of its directory."""
+    """Count what the HTTP process holds, its children, and the files of its directory."""
     root = Path(f"/proc/{service.process.pid}")
     status = dict(line.split(":", 1) for line in (root / "status").read_text().splitlines())
     return {
