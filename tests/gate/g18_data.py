@@ -35,7 +35,6 @@ def gate(options: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
         for name, change in {"gone": remove, "empty": clear, "garbage": overwrite}.items():
             refuse_database(service, folder / f"database-{name}", name, change, verdicts)
         keep_strays(service, folder / "strays", lift, digest, verdicts)
-        service.start()
 
 
 def back_up(service: Service, body: dict, folder: Path, options: argparse.Namespace, verdicts: Verdicts) -> None:
