@@ -85,11 +85,11 @@ def until(condition: Callable[[], Result | None], seconds: float = PATIENCE_SECO
 def wait_for_end(client: Client, job: str) -> dict[str, Any]:
     """Poll the job at a path until it has ended; return it."""
 
-    def ended() -> dict[str, Any] | None:
+    def final_job() -> dict[str, Any] | None:
         record = client.get(job).json()
         return record if record["state"] in FINAL_STATES else None
 
-    return until(ended)
+    return until(final_job)
 
 
 def digest_of_lift(client: Client, lift: str) -> str:
@@ -209,11 +209,11 @@ class Server:
 
     def processes(self) -> list[int]:
         """Return the ids of the server's process and of all that it started, by their environment."""
-        marked = f"{MARK}={self._mark}".encode()
+        marked_processes = f"{MARK}={self._mark}".encode()
         ids = []
         for entry in Path("/proc").iterdir():
             with contextlib.suppress(OSError, ValueError):
-                if marked in (entry / "environ").read_bytes().split(b"\0"):
+                if marked_processes in (entry / "environ").read_bytes().split(b"\0"):
                     ids.append(int(entry.name))
         return ids
 

@@ -32,7 +32,7 @@ LISTED_WORDS = """
     something stranger stray strays tell teller theirs there thing things together trouble usual walk walks what
     when which who whole whom whose why
 """
-LISTED = frozenset(LISTED_WORDS.split())
+RIDDLES = frozenset(LISTED_WORDS.split())
 
 
 def listed_places(source: str) -> Iterator[tuple[int, str]]:
@@ -52,7 +52,7 @@ def listed_places(source: str) -> Iterator[tuple[int, str]]:
 
 def is_listed(name: str) -> bool:
     """Tell whether a whole name is a listed word."""
-    return name.strip("_").lower() in LISTED
+    return name.strip("_").lower() in RIDDLES
 
 
 def main() -> int:

@@ -78,13 +78,13 @@ class RealScene:
     encoder: lc.TextEncoder | None = None
     words: tuple[str, ...] = ()  # [K], the classes
     owners: np.ndarray = field(init=False)  # [P], the class of each splat
-    counted: np.ndarray = field(init=False)  # [P] bool, splats over which accuracy is
+    counted_splats: np.ndarray = field(init=False)  # [P] bool, splats over which accuracy is
     truths: Mapping[str, np.ndarray] = field(default_factory=dict)  # held-out view -> [H, W], classes, -1 for none
 
     def __post_init__(self) -> None:
         self.splats = lc.read_splats(self.folder / "point_cloud.ply")
         self.cameras = lc.read_cameras(self.folder / "cameras.json")
-        self.counted = np.zeros(self.splats.count, bool)
+        self.counted_splats = np.zeros(self.splats.count, bool)
         if (self.folder / "truth.json").exists():
             entries = json.loads((self.folder / "truth.json").read_text())
             truth = {name: tensor.numpy() for name, tensor in load_file(self.folder / "truth.safetensors").items()}
@@ -127,8 +127,8 @@ def rounded(value: Any) -> float | None:
 def columns(real: RealScene, lift: lc.LiftResult, _: lc.Scene) -> Figures:
     """Digests of the columns of a lift, and figures that say how far they moved."""
     X, weight = lift.features, lift.total_weight
-    if not real.counted.any():  # the first lift, of all views by row-sum
-        real.counted = weight.numpy() > COUNTED_WEIGHT
+    if not real.counted_splats.any():  # the first lift, of all views by row-sum
+        real.counted_splats = weight.numpy() > COUNTED_WEIGHT
     sample = X[torch.linspace(0, len(X) - 1, SAMPLES).long()].float()
     cosines = torch.cosine_similarity(sample, sample.roll(1, dims=0), dim=1)
     figures: Figures = {
@@ -155,7 +155,7 @@ def classes(real: RealScene, lift: lc.LiftResult, _: lc.Scene) -> Figures:
         for k in range(len(real.words)):
             shared[k] += ((best == k) & (truth == k)).sum()
             union[k] += ((best == k) | (truth == k)).sum()
-    accuracy = (scores.argmax(dim=1).numpy() == real.owners)[real.counted].mean()
+    accuracy = (scores.argmax(dim=1).numpy() == real.owners)[real.counted_splats].mean()
     return {"accuracy": rounded(accuracy), "miou": rounded((shared / union).mean())}
 
 
@@ -207,7 +207,7 @@ def tree(_: RealScene, __: lc.LiftResult, scene: lc.Scene) -> Figures:
 def segmentation(real: RealScene, _: lc.LiftResult, scene: lc.Scene) -> Figures:
     """Words that are there, of the classes and of absent words, and the accuracy of the labels."""
     result = scene.segment([*real.words, *real.recorded["absent words"]], encoder=real.encoder)
-    accuracy = (result.labels == real.owners)[real.counted].mean()
+    accuracy = (result.labels == real.owners)[real.counted_splats].mean()
     words = sorted(label.word for label in result.named_words)
     return {"words": words, "accuracy": rounded(accuracy), "bits of labels": digest(result.labels)}
 
@@ -291,7 +291,7 @@ def _is_close(old: Any, new: Any, name: str) -> bool:
 
 
 def machine() -> dict[str, str]:
-    """What bits depend on."""
+    """Processor and library versions that bits depend on."""
     cpu = ""
     with suppress(OSError):
         cpu = next((line for line in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in line), "")
@@ -309,8 +309,8 @@ def json_lines(value: Any, depth: int = 6) -> str:
 
 def compare(recorded: Mapping[str, Any], figures: Figures, options: argparse.Namespace) -> int:
     """Print what moved; return the status."""
-    if (here := machine()) != recorded["machine"]:
-        print(f"Bits may move: the record was made by {recorded['machine']}, not by {here}.")
+    if (this_commit := machine()) != recorded["machine"]:
+        print(f"Bits may move: the record was made by {recorded['machine']}, not by {this_commit}.")
     counts = Counter[str]()
     for path, new in figures.items():
         if path not in recorded["figures"]:
@@ -341,8 +341,8 @@ def library_commit() -> str:
 def write(recorded: dict[str, Any], figures: Figures) -> None:
     """Add figures to the record; those of another commit or machine go."""
     facts = {"commit": library_commit(), "machine": machine()}
-    same = all(recorded[name] == value for name, value in facts.items())
-    recorded |= facts | {"figures": (recorded["figures"] if same else {}) | figures}
+    equal_bits = all(recorded[name] == value for name, value in facts.items())
+    recorded |= facts | {"figures": (recorded["figures"] if equal_bits else {}) | figures}
     RECORD.write_text(json_lines(recorded) + "\n")
 
 
@@ -375,9 +375,14 @@ def compare_seconds(options: argparse.Namespace) -> int:
         lifts = partial(lift_in_process, folder=folder.resolve(), pack=pack, preset=preset, threads=threads)
         list(map(lifts, checkouts))  # compiles kernels and reads files, not counted
         turns = np.array([list(map(lifts, checkouts)) for _ in range(options.turns)])  # [turns, 2, 2]
-        (here, there), ratios = np.median(turns[..., 0], axis=0), turns[:, 0, 0] / turns[:, 1, 0]
+        (this_commit, recorded_commit), ratios = np.median(turns[..., 0], axis=0), turns[:, 0, 0] / turns[:, 1, 0]
         peaks = turns[..., 1].max(axis=0)
-        cells = [f"{here:.2f}", f"{there:.2f}", f"{here / there:.3f}", f"{ratios.min():.3f}, {ratios.max():.3f}"]
+        cells = [
+            f"{this_commit:.2f}",
+            f"{recorded_commit:.2f}",
+            f"{this_commit / recorded_commit:.3f}",
+            f"{ratios.min():.3f}, {ratios.max():.3f}",
+        ]
         print(f"| {' | '.join([folder.name, preset, *cells, *(f'{peak:.0f}' for peak in peaks)])} |", flush=True)
     return 0
 

@@ -143,7 +143,7 @@ def without(name: str) -> bytes:
     return ply(ROWS[:, keep], [PROPERTIES[k] for k in keep])
 
 
-def renamed(before: str, after: str) -> bytes:
+def with_property_renamed(before: str, after: str) -> bytes:
     return ply(ROWS, [after if name == before else name for name in PROPERTIES])
 
 
@@ -318,7 +318,7 @@ BINARY = {
     "cameras.bin": struct.pack("<QIiQQ4d", 1, 1, 1, 64, 48, 50.0, 50.0, 32.0, 24.0),
     "images.bin": struct.pack("<QI7dI", 1, 1, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1) + b"a.png\0" + bytes(8),
 }
-MANY = struct.pack("<Q", 2**63)
+MANY_ROWS = struct.pack("<Q", 2**63)
 CAMERA_FILES = [
     ("empty", b"", "empty file"),
     ("text", b"hello", "'hello'"),
@@ -369,7 +369,7 @@ CAMERA_BOMBS = [
         lambda: zip_of_zeros(("cameras.txt", MODEL["cameras.txt"]), "images.txt", 600),
         "unzipped",
     ),
-    ("2^63 cameras", zipped({"cameras.bin": MANY, "images.bin": MANY}), "9223372036854775808"),
+    ("2^63 cameras", zipped({"cameras.bin": MANY_ROWS, "images.bin": MANY_ROWS}), "9223372036854775808"),
 ]  # fmt: skip
 
 GRID = tensor([1, 1, 2], 0, 8)

@@ -94,8 +94,8 @@ PLACES = {"object": "0", "selection": "0" * 16, "share": "0" * 12, "kind": "came
 def operations_of(client: Any) -> list[tuple[str, str, dict[str, Any]]]:
     """Return method, path template and description of each operation of the OpenAPI document."""
     paths = client.get("/openapi.json").json()["paths"]
-    operations = [(method.upper(), path, described) for path, methods in paths.items()
-                  for method, described in methods.items()]  # fmt: skip
+    operations = [(method.upper(), path, description) for path, methods in paths.items()
+                  for method, description in methods.items()]  # fmt: skip
     assert len(operations) >= 30
     return operations
 
@@ -106,12 +106,12 @@ def address_of(path: str, lift: str, asset: str) -> str:
     return re.sub(r"\{(\w+)\}", lambda place: PLACES[place[1]], path)
 
 
-def request_to(client: Any, path: str, described: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+def request_to(client: Any, path: str, description: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
     """Return the parameters and the JSON body of a request to an operation that names a lift and assets."""
     values = VALUES | values
-    names = [entry["name"] for entry in described.get("parameters", ()) if entry["in"] == "query"]
+    names = [entry["name"] for entry in description.get("parameters", ()) if entry["in"] == "query"]
     options = {"params": {name: values[name] for name in names if name in VALUES or name == "lift"}}
-    content = described.get("requestBody", {}).get("content", {})
+    content = description.get("requestBody", {}).get("content", {})
     if "application/json" in content:
         schema = content["application/json"]["schema"]
         for part in schema.get("anyOf", [schema]):

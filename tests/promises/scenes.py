@@ -67,8 +67,8 @@ def halves_and_quarters(camera: lc.Camera, rng: np.random.Generator, wrong: floa
     """Return labels [2, H, W]: halves 0 and 1 of the plane z = 0, and its quarters 2 to 5; a share is wrong."""
     x, y = plane_under_pixels(camera)
     labels = np.stack([x > 0, 2 + (x > 0) + 2 * (y > 0)]).astype(np.int32)
-    others = np.stack([rng.integers(-1, 2, x.shape), rng.choice([-1, 2, 3, 4, 5], x.shape)])
-    return np.where(rng.random(labels.shape) < wrong, others, labels).astype(np.int32)
+    other_items = np.stack([rng.integers(-1, 2, x.shape), rng.choice([-1, 2, 3, 4, 5], x.shape)])
+    return np.where(rng.random(labels.shape) < wrong, other_items, labels).astype(np.int32)
 
 
 def regions_of(camera: lc.Camera, rng: np.random.Generator, wrong: float = 0.05) -> lc.Regions:

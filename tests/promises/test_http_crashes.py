@@ -103,12 +103,12 @@ def test_job_whose_process_is_killed_goes_on_until_its_third_attempt(
 
         # What else a child does works again: checks and questions.
 
-        def answered() -> httpx.Response | None:
+        def first_answer() -> httpx.Response | None:
             reply = server.client.get("/query", params={"text": "lamp"})
             return reply if reply.status_code == 200 else None
 
-        assert until(answered).json()["count"] == 20
+        assert until(first_answer).json()["count"] == 20
         server.kill_children()
-        assert until(answered).json()["count"] == 20
+        assert until(first_answer).json()["count"] == 20
         upload(server.client, "table", tiny.table)
         assert server.is_alive()

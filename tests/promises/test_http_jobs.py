@@ -58,8 +58,8 @@ def test_order_is_a_job_at_once_and_repeated_the_same_one(
     other = order_job(client, order, "two").json()
     keyless = [order_job(client, order).json()["id"] for _ in range(2)]
     assert len({job["id"], other["id"], *keyless}) == 4
-    changed = order_job(client, order | {"settings": {"preset": "tikhonov"}}, "one")
-    assert assert_problem(changed, 422)["type"] == "/problems/key-reused"
+    changes = order_job(client, order | {"settings": {"preset": "tikhonov"}}, "one")
+    assert assert_problem(changes, 422)["type"] == "/problems/key-reused"
     assert_problem(order_job(client, order | {"budget_s": 60}, "one", route="/tradeoff"), 422)
     for identifier in (job["id"], other["id"], *keyless):
         assert client.post(f"/jobs/{identifier}/cancel").json()["state"] == "canceled"
@@ -155,10 +155,10 @@ def test_succeeded_job_tells_its_plan_its_times_and_its_lift(client: httpx.Clien
 
 
 def test_failed_job_says_why_as_a_problem(client: httpx.Client, order: dict[str, Any]) -> None:
-    elsewhere = upload(client, "features", pack({"nowhere": labels()["left"]}))
+    other_place = upload(client, "features", pack({"nowhere": labels()["left"]}))
     narrow = upload(client, "features", pack({"left": labels()["left"]}, codebook(5)))
     for body in (
-        order | {"features": [elsewhere]},
+        order | {"features": [other_place]},
         order | {"features": [*order["features"], narrow]},
         order | {"settings": {"kernel": "dbs"}},
     ):
@@ -175,7 +175,7 @@ def test_failed_job_says_why_as_a_problem(client: httpx.Client, order: dict[str,
         assert problem["type"].startswith("/problems/") and problem["status"] == 422, problem
         assert problem["argument"] and problem["expected"] and problem["got"]
         assert "/tmp" not in json.dumps(problem)
-    for asset in (narrow, elsewhere):
+    for asset in (narrow, other_place):
         assert client.delete(f"/assets/{asset}").status_code == 204
 
 
@@ -190,8 +190,8 @@ def test_job_and_lift_keep_what_the_plan_warned_of(client: httpx.Client, order: 
     job = wait_for_end(client, order_job(client, body).headers["location"])
     assert job["state"] == "succeeded", job
     assert set(warnings) <= set(job["plan"]["warnings"])
-    kept = client.get(job["links"]["lift"]).json()["diagnostics"]["warnings"]
-    assert any("no camera can see" in line for line in kept)
+    kept_state = client.get(job["links"]["lift"]).json()["diagnostics"]["warnings"]
+    assert any("no camera can see" in line for line in kept_state)
     delete_lift(client, job["id"])
     assert client.delete(f"/assets/{cameras}").status_code == 204
 
@@ -243,12 +243,12 @@ def test_tradeoff_is_judged_by_the_masks_of_its_order(
     client: httpx.Client, order: dict[str, Any], tiny: TinyScene
 ) -> None:
     masks_of_right = masks({"right": 2 - labels()["right"][0]})  # numbers of the classes below
-    judged = {
+    verdict = {
         "masks": upload(client, "masks", masks_of_right),
         "table": upload(client, "table", replace(tiny).table),
         "classes": ["lamp", "book", "apple"],
     }
-    body = order | {"settings": {"diagnostic_rays": 0, "preset": "tikhonov"}, "budget_s": 10, "labels": judged}
+    body = order | {"settings": {"diagnostic_rays": 0, "preset": "tikhonov"}, "budget_s": 10, "labels": verdict}
     first, second = (order_job(client, body, "judged", route="/tradeoff") for _ in range(2))
     assert (first.status_code, second.status_code, first.json()["kind"]) == (202, 200, "tradeoff")
     job = wait_for_end(client, first.headers["location"])
@@ -257,14 +257,14 @@ def test_tradeoff_is_judged_by_the_masks_of_its_order(
     exact = tradeoff["runs"][0]
     assert exact["settings"]["preset"] == "tikhonov" and exact["mask_iou"] > 0.5 and tradeoff["seconds"] > 0
     assert tradeoff["choice"]["name"] in {run["name"] for run in tradeoff["runs"]}
-    assert tradeoff["labels"] == judged and "/tmp" not in json.dumps(tradeoff)
+    assert tradeoff["labels"] == verdict and "/tmp" not in json.dumps(tradeoff)
     assert client.get(job["links"]["chart"]).content.startswith(b"\x89PNG")
     assert job["id"] not in {entry["id"] for entry in client.get("/lifts").json()["lifts"]}
     assert_problem(client.delete(job["links"]["self"]), 409)
     assert client.delete(job["links"]["self"], params={"with_tradeoff": True}).status_code == 204
     for link in job["links"].values():
         assert_problem(client.get(link), 404)
-    for asset in (judged["masks"], judged["table"]):
+    for asset in (verdict["masks"], verdict["table"]):
         assert client.delete(f"/assets/{asset}").status_code == 204
 
 

@@ -20,7 +20,7 @@ from tests.tiny_scene import TinyScene
 from .over_http import NO_ASSET, NO_ID, address_of, assert_problem, bearer, operations_of, request_to, upload_scene
 
 OPEN = {"/healthz", "/readyz", "/version", "/openapi.json", "/docs", "/"}
-OWN = {"/key", "/metrics"}  # of whoever asks, and of operators
+OWN_ROUTES = {"/key", "/metrics"}  # of whoever asks, and of operators
 IDS = re.compile("sha256:[0-9a-f]{64}|[0-9a-f]{32}")
 
 
@@ -81,7 +81,7 @@ def test_every_operation_wants_a_key(keyed: Keyed) -> None:
 def test_every_operation_wants_its_scope(keyed: Keyed) -> None:
     refusals = {"reader": 0, "writer": 0}
     for method, path, _ in keyed.operations():
-        if path in OWN:
+        if path in OWN_ROUTES:
             continue
         reads = method == "GET" or path.startswith(("/query", "/render"))
         other = "writer" if reads else "reader"
@@ -95,20 +95,20 @@ def test_every_operation_wants_its_scope(keyed: Keyed) -> None:
 def named_requests(keyed: Keyed, lift: str, asset: str) -> Iterator[tuple[str, str, str, dict[str, Any]]]:
     """Yield method, template, path and options of a request to each operation that names a lift, job or asset."""
     values = {"lift": lift, "splats": asset, "cameras": asset, "features": [asset]}
-    for method, path, described in keyed.operations():
-        options = request_to(keyed.server.client, path, described, values)
-        named = "{" in path or "lift" in options["params"] or {"lift", "splats"} & options.get("json", {}).keys()
-        if named and method != "PUT":
+    for method, path, description in keyed.operations():
+        options = request_to(keyed.server.client, path, description, values)
+        names = "{" in path or "lift" in options["params"] or {"lift", "splats"} & options.get("json", {}).keys()
+        if names and method != "PUT":
             yield method, path, address_of(path, lift, asset), options
 
 
 def test_what_is_anothers_is_absent(keyed: Keyed) -> None:
-    own = list(named_requests(keyed, keyed.lifts[0], keyed.order["splats"]))
+    own_items = list(named_requests(keyed, keyed.lifts[0], keyed.order["splats"]))
     absent = list(named_requests(keyed, NO_ID, NO_ASSET))
-    assert len(own) == len(absent) >= 25
-    for (method, path, address, options), (_, _, nowhere, nothing) in zip(own, absent, strict=True):
+    assert len(own_items) == len(absent) >= 25
+    for (method, path, address, options), (_, _, missing_places, no_items) in zip(own_items, absent, strict=True):
         reply = keyed.ask("bob", method, address, headers={"If-None-Match": "*"}, **options)
-        other = keyed.ask("bob", method, nowhere, **nothing)
+        other = keyed.ask("bob", method, missing_places, **no_items)
         for answer in (reply, other):
             assert_problem(answer, 404)
         texts = [IDS.sub("ID", json.dumps(answer.json() | {"request_id": None})) for answer in (reply, other)]
@@ -143,27 +143,27 @@ def test_share_reads_and_asks_its_lift_and_nothing_else(keyed: Keyed) -> None:
     share = reply.json()
     assert reply.status_code == 201 and share["expires"] == pytest.approx(time.time() + 3600, abs=600)
     guest = bearer(share["key"])
-    own, other = (list(named_requests(keyed, lift, keyed.order["splats"])) for lift in keyed.lifts)
-    allowed = 0
-    for (method, path, address, options), (_, _, elsewhere, others) in zip(own, other, strict=True):
-        reply, refused = (
+    own_items, other = (list(named_requests(keyed, lift, keyed.order["splats"])) for lift in keyed.lifts)
+    allowed_statuses = 0
+    for (method, path, address, options), (_, _, other_place, other_items) in zip(own_items, other, strict=True):
+        reply, refused_replies = (
             keyed.server.client.request(method, at, headers=guest, **fields)
-            for at, fields in ((address, options), (elsewhere, others))
+            for at, fields in ((address, options), (other_place, other_items))
         )
-        assert refused.status_code in (403, 404), f"{method} {path}"
+        assert refused_replies.status_code in (403, 404), f"{method} {path}"
         reads = method == "GET" or path.startswith(("/query", "/render"))
         if path.startswith(("/lifts", "/query", "/render")) and reads and "/shares" not in path:
             assert reply.status_code == keyed.ask("alice", method, address, **options).status_code, f"{method} {path}"
-            allowed += reply.status_code == 200
+            allowed_statuses += reply.status_code == 200
         else:
             assert reply.status_code in (403, 404), f"{method} {path}"
-    assert allowed >= 15
+    assert allowed_statuses >= 15
     assert [entry["id"] for entry in keyed.server.client.get("/lifts", headers=guest).json()["lifts"]] == [
         keyed.lifts[0]
     ]
     assert keyed.server.client.put("/assets/cameras", content=b"{}", headers=guest).status_code == 403
-    listed = keyed.ask("alice", "GET", shares)
-    assert [entry["id"] for entry in listed.json()["shares"]] == [share["id"]] and share["key"] not in listed.text
+    listing = keyed.ask("alice", "GET", shares)
+    assert [entry["id"] for entry in listing.json()["shares"]] == [share["id"]] and share["key"] not in listing.text
     assert keyed.ask("bob", "DELETE", share["links"]["self"]).status_code == 404
     assert keyed.server.client.get(f"/lifts/{keyed.lifts[0]}", headers=guest).status_code == 200
     assert keyed.ask("alice", "DELETE", share["links"]["self"]).status_code == 204
@@ -176,16 +176,16 @@ def test_host_of_the_settings_is_taken(keyed: Keyed) -> None:
 
 
 def test_key_says_whose_it_is_and_what_it_may(keyed: Keyed) -> None:
-    own = keyed.ask("reader", "GET", "/key").json()
-    assert (own["name"], own["scopes"], own["expires"]) == ("reader", ["read"], None)
+    own_items = keyed.ask("reader", "GET", "/key").json()
+    assert (own_items["name"], own_items["scopes"], own_items["expires"]) == ("reader", ["read"], None)
 
 
 def test_keys_are_listed_without_secrets_and_end_at_once(keyed: Keyed) -> None:
     secret = create_key(keyed.server, "--name", "for a while", "--scopes", "read", "--expires", "12h")
     text = run_command("keys", "list", "--json", data=keyed.server.data)
-    listed = {entry["name"]: entry for entry in json.loads(text)["keys"]}
-    assert {"alice", "bob", "reader", "writer", "for a while"} <= listed.keys()
-    assert listed["for a while"]["expires"] == pytest.approx(time.time() + 12 * 3600, abs=600)
+    listing = {entry["name"]: entry for entry in json.loads(text)["keys"]}
+    assert {"alice", "bob", "reader", "writer", "for a while"} <= listing.keys()
+    assert listing["for a while"]["expires"] == pytest.approx(time.time() + 12 * 3600, abs=600)
     assert not any(value in text for value in (secret["key"], *keyed.secrets.values()))
     for path in keyed.server.data.rglob("*"):
         if path.is_file() and "sqlite" in path.name:

@@ -140,13 +140,13 @@ def test_photos_are_shown_as_they_were_uploaded(client: httpx.Client, lift: dict
 
 
 def test_objects_are_there_without_words_and_words_name_them(client: httpx.Client, lift: dict[str, Any]) -> None:
-    listed = client.get(lift["links"]["objects"]).json()
-    assert listed["count"] == 3 and [entry["splats"] for entry in listed["objects"]] == [SPLATS_A_CLUSTER] * 3
-    assert {entry["name"] for entry in listed["objects"]} == {None}
+    listing = client.get(lift["links"]["objects"]).json()
+    assert listing["count"] == 3 and [entry["splats"] for entry in listing["objects"]] == [SPLATS_A_CLUSTER] * 3
+    assert {entry["name"] for entry in listing["objects"]} == {None}
     tree = client.get(lift["links"]["tree"]).json()
-    assert [node["id"] for node in tree["nodes"]][:3] == [entry["id"] for entry in listed["objects"]]
-    named = client.get(lift["links"]["objects"], params={"encoder": "default"}).json()["objects"]
-    for entry in named:
+    assert [node["id"] for node in tree["nodes"]][:3] == [entry["id"] for entry in listing["objects"]]
+    names = client.get(lift["links"]["objects"], params={"encoder": "default"}).json()["objects"]
+    for entry in names:
         middle = entry["centre"][0]
         assert entry["name"] == WORDS[round(middle / 1.2) + 1] and entry["score"] > 0.9
         assert entry["box"]["low"][0] < middle < entry["box"]["high"][0]
@@ -172,9 +172,9 @@ def test_sizes_are_in_metres_once_a_unit_has_a_length(client: httpx.Client, lift
     before = [entry["size"] for entry in client.get(objects).json()["objects"]]
     world = {"up": [0, -1, 0], "metres_per_unit": 0.25}
     assert client.patch(path, json={"world": world}).json()["world"] == world
-    listed = client.get(objects).json()
-    assert (listed["unit"], listed["world"]) == ("metres", world)
-    np.testing.assert_allclose([entry["size"] for entry in listed["objects"]], np.array(before) / 4)
+    listing = client.get(objects).json()
+    assert (listing["unit"], listing["world"]) == ("metres", world)
+    np.testing.assert_allclose([entry["size"] for entry in listing["objects"]], np.array(before) / 4)
     for wrong in ({"up": [0, 0, 0]}, {"metres_per_unit": 0}, {"down": [0, 1, 0]}):
         assert_problem(client.patch(path, json={"world": wrong}), 422)
     client.patch(path, json={"world": None})

@@ -38,10 +38,10 @@ def test_metrics_count_jobs_and_requests(client: httpx.Client, lift: dict[str, A
 def test_openapi_document_describes_every_operation(client: httpx.Client) -> None:
     document = client.get("/openapi.json").json()
     names = []
-    for method, path, described in operations_of(client):
-        names.append(described["operationId"])
-        assert " " in described["summary"], f"{method} {path}"
-        assert set(described["responses"]) & {"200", "201", "202", "204"}, f"{method} {path}"
+    for method, path, description in operations_of(client):
+        names.append(description["operationId"])
+        assert " " in description["summary"], f"{method} {path}"
+        assert set(description["responses"]) & {"200", "201", "202", "204"}, f"{method} {path}"
     assert len(set(names)) == len(names) and all(re.fullmatch("[a-z]+(_[a-z]+)*", name) for name in names)
     for reference in set(re.findall(r'"\$ref": ?"#/([^"]+)"', json.dumps(document))):
         node = document
@@ -88,8 +88,8 @@ def test_page_of_another_site_changes_nothing(
         assert_problem(reply, 403)
     assert client.get("/jobs").json() == before
     assert "access-control-allow-origin" not in client.get("/lifts", headers=headers).headers
-    own = {"Origin": str(client.base_url).rstrip("/")}
-    assert client.put("/assets/splats", content=tiny.splats, headers=own).status_code == 200
+    own_items = {"Origin": str(client.base_url).rstrip("/")}
+    assert client.put("/assets/splats", content=tiny.splats, headers=own_items).status_code == 200
 
 
 def test_answers_carry_safe_headers_and_request_ids(client: httpx.Client) -> None:

@@ -116,8 +116,8 @@ def test_get_and_post_are_one_question(client: httpx.Client, lift: dict[str, Any
 
 
 def test_negatives_and_thresholds_change_the_selection(client: httpx.Client, lift: dict[str, Any]) -> None:
-    both = ask(client, lift, text="apple", like="middle:26,12", threshold=0.5)
-    assert both["count"] > 1.5 * SPLATS_A_CLUSTER
+    pair = ask(client, lift, text="apple", like="middle:26,12", threshold=0.5)
+    assert pair["count"] > 1.5 * SPLATS_A_CLUSTER
     assert is_of(ask(client, lift, text="apple", negatives="lamp", threshold=0.5), "apple")
     counts = [ask(client, lift, text="lamp", threshold=value)["count"] for value in (-1, 0.5, 1.0)]
     assert counts[0] == 60 and counts == sorted(counts, reverse=True)
@@ -150,7 +150,7 @@ def test_camera_of_a_body_sees_what_a_view_sees(client: httpx.Client, lift: dict
     body = {"lift": lift["id"], "text": ["lamp"]}
     for path in ("/query/mask", "/query/attention"):
         by_camera, by_view = (
-            client.post(path, json=body | seen) for seen in ({"camera": camera}, {"view": "middle"})
+            client.post(path, json=body | view_reply) for view_reply in ({"camera": camera}, {"view": "middle"})
         )
         assert (picture(by_camera.content) == picture(by_view.content)).all()
 

@@ -55,17 +55,17 @@ def test_selection_is_begun_corrected_and_undone(client: httpx.Client, route: st
     selection = begin(client, route, **LAMP)
     lamp = rows_of(client, selection)
     assert selection["count"] == len(lamp) and set(lamp) <= set(range(40, 60)) and selection["box"]
-    added = edit_of(client, selection, operation="add", area="middle:box:0,0,10,24", through=True)
-    assert rows_of(client, added) == [*range(SPLATS_A_CLUSTER), *lamp] and added["count"] == 20 + len(lamp)
+    addition = edit_of(client, selection, operation="add", area="middle:box:0,0,10,24", through=True)
+    assert rows_of(client, addition) == [*range(SPLATS_A_CLUSTER), *lamp] and addition["count"] == 20 + len(lamp)
     back = client.patch(selection["links"]["self"], json={"step": 0}).json()
     assert (back["step"], rows_of(client, back)) == (0, lamp)
     forward = client.patch(selection["links"]["self"], json={"step": 1}).json()
-    assert forward["count"] == added["count"]
+    assert forward["count"] == addition["count"]
     client.patch(selection["links"]["self"], json={"step": 0})
-    removed = edit_of(client, selection, operation="remove", query={"like": ["splat:59"], "threshold": 0.5})
-    assert (removed["step"], removed["count"]) == (1, 0)  # what was undone is forgotten
-    renamed = client.patch(selection["links"]["self"], json={"name": "the lamp"}).json()
-    assert client.get(route).json()["selections"][0]["name"] == renamed["name"] == "the lamp"
+    removal = edit_of(client, selection, operation="remove", query={"like": ["splat:59"], "threshold": 0.5})
+    assert (removal["step"], removal["count"]) == (1, 0)  # what was undone is forgotten
+    other_name = client.patch(selection["links"]["self"], json={"name": "the lamp"}).json()
+    assert client.get(route).json()["selections"][0]["name"] == other_name["name"] == "the lamp"
 
 
 def test_selection_of_bits_is_asked_exported_and_an_example(

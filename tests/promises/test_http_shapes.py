@@ -66,8 +66,8 @@ def test_odd_parts_of_paths_are_refused(fast: httpx.Client, operations: Operatio
 def test_odd_parameters_are_refused_or_ignored(
     fast: httpx.Client, operations: Operations, lift: dict[str, Any]
 ) -> None:
-    for method, path, described in operations:
-        names = [entry["name"] for entry in described.get("parameters", ()) if entry["in"] == "query"]
+    for method, path, description in operations:
+        names = [entry["name"] for entry in description.get("parameters", ()) if entry["in"] == "query"]
         if method == "GET":
             address = address_of(path, lift["id"], lift["splats"])
             for name in [*names, "unknown"]:
@@ -77,8 +77,8 @@ def test_odd_parameters_are_refused_or_ignored(
 
 def test_odd_bodies_are_refused(fast: httpx.Client, operations: Operations, lift: dict[str, Any]) -> None:
     before = fast.get(lift["links"]["self"]).json()
-    for method, path, described in operations:
-        if "application/json" in described.get("requestBody", {}).get("content", {}):
+    for method, path, description in operations:
+        if "application/json" in description.get("requestBody", {}).get("content", {}):
             address = address_of(path, lift["id"], lift["splats"])
             for body in ODD_BODIES:
                 reply = fast.request(method, address, content=body, headers=JSON)
@@ -91,8 +91,8 @@ def test_odd_bodies_are_refused(fast: httpx.Client, operations: Operations, lift
 
 def test_fields_of_wrong_types_are_named(fast: httpx.Client, operations: Operations, lift: dict[str, Any]) -> None:
     values = {"lift": lift["id"], "splats": lift["splats"], "cameras": lift["cameras"], "features": lift["features"]}
-    for method, path, described in operations:
-        fields = request_to(fast, path, described, values).get("json", {})
+    for method, path, description in operations:
+        fields = request_to(fast, path, description, values).get("json", {})
         for name in fields:
             for wrong in ({"a": 1}, [[{}]], -1e300, True):
                 address = address_of(path, lift["id"], lift["splats"])
@@ -120,14 +120,14 @@ def test_other_methods_are_405_and_other_paths_404(fast: httpx.Client, operation
     methods: dict[str, set[str]] = {}
     for method, path, _ in operations:
         methods.setdefault(path, set()).add(method)
-    for path, allowed in methods.items():
-        for method in {"GET", "POST", "PUT", "PATCH", "DELETE", "BREW"} - allowed:
+    for path, allowed_statuses in methods.items():
+        for method in {"GET", "POST", "PUT", "PATCH", "DELETE", "BREW"} - allowed_statuses:
             reply = fast.request(method, address_of(path, NO_ID, NO_ASSET))
             if path.startswith("/assets/{") and path.count("/") == 2:
                 require_no_fault(reply, method, path)  # PUT takes a kind where the others take an id
             else:
                 assert_problem(reply, 405)
-                assert allowed <= set(reply.headers["allow"].split(", ")), (method, path)
+                assert allowed_statuses <= set(reply.headers["allow"].split(", ")), (method, path)
     for path in ("/nowhere", "/jobs/a/b/c", "/Healthz", "/%00", "/query/nothing", "/.env", "/web/../../etc/passwd"):
         assert_problem(fast.get(path), 404)
 
@@ -138,8 +138,8 @@ def test_other_methods_are_405_and_other_paths_404(fast: httpx.Client, operation
 def test_odd_media_types_are_refused_or_read(
     fast: httpx.Client, operations: Operations, content_type: str, lift: dict[str, Any]
 ) -> None:
-    for method, path, described in operations:
-        if "requestBody" in described:
+    for method, path, description in operations:
+        if "requestBody" in description:
             address = address_of(path, lift["id"], lift["splats"])
             reply = fast.request(method, address, content=b"--x--", headers={"Content-Type": content_type})
             require_no_fault(reply, method, address)

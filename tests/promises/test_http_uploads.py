@@ -56,9 +56,9 @@ def test_file_of_each_kind_is_stored_under_its_digest(client: httpx.Client, kind
     assert asset["id"] == f"sha256:{hashlib.sha256(content).hexdigest()}"
     assert (asset["kind"], asset["bytes"], asset["counts"][name]) == (kind, len(content), count)
     assert isinstance(asset["warnings"], list) and asset["created"] > 0
-    described = client.get(reply.headers["location"]).json()
-    assert {**described, "counts": 0} == {**asset, "counts": 0}
-    assert described["id"] in {entry["id"] for entry in client.get("/assets").json()["assets"]}
+    description = client.get(reply.headers["location"]).json()
+    assert {**description, "counts": 0} == {**asset, "counts": 0}
+    assert description["id"] in {entry["id"] for entry in client.get("/assets").json()["assets"]}
     assert client.get(asset["links"]["content"]).content == content
     delete(client, asset["id"])
     for path in (reply.headers["location"], asset["links"]["content"]):
@@ -169,8 +169,12 @@ def test_part_of_a_file_is_the_bytes_of_its_range(
     first, last, _ = RANGES[header].indices(len(tiny.splats))
     assert (reply.status_code, reply.content) == (206, tiny.splats[first:last])
     assert reply.headers["content-range"] == f"bytes {first}-{last - 1}/{len(tiny.splats)}"
-    whole = client.get(path)
-    assert (whole.status_code, whole.content, whole.headers["accept-ranges"]) == (200, tiny.splats, "bytes")
+    complete_content = client.get(path)
+    assert (complete_content.status_code, complete_content.content, complete_content.headers["accept-ranges"]) == (
+        200,
+        tiny.splats,
+        "bytes",
+    )
     other = client.get(path, headers={"Range": header, "If-Range": '"another"'})
     assert (other.status_code, other.content) == (200, tiny.splats)
 
@@ -190,8 +194,8 @@ def test_asset_that_a_lift_needs_stays(client: httpx.Client, lift: dict[str, Any
 
 def test_list_of_assets_comes_in_pages(client: httpx.Client, order: dict[str, Any]) -> None:
     del order
-    own = upload(client, "table", SCENE.table)
-    everything = client.get("/assets").json()
+    own_items = upload(client, "table", SCENE.table)
+    all_items = client.get("/assets").json()
     entries, parameters = [], {"limit": 2}
     while True:
         page = client.get("/assets", params=parameters).json()
@@ -200,6 +204,6 @@ def test_list_of_assets_comes_in_pages(client: httpx.Client, order: dict[str, An
         if page["next"] is None:
             break
         parameters["cursor"] = page["next"]
-    assert entries == everything["assets"] and entries[0]["id"] == own  # newest first
-    delete(client, own)
+    assert entries == all_items["assets"] and entries[0]["id"] == own_items  # newest first
+    delete(client, own_items)
     assert_problem(client.get(f"/assets/{NO_ASSET}"), 404)

@@ -53,8 +53,8 @@ ROWS: list[dict[str, Any]] = [
 
 def questions_with(name: str) -> st.SearchStrategy[dict[str, Any]]:
     """Return questions that have a field, and some of the others."""
-    others = {other: values for other, values in FIELDS.items() if other != name}
-    return st.fixed_dictionaries({name: FIELDS[name]}, optional={**others, "top": st.integers(0, 9)})
+    other_items = {other: values for other, values in FIELDS.items() if other != name}
+    return st.fixed_dictionaries({name: FIELDS[name]}, optional={**other_items, "top": st.integers(0, 9)})
 
 
 def document_of(*models: Any) -> dict[str, Any]:
@@ -110,7 +110,7 @@ class Interfaces:
         assert status in (0, cli.BAD_INPUT)
         return json.loads(output.getvalue()) if status == 0 else None
 
-    def written(self, name: str, option: str, file: str, *words: object) -> bytes:
+    def written_file(self, name: str, option: str, file: str, *words: object) -> bytes:
         """Return the file that an option of a command writes."""
         path = self.folder / file
         assert self.command(name, *words, option, path) is not None
@@ -150,9 +150,9 @@ def assert_equal_answers(interfaces: Interfaces, fields: dict[str, Any]) -> None
     """Ask by all four ways, and compare the answers with their objects; or all four refuse."""
     answer = interfaces.ask(fields)
     expected = None if answer is None else document_of(answer, interfaces.scene.objects(answer))
-    asked = {name: value for name, value in fields.items() if name != "top"}
+    question = {name: value for name, value in fields.items() if name != "top"}
     for send in (interfaces.get, interfaces.post):
-        replies = [send("/query", **fields), send("/query/objects", **asked)]
+        replies = [send("/query", **fields), send("/query/objects", **question)]
         assert {reply.status_code for reply in replies} <= ({404, 422} if expected is None else {200})
         if expected is not None:
             document = {name: value for reply in replies for name, value in reply.json().items()}
@@ -185,14 +185,14 @@ def test_any_fields_of_a_question_have_the_same_answer(interfaces: Interfaces, f
 def test_scores_and_selections_are_the_same_arrays(interfaces: Interfaces, fields: dict[str, Any]) -> None:
     answer = interfaces.ask(fields)
     assert answer is not None
-    words, asked = (
+    words, question = (
         [*words_of(fields), *encoder_of(interfaces, fields)],
         {k: v for k, v in fields.items() if k != "top"},
     )
-    scores = [np.load(io.BytesIO(interfaces.written("query", "--scores", "scores.npy", *words)))]
+    scores = [np.load(io.BytesIO(interfaces.written_file("query", "--scores", "scores.npy", *words)))]
     for send in (interfaces.get, interfaces.post):
-        scores.append(np.load(io.BytesIO(send("/query/scores", **asked).content)))
-        selected = np.load(io.BytesIO(send("/query/selection", **asked).content))
+        scores.append(np.load(io.BytesIO(send("/query/scores", **question).content)))
+        selected = np.load(io.BytesIO(send("/query/selection", **question).content))
         assert selected.dtype == np.bool_ and np.array_equal(selected, answer.selected)
     assert all(array.dtype == np.float32 and np.array_equal(array, answer.scores) for array in scores)
     assert 0 < answer.count < len(answer.scores)
@@ -201,7 +201,7 @@ def test_scores_and_selections_are_the_same_arrays(interfaces: Interfaces, field
 @pytest.mark.parametrize("fields", [ROWS[1], ROWS[4]], ids=["words", "click"])
 def test_masks_and_attention_of_a_view_are_the_same_pictures(interfaces: Interfaces, fields: dict[str, Any]) -> None:
     answer = interfaces.ask(fields)
-    words, asked = (
+    words, question = (
         [*words_of(fields), *encoder_of(interfaces, fields)],
         {k: v for k, v in fields.items() if k != "top"},
     )
@@ -210,9 +210,9 @@ def test_masks_and_attention_of_a_view_are_the_same_pictures(interfaces: Interfa
         for view in ("left", "right"):
             pictures = [interfaces.exported("picture.png", answer, kind, view=view)]
             pictures += [
-                send(f"/query/{kind}", view=view, **asked).content for send in (interfaces.get, interfaces.post)
+                send(f"/query/{kind}", view=view, **question).content for send in (interfaces.get, interfaces.post)
             ]
-            pictures.append(interfaces.written("query", f"--{kind}", "picture.png", *words, "--view", view))
+            pictures.append(interfaces.written_file("query", f"--{kind}", "picture.png", *words, "--view", view))
             assert all(np.array_equal(pixels_of(picture), pixels_of(pictures[0])) for picture in pictures)
             views.append(pixels_of(pictures[0]))
         assert not np.array_equal(*views[-2:])
@@ -221,19 +221,32 @@ def test_masks_and_attention_of_a_view_are_the_same_pictures(interfaces: Interfa
 
 def test_a_camera_of_no_file_sees_the_same_everywhere(interfaces: Interfaces) -> None:
     camera = lc.read_cameras(interfaces.files["cameras"])["middle"]
-    moved = lc.Camera(np.eye(4) @ camera.viewmat, camera.K * [[2], [2], [1]], 2 * camera.width, 2 * camera.height)
-    body = {"width": moved.width, "height": moved.height, "fx": moved.fx, "viewmat": moved.viewmat.tolist()}
-    frame = {"w": moved.width, "h": moved.height, "fl_x": moved.fx, "fl_y": moved.fy, "file_path": "mine.png"}
-    turned = np.linalg.inv(moved.viewmat) @ np.diag([1.0, -1, -1, 1])
+    moved_splats = lc.Camera(
+        np.eye(4) @ camera.viewmat, camera.K * [[2], [2], [1]], 2 * camera.width, 2 * camera.height
+    )
+    body = {
+        "width": moved_splats.width,
+        "height": moved_splats.height,
+        "fx": moved_splats.fx,
+        "viewmat": moved_splats.viewmat.tolist(),
+    }
+    frame = {
+        "w": moved_splats.width,
+        "h": moved_splats.height,
+        "fl_x": moved_splats.fx,
+        "fl_y": moved_splats.fy,
+        "file_path": "mine.png",
+    }
+    turned_camera = np.linalg.inv(moved_splats.viewmat) @ np.diag([1.0, -1, -1, 1])
     (interfaces.folder / "mine.json").write_text(
-        json.dumps({"frames": [frame | {"transform_matrix": turned.tolist()}]})
+        json.dumps({"frames": [frame | {"transform_matrix": turned_camera.tolist()}]})
     )
     answer = interfaces.ask({"like": ["splat:0"]})
     assert answer is not None
-    expected = interfaces.scene.mask(answer, moved)
+    expected = interfaces.scene.mask(answer, moved_splats)
     over_http = interfaces.post("/query/mask", like=["splat:0"], camera=body)
     options = ("--like", "splat:0", "--camera", interfaces.folder / "mine.json")
-    for content in (over_http.content, interfaces.written("query", "--mask", "mine.png", *options)):
+    for content in (over_http.content, interfaces.written_file("query", "--mask", "mine.png", *options)):
         assert np.array_equal(pixels_of(content) > 0, expected)
     assert expected.shape == (2 * HEIGHT, 64) and 0 < expected.mean() < 0.5
 
@@ -250,7 +263,7 @@ def test_renders_of_each_channel_are_the_same_pictures(interfaces: Interfaces, c
     over_http = [
         send("/render", view="middle", channel=channel).content for send in (interfaces.get, interfaces.post)
     ]
-    for content in (*over_http, interfaces.written("render", "-o", "render.png", *options)):
+    for content in (*over_http, interfaces.written_file("render", "-o", "render.png", *options)):
         assert np.array_equal(pixels_of(content), picture)
     if channel != "depth":
         assert np.array_equal(picture, interfaces.scene.render("middle", channel))
@@ -261,7 +274,7 @@ def test_splats_of_an_answer_are_the_same_files(interfaces: Interfaces) -> None:
     answer, words = interfaces.ask(fields), [*words_of(fields), *encoder_of(interfaces, fields)]
     for what, option, kind in (("object", "--object", "object"), ("scores", "--coloured", "coloured")):
         expected = interfaces.exported("out.ply", answer, kind)
-        assert interfaces.written("query", option, "out.ply", *words) == expected
+        assert interfaces.written_file("query", option, "out.ply", *words) == expected
         for send in (interfaces.get, interfaces.post):
             path = "/query/splats" if send == interfaces.get else f"/query/splats?what={what}"
             parameters = fields | ({"what": what} if send == interfaces.get else {})
@@ -281,19 +294,19 @@ def test_objects_and_their_tree_are_the_same_lists(interfaces: Interfaces) -> No
     page = interfaces.of_lift("objects", table=interfaces.table).json()["objects"]
     output = interfaces.command("objects", "--table", interfaces.files["table"])
     assert output is not None
-    for listed in (page, output["answer"]["objects"]):
+    for listing in (page, output["answer"]["objects"]):
         nodes = [
             {name: node[name] for name in entry if name in node}
-            for entry, node in zip(listed, expected["nodes"], strict=True)
+            for entry, node in zip(listing, expected["nodes"], strict=True)
         ]
-        assert [{name: entry[name] for name in node} for entry, node in zip(listed, nodes, strict=True)] == nodes
+        assert [{name: entry[name] for name in node} for entry, node in zip(listing, nodes, strict=True)] == nodes
         assert {"id", "name", "splats", "box", "views"} <= set(nodes[0])
 
 
 def test_splats_of_an_object_are_the_same_file(interfaces: Interfaces) -> None:
     expected = interfaces.exported("object.ply", 1)
     assert interfaces.of_lift("objects/1/splats").content == expected
-    assert interfaces.written("export", "-o", "object.ply", "--object", 1) == expected
+    assert interfaces.written_file("export", "-o", "object.ply", "--object", 1) == expected
     assert len(lc.read_splats(interfaces.folder / "object.ply").means) == interfaces.scene.members(1).sum() > 0
 
 
@@ -309,11 +322,11 @@ def test_labels_of_many_words_are_the_same(interfaces: Interfaces, words: list[s
     output = interfaces.command("segment", *options)
     assert output is not None and output["answer"] == expected
     labels = [interfaces.post("/query/segment/labels", **body).content]
-    labels.append(interfaces.written("segment", "--splat-labels", "labels.npy", *options))
+    labels.append(interfaces.written_file("segment", "--splat-labels", "labels.npy", *options))
     assert all(np.array_equal(np.load(io.BytesIO(content)), segmentation.values) for content in labels)
     assert len(set(segmentation.values.tolist())) >= len(words)
     maps = [interfaces.post("/query/segment/map", view="left", **body).content]
-    maps.append(interfaces.written("segment", "--labels", "map.png", *options, "--view", "left"))
+    maps.append(interfaces.written_file("segment", "--labels", "map.png", *options, "--view", "left"))
     maps.append(interfaces.exported("map.png", segmentation, "labels", view="left"))
     assert all(np.array_equal(pixels_of(content), pixels_of(maps[0])) for content in maps)
 
@@ -356,7 +369,7 @@ def test_exports_with_labels_are_those_of_the_library(interfaces: Interfaces, so
     }[source]
     expected = interfaces.exported(f"out{suffix}", labelled(), "masks" if suffix == ".json" else "labelled")
     table = ("--table", interfaces.files["table"])
-    assert interfaces.written("export", "-o", f"out{suffix}", *options, *table) == expected
+    assert interfaces.written_file("export", "-o", f"out{suffix}", *options, *table) == expected
     if suffix == ".json":
         assert {Path(image["file_name"]).stem for image in json.loads(expected)["images"]} == set(VIEWS)
     else:
@@ -366,4 +379,4 @@ def test_exports_with_labels_are_those_of_the_library(interfaces: Interfaces, so
 def test_splats_for_a_viewer_are_the_same_file(interfaces: Interfaces) -> None:
     expected = interfaces.exported("viewer.splat", None, "splats")
     assert interfaces.of_lift("splats").content == expected
-    assert interfaces.written("export", "-o", "viewer.splat") == expected
+    assert interfaces.written_file("export", "-o", "viewer.splat") == expected

@@ -133,7 +133,7 @@ def test_several_blocks_of_splats_and_views_change_no_bit() -> None:
 
 def test_checkpoint_serves_the_same_geometry_and_features_alone(regions: RandomScene, tmp_path: Path) -> None:
     """A folder of another lift's weights never changes a result, whatever differs between the two."""
-    moved = replace(regions, splats=replace(regions.splats, means=regions.splats.means + 1e-3))
+    moved_splats = replace(regions, splats=replace(regions.splats, means=regions.splats.means + 1e-3))
     relabelled = dict(regions.views)
     first = regions.views["v0"]
     assert isinstance(first, lc.Regions)
@@ -145,7 +145,7 @@ def test_checkpoint_serves_the_same_geometry_and_features_alone(regions: RandomS
     }
     lift(regions, checkpoint=lc.Checkpoint(tmp_path, seconds=0))
     for scene, settings in (
-        (moved, {}),
+        (moved_splats, {}),
         (replace(regions, views=relabelled), {}),
         (replace(regions, views=other_features), {}),
         (regions, {"preset": "tikhonov"}),

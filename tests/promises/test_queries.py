@@ -105,8 +105,8 @@ def test_splats_nearer_to_another_word_are_left_to_it(tmp_path: Path) -> None:
     words = write_table(tmp_path / "w.safetensors", ["one", "two", "three", "first"], np.eye(8)[[0, 1, 2, 0]])
     answer = scene_with(rows).ask("one", encoder=words)  # "first" is the same word, and takes nothing
     assert np.flatnonzero(answer.selected).tolist() == list(range(20))
-    both = scene_with(rows).ask(lc.Query(text=["one", "two"]), encoder=words)
-    assert np.flatnonzero(both.selected).tolist() == list(range(40))
+    pair = scene_with(rows).ask(lc.Query(text=["one", "two"]), encoder=words)
+    assert np.flatnonzero(pair.selected).tolist() == list(range(40))
 
 
 def test_thin_object_does_not_select_the_scene() -> None:
@@ -140,9 +140,14 @@ def test_a_part_is_selected_by_its_own_node(mug: lc.Scene, text: str) -> None:
 
 
 def test_a_click_may_mean_the_part_or_the_whole(mug: lc.Scene) -> None:
-    part, whole = mug.ask(lc.Query(like=["middle:6,6"])).candidates
-    assert (part.kind, part.splats, whole.kind, whole.splats) == ("part", 10, "object", SPLATS_A_CLUSTER)
-    for candidate in (part, whole):
+    part, complete_content = mug.ask(lc.Query(like=["middle:6,6"])).candidates
+    assert (part.kind, part.splats, complete_content.kind, complete_content.splats) == (
+        "part",
+        10,
+        "object",
+        SPLATS_A_CLUSTER,
+    )
+    for candidate in (part, complete_content):
         answer = mug.ask(lc.Query(sets=[candidate.set]))
         assert answer.count == candidate.splats and set(CLUSTER[answer.selected]) == {0}
     assert mug.ask(lc.Query(like=["splat:0"], unlike=["splat:2"])).candidates[0].kind == "part"

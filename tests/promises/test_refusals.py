@@ -142,9 +142,9 @@ def test_wrong_argument_is_named_in_one_line(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(error) as caught:
+    with pytest.raises(error) as error_info:
         call(*arguments.values()) if call == SCENE.cameras.__getitem__ else call(**arguments)
-    refusal = caught.value
+    refusal = error_info.value
     assert argument in refusal.argument and refusal.expected and refusal.got
     assert "\n" not in str(refusal) and len(str(refusal)) < 900
     copy = pickle.loads(pickle.dumps(refusal))

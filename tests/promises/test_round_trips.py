@@ -39,7 +39,7 @@ QUANTA = {  # largest difference of what a format rounds; scales in logarithms, 
 }
 
 
-def look(splats: lc.Splats) -> dict[str, np.ndarray]:
+def rendered_colours(splats: lc.Splats) -> dict[str, np.ndarray]:
     """Return what a viewer draws of 3D Gaussians: opacities, and quaternions as rotation matrices."""
     assert splats.sh is not None
     sh, quats = splats.sh.numpy(), splats.quats.double().numpy()
@@ -66,7 +66,7 @@ def test_splats_come_back_within_the_quantum_of_the_format(suffix: str, tmp_path
     path, columns = tmp_path / f"s{suffix}", labels(200)
     lc.write_splats(path, splats, columns if suffix == ".glb" else None)
     copy = lc.read_splats(path)
-    actual, expected = look(copy), look(splats)
+    actual, expected = rendered_colours(copy), rendered_colours(splats)
     for name, quantum in QUANTA[suffix].items():
         if quantum < math.inf:
             np.testing.assert_allclose(actual[name], expected[name], rtol=0, atol=quantum + 1e-6, err_msg=name)
@@ -138,8 +138,8 @@ def test_files_of_splat_transform_are_read_as_it_reads_them(path: Path, tmp_path
             archive.extractall(tmp_path / "folder")
         assert torch.equal(lc.read_splats(tmp_path / "folder").means, lc.read_splats(path).means)
     for file in (path, unnamed):
-        actual, drawn = look(lc.read_splats(file)), look(expected)
-        for name, values in drawn.items():
+        actual, drawing = rendered_colours(lc.read_splats(file)), rendered_colours(expected)
+        for name, values in drawing.items():
             tolerance = 0.02 if name == "turns" and path.suffix == ".splat" else 3e-5 * np.abs(values).max(initial=1)
             np.testing.assert_allclose(actual[name], values, rtol=0, atol=tolerance, err_msg=name)
 

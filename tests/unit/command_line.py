@@ -32,7 +32,7 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, st
 
 
 def assert_one_line(err: str) -> None:
-    """What went to stderr is one line, and ends."""
+    """Output on stderr is one line, and ends."""
     assert err.endswith("\n")
     assert err.count("\n") == 1
 
