@@ -149,6 +149,8 @@ def test_checkpoint_serves_the_same_geometry_and_features_alone(regions: RandomS
         (replace(regions, views=relabelled), {}),
         (replace(regions, views=other_features), {}),
         (regions, {"preset": "tikhonov"}),
+        (regions, {"preset": "argmax"}),
+        (regions, {"alpha_cap": 0.5}),
         (regions, {"stride": 2}),
     ):
         assert lift(scene, checkpoint=tmp_path, **settings) == lift(scene, **settings)

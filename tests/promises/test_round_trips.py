@@ -18,7 +18,7 @@ import liftcore as lc
 import numpy as np
 import pytest
 import torch
-from liftcore import evaluate
+from liftcore import evaluate, files
 from PIL import Image
 from safetensors.numpy import load_file
 from scipy.spatial.transform import Rotation
@@ -203,7 +203,7 @@ def test_pack_has_the_views_that_were_written(tmp_path: Path) -> None:
 
 
 MASKS = np.zeros((3, 6, 8), bool)
-MASKS[0, :3, :5] = MASKS[1, 2:5, 3:7] = MASKS[2, 5:, 6:] = True  # the first two overlap
+MASKS[0, :2, :4] = MASKS[1, 1:5, 3:7] = MASKS[2, 5:, 6:] = True  # the first two overlap
 VECTORS = np.random.default_rng(0).normal(size=(3, CHANNELS)).astype(np.float32)
 
 
@@ -250,6 +250,8 @@ def test_masks_of_every_kind_become_regions_that_cover_them(kind: str, tmp_path:
     np.testing.assert_allclose(view.codebook.numpy(), VECTORS, rtol=1e-3)
     for number, mask in enumerate(masks):
         np.testing.assert_array_equal((view.labels == number).any(dim=0).numpy(), mask)
+    largest = max(range(3), key=lambda number: masks[number].sum())
+    np.testing.assert_array_equal((view.labels[0] == largest).numpy(), masks[largest], "the largest comes first")
     from_masks = lc.Regions.from_masks(list(masks), VECTORS)
     assert torch.equal(from_masks.labels, view.labels)
 
@@ -401,6 +403,35 @@ def test_text_and_binary_models_say_the_same_lens(model: str, tmp_path: Path) ->
     for camera, twin in zip(read[0].values(), read[1].values(), strict=True):
         assert camera.lens is not None and camera.lens == twin.lens
         np.testing.assert_array_equal(camera.viewmat, twin.viewmat)
+
+
+PAIRS = [  # names of views and of cameras, and which pair
+    (["000"], ["camA/000"], {"000": "camA/000"}),
+    (["camA/000"], ["000"], {"camA/000": "000"}),
+    (["/photos/camA/000"], ["camA/000", "camB/000"], {"/photos/camA/000": "camA/000"}),
+    (["000"], ["train/000", "test/000"], {}),
+    (["train/000", "test/000"], ["000"], {}),
+    (["train/000", "test/000"], ["train/000"], {"train/000": "train/000"}),
+    (["train/000"], ["test/000"], {}),
+]
+
+
+@pytest.mark.parametrize(("views", "cameras", "pairs"), PAIRS)
+def test_views_pair_with_the_one_camera_that_ends_like_them(
+    views: list[str], cameras: list[str], pairs: dict[str, str]
+) -> None:
+    assert files.cameras_of_views(views, cameras) == pairs
+
+
+def test_colours_turn_with_their_splats() -> None:
+    """The harmonics of degree 1 are a vector along which a colour grows: it turns as positions do."""
+    splats = random_splats(5, 20, degree=1)
+    rotation = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
+    moved = splats.transformed(rotation=rotation)
+    assert splats.sh is not None and moved.sh is not None
+    gradients = [-sh[:, [3, 1, 2]].numpy() * np.array([1, 1, -1])[:, None] for sh in (splats.sh, moved.sh)]
+    np.testing.assert_allclose(gradients[1], np.einsum("ij,njc->nic", rotation, gradients[0]), atol=1e-5)
+    np.testing.assert_allclose(moved.means.numpy(), splats.means.numpy() @ rotation.T, atol=1e-5)
 
 
 def test_inspected_files_are_of_the_kinds_that_were_written(tmp_path: Path) -> None:
