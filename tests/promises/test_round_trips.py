@@ -395,9 +395,9 @@ def test_text_and_binary_models_say_the_same_lens(model: str, tmp_path: Path) ->
     text["cameras.txt"] = f"1 {model} {SIZE[0]} {SIZE[1]} {' '.join(map(str, values))}\n".encode()
     binary["cameras.bin"] = struct.pack(f"<QIiQQ{len(values)}d", 1, 1, number, *SIZE, *values)
     read = []
-    for name, files in {"text": text, "binary": binary}.items():
+    for name, model_files in {"text": text, "binary": binary}.items():
         (tmp_path / name).mkdir()
-        for file, content in files.items():
+        for file, content in model_files.items():
             (tmp_path / name / file).write_bytes(content)
         read.append(lc.read_cameras(tmp_path / name))
     for camera, twin in zip(read[0].values(), read[1].values(), strict=True):
