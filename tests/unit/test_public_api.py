@@ -107,13 +107,6 @@ def test_plan_chooses_what_the_lift_takes(scene):
     assert any("; 2 of 3 views" in line for line in strided.lines())
 
 
-def test_view_of_another_kind_is_refused_by_name(scene):
-    _, splats, cameras, _ = scene
-    with pytest.raises(lc.InvalidFeatures, match="Regions or FeatureGrid") as excinfo:
-        lc.lift(splats, cameras, {"v0": torch.ones(2, 2, 4)})  # pyright: ignore[reportArgumentType]
-    assert "v0" in excinfo.value.argument
-
-
 def test_render_composites_numbers_of_splats(scene):
     _, splats, cameras, _ = scene
     camera = cameras["v0"]
@@ -137,38 +130,6 @@ def test_render_of_cameras_is_an_image_of_each_by_its_name(scene):
         assert images[name].shape == (camera.height, camera.width) and bool((images[name] > 0.5).any())
     with pytest.raises(lc.InvalidCameras, match="camera: expected a Camera, got 3"):
         lc.render(splats, {"v0": cameras["v0"], "v1": 3}, selected)  # pyright: ignore
-
-
-def test_region_weights_times_codebooks_are_the_lift(scene):
-    _, splats, cameras, views = scene
-    weights = lc.region_weights(splats, cameras, views, preset="row-sum")
-    W = weights.matrix(splats.count)
-    E = np.concatenate([views[name].codebook.double().numpy() for name in weights.views])
-    assert W.shape == (splats.count, len(E)) and weights.offsets.tolist()[0] == 0
-    result = lc.lift(splats, cameras, views, preset="row-sum", dtype="float32")
-    sums = W.sum(axis=1)
-    assert ((sums > 0) == result.has_feature.numpy()).all()
-    X = np.divide(W @ E, sums[:, None], out=np.zeros((splats.count, E.shape[1])), where=sums[:, None] > 0)
-    np.testing.assert_allclose(result.features.numpy(), X, atol=1e-5)
-    weights_of_iterator = lc.region_weights(splats, cameras, iter(views.items()), preset="row-sum", threads=2)
-    assert torch.equal(weights_of_iterator.weight, weights.weight) and torch.equal(
-        weights_of_iterator.region, weights.region
-    )
-
-
-@pytest.mark.parametrize("settings", [{}, {"preset": "row-sum", "loss": "huber"}])
-def test_reweighted_region_weights_times_codebooks_are_the_lift_of_any_preset(scene, settings):
-    _, splats, cameras, views = scene
-    reweighted = lc.region_weights(splats, cameras, views, reweight=True, **settings)
-    weights = lc.region_weights(splats, cameras, views, **settings)
-    W = reweighted.matrix(splats.count)
-    E = np.concatenate([views[name].codebook.double().numpy() for name in reweighted.views])
-    result = lc.lift(splats, cameras, views, dtype="float32", **settings)
-    has_feature = result.has_feature.numpy()
-    np.testing.assert_allclose(
-        result.features.numpy()[has_feature], (W @ E)[has_feature] / W.sum(axis=1)[has_feature, None], atol=1e-5
-    )
-    assert torch.equal(reweighted.region, weights.region) and not torch.equal(reweighted.weight, weights.weight)
 
 
 def test_stages_are_reported_in_order_and_the_plan_after_the_first_views(tmp_path):
@@ -212,37 +173,6 @@ def test_warnings_of_memory_go_to_the_callback_else_to_the_log(tmp_path, monkeyp
         assert plans[0].warnings == (little_memory,) and little_memory not in caplog.text
         lift_files(splats, cameras, [pack], lc.LiftSettings.of())
         assert caplog.text.count(little_memory) == 1
-
-
-@pytest.mark.parametrize(
-    ("overrides", "error", "message"),
-    [
-        ({"splats": "scene.ply"}, lc.InvalidSplats, r"splats: .*got str 'scene.ply'; .*read_splats"),
-        ({"cameras": "sparse/0"}, lc.InvalidCameras, r"cameras: .*got str 'sparse/0'; read_cameras"),
-        ({"cameras": {0: None}}, lc.InvalidCameras, r"cameras: expected names that are texts, as of photos, got 0"),
-        ({"cameras": None}, lc.InvalidCameras, r"cameras: expected a Camera for each name, got NoneType"),
-        ({"views": "pack.safetensors"}, lc.InvalidFeatures, r"features: .*got str 'pack.safetensors'; read_features"),
-        ({"views": None}, lc.InvalidFeatures, r"features: expected views by name"),
-        ({"views": [torch.ones(2, 2, 4)]}, lc.InvalidFeatures, r"features: expected pairs of a name and a view"),
-        ({"threads": 0}, lc.InvalidSettings, r"threads: expected a whole number of one or more, .*got 0"),
-        ({"threads": 1.5}, lc.InvalidSettings, r"threads: .*got 1.5"),
-        ({"threads": True}, lc.InvalidSettings, r"threads: .*got True"),
-        (
-            {"views": {0: None}},
-            lc.InvalidFeatures,
-            r"features: expected names that are texts, as of cameras, got int 0",
-        ),
-        ({"views": [(0, None)]}, lc.InvalidFeatures, r"features: expected names that are texts"),
-        ({"device": "tpu"}, lc.InvalidSettings, r"device: expected 'auto', 'cpu' or 'cuda', got 'tpu'"),
-        ({"robust_step": 1}, lc.InvalidSettings, r"robust_step: .*nearest: robust_steps"),
-    ],
-)
-@pytest.mark.parametrize("call", [lc.lift, lc.plan, lc.region_weights])
-def test_what_is_no_such_value_is_refused_by_its_name(scene, call, overrides, error, message):
-    _, splats, cameras, views = scene
-    arguments = {"splats": splats, "cameras": cameras, "views": views} | overrides
-    with pytest.raises(error, match=message):
-        call(**arguments)
 
 
 def test_settings_and_keywords_beside_them_are_one(scene):

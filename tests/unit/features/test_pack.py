@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import resource
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +15,13 @@ from liftcore.errors import InvalidFeatures, Unavailable
 from liftcore.io.cameras import read_cameras
 from liftcore.io.safetensors_file import write_tensors
 from liftcore.scene.cameras import Camera, Cameras
-from liftcore.values.pack import Views, as_views, pair, read_features, write_pack
+from liftcore.values.pack import as_views, pair, read_features, write_pack
 from liftcore.values.views import FeatureGrid, Regions, ViewFeatures
 
 MAP = np.arange(24, dtype=np.float32).reshape(3, 2, 4)  # [F, h, w]
 ANY_REGIONS: Any = Regions  # by what types do not allow
-ANY_GRID: Any = FeatureGrid
+
+
 LABELS = np.array([[0, -1], [1, 1]])
 
 
@@ -65,29 +65,6 @@ def test_arrays_that_fit_are_not_copied() -> None:
     assert FeatureGrid(grid).grid.data_ptr() == grid.ctypes.data
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: ANY_REGIONS([[0, 2]], np.eye(2)), r"labels: expected rows of its codebook \(0\.\.1\).*the label 2"),
-        (lambda: ANY_REGIONS([[0, -2]], np.eye(2)), "the label -2"),
-        (lambda: ANY_REGIONS([[0.5]], np.eye(2)), r"integers \[L, h, w\]"),
-        (lambda: ANY_REGIONS(np.ones((1, 1), np.uint64), np.eye(2)), r"integers \[L, h, w\].*uint64"),
-        (lambda: ANY_REGIONS([0], np.eye(2)), r"labels: .*int64 \[1\]"),
-        (lambda: ANY_REGIONS([[0]], np.ones(2)), r"codebook: expected floats \[M, F\]"),
-        (lambda: ANY_REGIONS([[0]], np.full((1, 2), np.nan), context="view 'a'"), "view 'a' codebook: .*got 2 of 2"),
-        (lambda: ANY_GRID(np.ones((2, 3))), r"grid: expected floats \[h, w, F\]"),
-        (lambda: ANY_GRID(np.ones((2, 0, 3))), "no side empty"),
-        (lambda: ANY_GRID(torch.ones(1, 2, 3, dtype=torch.int32)), "int32"),
-        (lambda: ANY_GRID(np.full((1, 1, 2), 1e16)), "finite values"),
-        (lambda: ANY_GRID(None), r"grid: expected floats \[h, w, F\], got NoneType"),
-        (lambda: ANY_GRID([["x"]]), "floats"),
-    ],
-)
-def test_values_that_cannot_be_right_are_refused(make, message: str) -> None:
-    with pytest.raises(InvalidFeatures, match=message):
-        make()
-
-
 def test_tensors_of_any_order_are_stored_in_row_order(tmp_path) -> None:
     transposed = torch.from_numpy(MAP).permute(1, 2, 0)
     single = torch.arange(6).as_strided((1,), (2,))  # as a slice of one number may be
@@ -95,39 +72,6 @@ def test_tensors_of_any_order_are_stored_in_row_order(tmp_path) -> None:
     tensors = load_file(tmp_path / "t")
     assert torch.equal(tensors["turned"], transposed) and torch.equal(tensors["every other"], transposed[:, ::2])
     assert torch.equal(tensors["single"], single)
-
-
-def sources(tmp_path) -> dict[str, Views]:
-    write_pack(tmp_path / "p", values(), {})
-    names: list[str] = []
-
-    def pairs() -> Iterator[tuple[str, ViewFeatures]]:
-        for name, value in values().items():
-            names.append(name)
-            yield name, value
-
-    views = {
-        "pack": read_features(tmp_path / "p"),
-        "dict": as_views(values()),
-        "iterator": as_views(pairs(), tmp_path),
-    }
-    assert names == ["b", "a"] and [path.name for path in tmp_path.iterdir()] == ["p"]
-    return views
-
-
-@pytest.mark.parametrize("kind", ["pack", "dict", "iterator"])
-def test_views_are_the_same_from_every_source(kind: str, tmp_path) -> None:
-    views, expected = sources(tmp_path)[kind], values()
-    assert (list(views), len(views), views.channels, "c" in views) == (["a", "b"], 2, 3, False)
-    assert as_views(views) is views
-    cameras = Cameras((Camera.pinhole("b", 4, 4, 5.0, 5.0, 2.0, 2.0, np.eye(4)),))
-    assert pair(views, cameras)[1] == ["a"]
-    assert (views.is_regions("a"), views.map_size("b")) == (True, (4, 2))
-    assert {part: spec.dtype for part, spec in views.specs("a").items()} == {"labels": "I16", "codebook": "F16"}
-    for name, value in expected.items():
-        assert torch.equal(views[name].codebook, value.codebook)
-    actual, source = views["a"], expected["a"]
-    assert isinstance(actual, Regions) and isinstance(source, Regions) and torch.equal(actual.labels, source.labels)
 
 
 CODEBOOK = torch.arange(12.0).reshape(4, 3)
