@@ -69,7 +69,8 @@ def failures_of(folder: Path, *, examples: int, phases: Sequence[str], keys: boo
         until(lambda: server.client.get("/query", params={"text": "apple"}).status_code == 200)
         command = [
             str(Path(sys.executable).with_name("schemathesis")), "run",
-            str(server.client.base_url.join("/openapi.json")), "--no-color", "--checks", ",".join(CHECKS), "--phases", ",".join(phases), "--max-examples", str(examples),
+            str(server.client.base_url.join("/openapi.json")),
+            "--no-color", "--checks", ",".join(CHECKS), "--phases", ",".join(phases), "--max-examples", str(examples),
             "--seed", "1", "--generation-deterministic", "--continue-on-failure", "--no-shrink",
             "--suppress-health-check", "all", "--warnings", "off", "--request-timeout", "300", *headers,
         ]  # fmt: skip

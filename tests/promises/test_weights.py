@@ -104,10 +104,10 @@ def test_reweighting_mends_masks_that_merge_things() -> None:
         views[name] = lc.Regions(halves, book)
         merged[name] = lc.Regions(halves * 0 + 2, book) if number % 3 == 0 else views[name]
     truth = lc.lift(scene.splats, scene.cameras, views, preset="row-sum", progress=False)
-    plain = lc.lift(scene.splats, scene.cameras, merged, preset="row-sum", progress=False)
+    expected_rows = lc.lift(scene.splats, scene.cameras, merged, preset="row-sum", progress=False)
     robust = lc.lift(scene.splats, scene.cameras, merged, progress=False)
-    assert agreement(plain, truth) < 0.97
-    assert 1 - agreement(robust, truth) < 0.5 * (1 - agreement(plain, truth))
+    assert agreement(expected_rows, truth) < 0.97
+    assert 1 - agreement(robust, truth) < 0.5 * (1 - agreement(expected_rows, truth))
 
 
 def test_masks_of_other_views_weigh_where_vectors_are_too_noisy() -> None:
@@ -122,17 +122,19 @@ def test_masks_of_other_views_weigh_where_vectors_are_too_noisy() -> None:
         views[name] = lc.Regions(halves, clean)
         wrong[name] = lc.Regions(halves if number % 3 else halves * 0 + number % 2, book)
     truth = lc.lift(scene.splats, scene.cameras, views, preset="row-sum", progress=False)
-    plain = lc.lift(scene.splats, scene.cameras, wrong, preset="row-sum", progress=False)
+    expected_rows = lc.lift(scene.splats, scene.cameras, wrong, preset="row-sum", progress=False)
     robust = lc.lift(scene.splats, scene.cameras, wrong, progress=False)
     # 0.80 and 0.86; 0.84 by vectors alone, without the masks.
-    assert agreement(plain, truth) < 0.82 and agreement(robust, truth) > 0.852
+    assert agreement(expected_rows, truth) < 0.82 and agreement(robust, truth) > 0.852
 
 
 def test_one_view_is_no_evidence_against_itself() -> None:
     """A region is compared with other views alone: where there is none, nothing is reweighted."""
     scene = random_scene(29, views=1, wrong=0.3)
-    plain, robust = (lc.lift(*scene.arguments(), preset=name, progress=False) for name in ("row-sum", "default"))
-    np.testing.assert_allclose(robust.features.float().numpy(), plain.features.float().numpy(), atol=2e-3)
+    expected_rows, robust = (
+        lc.lift(*scene.arguments(), preset=name, progress=False) for name in ("row-sum", "default")
+    )
+    np.testing.assert_allclose(robust.features.float().numpy(), expected_rows.features.float().numpy(), atol=2e-3)
 
 
 def test_objects_and_their_parts_are_those_of_the_masks() -> None:
@@ -157,30 +159,30 @@ def test_splats_of_a_cluster_take_its_feature_or_keep_their_own() -> None:
     """The published aggregation: a cluster without a region that overlaps it enough changes nothing."""
     scene = random_scene(19, count=300, views=6, wrong=0.0)
     settings: dict[str, Any] = {"preset": "row-sum", "dtype": "float32", "progress": False}
-    plain = lc.lift(*scene.arguments(), **settings).features.numpy()
+    expected_rows = lc.lift(*scene.arguments(), **settings).features.numpy()
     result = lc.lift(*scene.arguments(), aggregation=True, aggregation_cluster_size=5, **settings)
     assert result.cluster is not None and result.cluster_features is not None
     cluster, features, means = (x.float().numpy() for x in (result.cluster, result.features, result.cluster_features))
-    changed = 0
+    changes = 0
     for number, mean in enumerate(means):
         rows = cluster == number
         assert rows.sum() >= 5
         takes = np.allclose(features[rows], mean, atol=1e-3)
-        assert takes or np.array_equal(features[rows], plain[rows])
-        changed += int(takes)
-    assert changed >= 2
-    np.testing.assert_array_equal(features[cluster < 0], plain[cluster < 0])
+        assert takes or np.array_equal(features[rows], expected_rows[rows])
+        changes += int(takes)
+    assert changes >= 2
+    np.testing.assert_array_equal(features[cluster < 0], expected_rows[cluster < 0])
     strict = lc.lift(*scene.arguments(), aggregation=True, aggregation_cluster_size=5, aggregation_iou=1, **settings)
-    np.testing.assert_array_equal(strict.features.numpy(), plain, "no silhouette is a region to the pixel")
+    np.testing.assert_array_equal(strict.features.numpy(), expected_rows, "no silhouette is a region to the pixel")
 
 
 def test_smoothness_draws_neighbours_together_without_moving_their_mean() -> None:
     scene = random_scene(23, grids=True)
-    plain, weak, strong = (
+    expected_rows, weak, strong = (
         lc.lift(*scene.arguments(), preset="row-sum", smoothness=s, dtype="float32", progress=False).features.numpy()
         for s in (0.0, 0.3, 30.0)
     )
-    spreads = [float(np.var(X[np.linalg.norm(X, axis=1) > 0], axis=0).sum()) for X in (plain, weak, strong)]
+    spreads = [float(np.var(X[np.linalg.norm(X, axis=1) > 0], axis=0).sum()) for X in (expected_rows, weak, strong)]
     assert spreads[0] > spreads[1] > spreads[2]
 
 
