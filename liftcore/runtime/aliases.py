@@ -1,6 +1,6 @@
 """Old public names: read as the new ones, in Python with a `DeprecationWarning`, and never written to a file.
 
-A row of the table of public names in CONTRIBUTING.md is one entry ``old: new`` of a mapping here called aliases. An
+One entry ``old: new`` of a mapping here is called an alias. An
 old and a new name with different values are an error, as either could be the one that was meant.
 """
 
