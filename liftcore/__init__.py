@@ -20,4 +20,4 @@ the service import nothing else. Modules are loaded on first use: ``import liftc
 from liftcore.runtime.lazy_names import lazy_names
 from liftcore.runtime.version import __version__ as __version__
 
-__getattr__, __dir__ = lazy_names(__name__, __file__, {"FoundObject": "SelectedObject"})
+__getattr__, __dir__ = lazy_names(__name__, __file__)

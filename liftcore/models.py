@@ -15,14 +15,9 @@ from liftcore.query.question import (
     Viewpoint,
 )
 from liftcore.query.terms import NOTATIONS
-from liftcore.runtime.aliases import deprecated_module_names
 from liftcore.runtime.fields import Body, NoBoolean, takes
 
 __all__ = [
     "METHODS", "NOTATIONS", "BestWords", "Body", "Box", "Edit", "LabelSummary", "ListedObjects", "NoBoolean",
     "Notation", "OwnCamera", "SceneTree", "SelectionSummary", "SuggestedWords", "Viewpoint", "takes",
 ]  # fmt: skip
-
-__getattr__ = deprecated_module_names(
-    __name__, AskableWords="SuggestedWords", Found="SelectionSummary", FoundWords="LabelSummary", Seen="Viewpoint"
-)

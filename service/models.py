@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -76,8 +76,7 @@ class Published:
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         copy = deepcopy(handler.resolve_ref_schema(handler(self.model.__pydantic_core_schema__)))
-        names = [old for old, new in getattr(self.model, "old_names", {}).items() if new in self.without]
-        for name in (*self.without, *names):
+        for name in self.without:
             copy["properties"].pop(name, None)
         del copy["title"]
         return copy
@@ -267,7 +266,7 @@ class Progress(BaseModel):
     """Progress of a job's current stage."""
 
     stage: str
-    completed: int = Field(validation_alias=AliasChoices("completed", "done"))  # stored jobs may have the old name
+    completed: int = Field()
     total: int
     unit: str
     eta_s: float | None = Field(description="seconds until the end of this stage, from its speed so far")
@@ -589,7 +588,6 @@ class ExportRequest(Words):
     """The content of a ZIP: the answers of questions, every splat's best word, or the objects of the lift."""
 
     model_config = BODY_CONFIG
-    old_values: ClassVar[Mapping[str, Mapping[str, str]]] = {"of": {"things": "objects"}}
     of: Literal["questions", "words", "objects"] = Field("objects", description="the labels of the content")
     questions: Annotated[list[NamedQuestion], Field(max_length=QUESTIONS, fail_fast=True)] = Field(
         [], description="for content `questions`: each is a class of the labels"
@@ -725,19 +723,11 @@ class ListedSelection(OfLift):
     links: dict[str, str]
 
 
-def _with_both_names(edit: dict[str, Any]) -> dict[str, Any]:
-    """Return an edit with its old field names beside the new ones, whichever it was stored with."""
-    fields = Edit.with_old_names(edit)
-    return {**fields, "query": Query.with_old_names(fields["query"])} if "query" in fields else fields
-
-
 class SelectionStep(BaseModel):
     """A step of a selection's history."""
 
     number: int
-    edit: Annotated[dict[str, Any], BeforeValidator(_with_both_names)] = Field(
-        description="the edit of the step before, without bits; `how` is the old name of `operation`"
-    )
+    edit: dict[str, Any] = Field(description="the edit of the step before, without bits")
     count: int = Field(description="splats after it")
 
 

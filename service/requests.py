@@ -50,12 +50,11 @@ async def _known_only(request: Request) -> None:
     documented = (route.openapi_extra or {}).get("parameters", ())
     by_name = {parameter["name"]: parameter for parameter in documented if parameter["in"] == "query"}
     names = [*_names(route), *by_name]
-    listed_names = [name for name in names if not by_name.get(name, {}).get("deprecated")]
     lists = {name for name, parameter in by_name.items() if parameter["schema"].get("type") == "array"}
     for name in parameters:
         if name not in names:
             raise InvalidRequest(
-                name[:NAME_CHARACTERS], expected=f"one of {', '.join(listed_names)}" if names else "no parameters",
+                name[:NAME_CHARACTERS], expected=f"one of {', '.join(names)}" if names else "no parameters",
                 got=repr(name[:NAME_CHARACTERS]), hint="in the query of the request",
             )  # fmt: skip
         if len(values := parameters.getlist(name)) > 1 and name not in lists:  # the framework would take the last one
@@ -221,7 +220,7 @@ class Parameters(Generic[M]):
         query, fields = request.query_params, self.schema["properties"]
         values = {
             name: query.getlist(name) if fields[name].get("type") == "array" else query[name]
-            for name in self._names()
+            for name in self.names
             if name in query
         }
         try:
@@ -239,21 +238,16 @@ class Parameters(Generic[M]):
         """The fields as JSON schema."""
         return self.model.model_json_schema()
 
-    def _names(self) -> list[str]:
-        """Return the names of the parameters, and old names of these, which the schema has as deprecated."""
-        return [*self.names, *(old for old, new in self.model.old_names.items() if new in self.names)]
-
     def openapi_schema(self) -> dict[str, Any]:
         """Describe the parameters for OpenAPI."""
         parameters = []
-        for name in self._names():
+        for name in self.names:
             schema = {key: value for key, value in self.schema["properties"][name].items() if key != "description"}
             if "anyOf" in schema.get("items", {}):  # the part of an example that a URL can hold
                 schema["items"] = next(part for part in schema["items"]["anyOf"] if part["type"] == "string")
             about = self.schema["properties"][name].get("description", "")
             parameter = {"name": name, "in": "query", "required": name in self.needs, "schema": schema}
-            deprecated = {"deprecated": True} if schema.pop("deprecated", False) else {}
-            parameters.append(parameter | {"description": about} | deprecated)
+            parameters.append(parameter | {"description": about})
         return {"parameters": parameters}
 
 

@@ -72,14 +72,13 @@ def run(options: argparse.Namespace) -> int:
     (plan,) = plans
     warnings = result.metadata.diagnostics["warnings"]
     document = {"out": str(options.output), **_summary(result), "warnings": [*plan.warnings, *warnings]}
-    current_names = {"diagnostics": result.diagnostics}
     lift_warnings = [
         warning for warning in warnings if warning not in plan.input_warnings
     ]  # the others were printed with the plan
     reply(
         document,
         as_json=options.json,
-        lines=_lines(document | current_names | {"warnings": lift_warnings}, options.cameras, options.verbose),
+        lines=_lines(document | {"warnings": lift_warnings}, options.cameras, options.verbose),
     )
     return 0
 
@@ -136,7 +135,6 @@ def pairs_of(pairs: Sequence[str]) -> dict[str, Any]:
         key, equals, text = pair.partition("=")
         if not equals or not key:
             raise InvalidSettings("--set", expected="key=value", got=repr(pair))
-        key = LiftSettings.old_names.get(key, key)
         if key not in LiftSettings.model_fields:
             hint = LiftSettings.hint_of_name(key)
             raise InvalidSettings("--set", expected="a setting of a lift", got=f"the unknown {key[:80]!r}", hint=hint)
@@ -175,7 +173,7 @@ def plan_lines(plan: Plan) -> Iterable[str]:
 def _summary(result: LiftResult) -> dict[str, Any]:
     metadata = result.metadata
     feature_share = float(result.has_feature.float().mean())
-    diagnostics = result.diagnostics_of_reply(result.diagnostics)
+    diagnostics = result.diagnostics
     return {
         "splats": result.features.shape[0],
         "feature_share": feature_share,
@@ -187,9 +185,8 @@ def _summary(result: LiftResult) -> dict[str, Any]:
         "text_space": metadata.text_space,
         "world": metadata.world.model_dump(mode="json"),
         "diagnostics": diagnostics,
-        "certificate": diagnostics,
         "timings": metadata.timings,
-        "settings": metadata.settings.with_old_names(metadata.settings.model_dump(mode="json")),
+        "settings": metadata.settings.model_dump(mode="json"),
     }
 
 

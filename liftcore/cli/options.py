@@ -154,7 +154,7 @@ def add_settings(parser: Parser) -> None:
     parser.appendix = settings_help
     parser.add_argument("--preset", metavar="NAME", help=f"a set of weights: {PRESETS}")
     quality_help = "level of quality: exact, balanced, fast or draft"
-    add_renamed(parser, "--quality", ["--speed"], metavar="NAME", help=quality_help)
+    parser.add_argument("--quality", metavar="NAME", help=quality_help)
     add_device(parser)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one of the settings below")
 
@@ -200,7 +200,7 @@ def add_fields(
         if get_origin(parts[0]) is list:
             keywords |= {"action": "append", "default": [], "metavar": "TEXT"}
         elif get_origin(parts[0]) is Literal and not union:
-            keywords |= {"choices": get_args(parts[0]), "type": partial(model.current_value, name)}
+            keywords |= {"choices": get_args(parts[0])}
         elif int in parts:
             keywords |= {"type": whole_number, "metavar": "N"}
         else:
@@ -208,42 +208,7 @@ def add_fields(
         keywords |= overrides.get(name, {})
         flag = keywords.pop("flag", f"--{name.replace('_', '-')}")
         keywords |= {"dest": name} if flag.startswith("-") else {}
-        old_flags = [f"--{old.replace('_', '-')}" for old, new in model.old_names.items() if new == name]
-        add_renamed(parser, flag, old_flags, **keywords)
-
-
-def add_renamed(parser: argparse.ArgumentParser, flag: str, old_flags: Sequence[str], **options: Any) -> None:
-    """Add an option that can also be given by its old names, which help does not show.
-
-    Args:
-        flag: its name now. old_flags: its old names. options: of `add_argument`.
-    """
-    if not old_flags:
-        parser.add_argument(flag, **options)
-        return
-    options.setdefault("action", OneValue)
-    dest = parser.add_argument(flag, **options).dest
-    for old in old_flags:
-        action = parser.add_argument(old, **{**options, "dest": dest, "help": argparse.SUPPRESS})
-        if isinstance(action, OneValue):
-            action.renamed_to = flag
-
-
-class OneValue(argparse.Action):
-    """Store the value of an option; by the old name and the new one, two values are bad input."""
-
-    renamed_to = ""  # the option's name now, of an old one
-
-    def __call__(
-        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option: str | None = None
-    ) -> None:
-        flag, value = vars(namespace).setdefault(f"spelling of {self.dest}", (option, values))
-        if flag != option and value != values:
-            parser.error(f"{flag}: expected one of {flag} and {option}, got both, with different values")
-        if self.renamed_to:
-            note = f"splatlift: {option} is now {self.renamed_to}; the old name goes with the next release"
-            print(note, file=sys.stderr)
-        setattr(namespace, self.dest, values)
+        parser.add_argument(flag, **keywords)
 
 
 def add_encoder(parser: argparse.ArgumentParser) -> None:

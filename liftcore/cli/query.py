@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -115,37 +114,14 @@ def _query(options: argparse.Namespace) -> Query:
 def _document(
     answer: Answer, objects: Objects | None, view_mask: ViewMask | None, encoder: TextEncoder | None
 ) -> dict[str, Any]:
-    """Return the answer as in HTTP, and the files and view of the command, with deprecated keys."""
+    """Return the answer as in HTTP, and the files and view of the command."""
     lists = {"top", "box"} if not answer.top else set()
     fields = answer.model_dump(mode="json", exclude=lists)
     fields |= {} if objects is None else objects.model_dump(mode="json")
     document = {"answer": fields, "encoder": encoder.name if encoder else None, "splats": len(answer.scores)}
-    document |= _deprecated_keys(answer, objects)
     if view_mask is not None:
         share = float(view_mask.mask.mean())
         document["view"] = {"name": view_mask.view, "explanation": view_mask.explanation, "mask_share": share}
-    return document
-
-
-def _deprecated_keys(answer: Answer, objects: Objects | None) -> dict[str, Any]:
-    positives = len(answer.query.positives)
-    document: dict[str, Any] = {
-        "query": [str(term) for term in answer.query.positives],
-        "negatives": [str(term) for term in answer.query.terms[positives:]],
-        "selected": answer.count,
-        "threshold": answer.threshold.value,
-        "threshold_method": answer.threshold.method,
-        "explanation": answer.threshold.explanation,
-        "why": answer.reason,
-        **{name: getattr(answer, name) for name in ("clear", "present", "presence", "statistics")},
-    }
-    if answer.top:
-        document |= {"top": [vars(splat) for splat in answer.top], "box": answer.box}
-    if objects is not None:
-        document |= {
-            "objects": [vars(scene_object) for scene_object in objects.objects],
-            "strays": objects.unassigned_splats,
-        }
     return document
 
 
@@ -161,35 +137,36 @@ def source_files(scene: Scene) -> list[Path]:
 
 
 def _lines(document: dict[str, Any]) -> Iterable[str]:
-    query_text = ", ".join(map(repr, document["query"]))
-    yield from (f"{entry['text']!r} is queried as {entry['word']!r}" for entry in document["answer"]["wording"])
-    if document["present"] is not None or document["encoder"]:
-        yield document["answer"]["reason"]
-    if document["threshold"] < math.inf:
-        selection = f"{document['selected']} of {document['splats']} splats at or above {document['threshold']:.4g}"
-        yield f"{query_text}: {selection} ({document['explanation']})"
+    answer = document["answer"]
+    threshold, query_text = answer["threshold"], ", ".join(map(repr, [*answer["text"], *answer["like"]]))
+    yield from (f"{entry['text']!r} is queried as {entry['word']!r}" for entry in answer["wording"])
+    if answer["present"] is not None or document["encoder"]:
+        yield answer["reason"]
+    if threshold["value"] is not None:
+        selection = f"{answer['count']} of {document['splats']} splats at or above {threshold['value']:.4g}"
+        yield f"{query_text}: {selection} ({threshold['explanation']})"
     else:
         no_selection = "nothing is selected; --absent keep selects the most similar splats"
-        yield f"{query_text}: {no_selection if document['present'] is False else document['explanation']}"
-    if rivals := document["answer"]["rivals"]:
+        yield f"{query_text}: {no_selection if answer['present'] is False else threshold['explanation']}"
+    if rivals := answer["rivals"]:
         yield f"  words nearer to it: {', '.join(map(repr, rivals))}"
     if "view" in document:
         view = document["view"]
         yield f"  view {view['name']}: {view['mask_share']:.2%} of the image ({view['explanation']})"
-    for candidate in document["answer"]["candidates"]:
-        whole_object = "the example" if document["answer"]["like"] else "the object"
+    for candidate in answer["candidates"]:
+        whole_object = "the example" if answer["like"] else "the object"
         size = f"{candidate['splats']} splats, {candidate['share']:.0%} of {whole_object}"
         yield f"  may be {candidate['set']}, {candidate['kind']}: {size}"
-    for best in document.get("top", []):
+    for best in answer.get("top", []):
         yield f"  splat {best['splat']}: score {best['score']:.4g} at {place_of(best['position'])}"
-    for number, entry in enumerate(document.get("objects", []), 1):
-        low, high = entry["box"]
+    for number, entry in enumerate(answer.get("objects", []), 1):
+        low, high = entry["box"].values()
         yield (
             f"  object {number}: {entry['splats']} splats, {entry['share']:.1%} of the selection, score "
             f"{entry['score']:.4g}, at {place_of(entry['centre'])}, from {place_of(low)} to {place_of(high)}, "
-            f"{sides_of(entry['size'], document['answer']['unit'])}"
+            f"{sides_of(entry['size'], answer['unit'])}"
         )
-    if count := document["answer"].get("unassigned_splats"):
+    if count := answer.get("unassigned_splats"):
         yield f"  {count} selected splats are in no object: single splats or small groups"
     yield from (f"  {kind}: {path}" for kind, path in document["files"].items())
     if "origin" in document:

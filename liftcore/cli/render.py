@@ -31,6 +31,6 @@ def run(options: argparse.Namespace) -> int:
     scene = open_lift(options)
     check_outputs(files, source_files(scene))
     paths = write_files(files, {"output": partial(scene.export, what=options.channel, view=view)})
-    document = {"channel": options.channel, "what": options.channel, "out": paths["output"]}  # what: deprecated
+    document = {"channel": options.channel, "out": paths["output"]}
     reply(document, as_json=options.json, lines=[paths["output"]])
     return 0

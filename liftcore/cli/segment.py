@@ -11,7 +11,6 @@ from liftcore.cli.options import (
     Parser,
     add_encoder,
     add_lift,
-    add_renamed,
     add_view,
     count,
     open_lift,
@@ -38,7 +37,7 @@ def add_arguments(parser: Parser) -> None:
     )
     add_encoder(parser)
     example_help = "list the best words for an example, as for 'query --like'; may be repeated"
-    add_renamed(parser, "--example", ["--what"], action="append", default=[], metavar="EXAMPLE", help=example_help)
+    parser.add_argument("--example", action="append", default=[], metavar="EXAMPLE", help=example_help)
     parser.add_argument("--top", type=count, default=5, metavar="N", help="words for each --example; default 5")
     add_view(parser)
     parser.add_argument(
@@ -79,13 +78,9 @@ def run(options: argparse.Namespace) -> int:
         document["examples"] = [
             BestWords(example=text, words=nearest).model_dump(mode="json") for text, nearest in best.items()
         ]
-        document["what"] = {text: [vars(word) for word in nearest] for text, nearest in best.items()}  # deprecated
     if files or not options.example:
         segmentation = scene.segment(words, encoder=encoder, progress=True)
         document["answer"] = segmentation.summary.model_dump(mode="json")
-        # Deprecated keys, which the next release removes.
-        document |= {"splats": len(segmentation.labels), "none": segmentation.summary.none}
-        document["found"] = [vars(word) for word in segmentation.named_words]
         exports = {kind: partial(scene.export, source=segmentation, what=kind, view=view) for kind in files}
         document["files"] = write_files(files, exports)
     reply(document, as_json=options.json, lines=_lines(document))
@@ -111,15 +106,16 @@ def encoder_and_words(
 
 
 def _lines(document: dict[str, Any]) -> Iterable[str]:
-    for example, words in document.get("what", {}).items():
-        best = ", ".join(f"{word['word']} {word['score']:.3f}" for word in words)
-        yield f"{example}: {best}"
-    if "found" not in document:
+    for example in document.get("examples", ()):
+        best = ", ".join(f"{word['word']} {word['score']:.3f}" for word in example["words"])
+        yield f"{example['example']}: {best}"
+    if "answer" not in document:
         return
-    unlabelled = f"{document['none']} of {document['splats']} splats have no word"
-    yield f"{len(document['found'])} of {document['words']} words found; {unlabelled}"
-    for entry in document["found"]:
-        low, high = entry["box"]
+    answer = document["answer"]
+    unlabelled = f"{answer['none']} of {answer['splats']} splats have no word"
+    yield f"{len(answer['named_words'])} of {document['words']} words found; {unlabelled}"
+    for entry in answer["named_words"]:
+        low, high = entry["box"].values()
         yield (
             f"  {entry['value']} {entry['word']}: {entry['splats']} splats, {entry['share']:.1%} of the "
             f"total weight, score {entry['score']:.3f}, margin {entry['margin']:.3f}, "

@@ -61,7 +61,7 @@ def run(options: argparse.Namespace) -> int:
         )
     with writing(options.out):
         files = comparison.save(options.out)
-    document = comparison.document_of_reply() | {"files": [str(file) for file in files]}
+    document = comparison.document | {"files": [str(file) for file in files]}
     reply(document, as_json=options.json, lines=[*comparison.lines(), "", *document["files"]])
     return 0
 

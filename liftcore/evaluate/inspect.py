@@ -318,23 +318,19 @@ def describe_lift(lift: Lift) -> dict[str, Any]:
     count, channels = lift.features.shape
     feature_share = float(lift.has_feature.float().mean())
     view_consistency = _ends(lift.view_consistency[lift.has_feature])
-    diagnostics = lift.diagnostics_of_reply(lift.diagnostics)
+    diagnostics = lift.diagnostics
     return {
         "splats": count,
         "channels": channels,
         "dtype": str(lift.features.dtype).removeprefix("torch."),
         "feature_share": feature_share,
-        "seen_share": feature_share,
         "total_weight": _ends(lift.total_weight),
-        "evidence": _ends(lift.total_weight),
         "view_consistency": view_consistency,
-        "agreement": view_consistency,
         "encoder": metadata.encoder,
         "text_space": metadata.text_space,
         "views": len(metadata.views),
-        "settings": metadata.settings.with_old_names(metadata.settings.model_dump(mode="json")),
+        "settings": metadata.settings.model_dump(mode="json"),
         "diagnostics": diagnostics,
-        "certificate": diagnostics,
         "timings": metadata.timings,
         "version": metadata.version,
         "inputs": [file.path for file in (metadata.splats, metadata.cameras, *metadata.features)],

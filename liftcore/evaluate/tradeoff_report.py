@@ -17,11 +17,8 @@ from liftcore.evaluate.ranking import NAMES
 from liftcore.evaluate.tradeoff import SceneFiles, compare
 from liftcore.io.files import whole_file
 from liftcore.io.json_file import finite
-from liftcore.runtime.aliases import AliasedDict, current_names, with_old_names
 from liftcore.runtime.progress import Progress, shown_progress
 from liftcore.scene.kernel import Kernel
-from liftcore.values.lift_file import OLD_DIAGNOSTICS
-from liftcore.values.settings import LiftSettings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,15 +36,8 @@ KEY = (
     "over draws of its views."
 )
 TITLE = "Speed against accuracy"
-OLD_KEYS = {"skipped": "over_budget", "refused": "invalid_runs"}  # of documents of 0.4: new names by old ones
 LOST_SHARE = 0.001  # of the splats, above which the verdict mentions them
 LEAST_SHARE = 0.02  # of any run's seconds, for a stage that the chart shows
-
-
-class TradeoffDocument(AliasedDict):
-    """Figures of a comparison by their names, as plain numbers."""
-
-    aliases = OLD_KEYS
 
 
 @dataclass(frozen=True)
@@ -64,16 +54,6 @@ class SpeedComparison:
     def save(self, folder: Path) -> list[Path]:
         """Write ``tradeoff.json``, ``.png`` (a chart) and ``.md`` in a folder; return their paths."""
         return save(self.document, folder)
-
-    def document_of_reply(self) -> dict[str, Any]:
-        """Return the document with each old name behind its new one."""
-        document = with_old_names(self.document, OLD_KEYS)
-        return document | {"runs": [_run_of_reply(run) for run in document["runs"]]}
-
-
-def _run_of_reply(run: Mapping[str, Any]) -> dict[str, Any]:
-    settings = {name: LiftSettings.with_old_names(run[name]) for name in ("options", "settings")}
-    return with_old_names(run, OLD_DIAGNOSTICS) | settings
 
 
 def compare_speeds(
@@ -106,7 +86,7 @@ def compare_speeds(
     """
     if not isinstance(files, SceneFiles):
         raise InvalidInput("files", expected="SceneFiles", got=repr(files)[:80])
-    run_settings = LiftSettings.current_names(dict(settings)) if isinstance(settings, Mapping) else None
+    run_settings = dict(settings) if isinstance(settings, Mapping) else None
     if run_settings is None or "quality" in run_settings:
         got = repr(settings)[:80] if run_settings is None else "quality"
         raise InvalidSettings("settings", expected="settings that are the same in all runs", got=got)
@@ -114,7 +94,7 @@ def compare_speeds(
     with shown_progress(progress) as reporter:
         facts = compare(files, budget, run_settings, threads, reporter, kernel)
     document = finite({"title": TITLE, "scene": scene, "command": command} | facts)
-    return SpeedComparison(TradeoffDocument(document))
+    return SpeedComparison(document)
 
 
 def _check_chart() -> None:
@@ -146,7 +126,6 @@ def save(document: Mapping[str, Any], out: Path) -> list[Path]:
 
 def page_of(document: Mapping[str, Any]) -> list[str]:
     """Return the table, the verdict and the conditions as lines of Markdown."""
-    document = current_names(document, OLD_KEYS)
     views, machine = document["views"], document["hardware"]
     not_run, forbidden = ", ".join(document["over_budget"]), ", ".join(document["invalid_runs"])
     over_budget = f" Not run for want of time: {not_run}." if not_run else ""

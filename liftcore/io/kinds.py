@@ -33,7 +33,6 @@ from liftcore.io.splat import looks_like_splat
 from liftcore.io.spz import begins_like_spz
 from liftcore.io.streamed_sog import LOD_META, is_streamed_document, streamed_folder
 from liftcore.io.transforms import FRAME_FILE
-from liftcore.runtime.aliases import deprecated_keywords
 from liftcore.scene.views import IMAGE_SUFFIXES
 
 LIFT_KEY = "splatlift"  # of the metadata of a lift
@@ -257,7 +256,6 @@ def kind_of(path: Path) -> str | None:
     return identify(path).kind
 
 
-@deprecated_keywords(wanted="kind")
 def wrong_kind(
     path: Path | str, kind: str, fault: type[Fault], *, argument: str = "", expected: str = ""
 ) -> Fault | None:

@@ -169,9 +169,7 @@ def region_weights(
     Raises:
         InvalidFeatures, InvalidSettings, Unavailable: as in `lift`.
     """
-    inputs = LiftInputs.of(
-        splats, cameras, views, preset, {**LiftSettings.current_names(dict(settings)), "diagnostic_rays": 0}, threads
-    )
+    inputs = LiftInputs.of(splats, cameras, views, preset, {**settings, "diagnostic_rays": 0}, threads)
     device = choose_device(inputs.settings.device)
     raster = open_raster(inputs.splats, device, threads)
     count = inputs.splats.count

@@ -55,7 +55,6 @@ from liftcore.query.selection import (
 from liftcore.query.selections import set_members
 from liftcore.query.terms import Vector
 from liftcore.query.threshold import explain_no_selection, find_threshold
-from liftcore.runtime.aliases import deprecated_names
 from liftcore.runtime.cores import cores
 from liftcore.runtime.one_thread import one_thread
 from liftcore.text import TextEncoder, check_texts
@@ -97,7 +96,6 @@ class PartQuery:
     part: ResolvedQuery
 
 
-@deprecated_names(why="reason")
 @dataclass(frozen=True)
 class VectorAnswer:
     """Answer of a lift to vectors (`query_vectors`); tensors are on the CPU, where queries run."""

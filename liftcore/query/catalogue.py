@@ -27,7 +27,6 @@ from liftcore.query.question import ListedObjects, Point, SceneNode, SceneObject
 from liftcore.query.relations import relations as related
 from liftcore.query.relations import upright
 from liftcore.query.scores import cosines, norms_of
-from liftcore.runtime.aliases import deprecated_names
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.origin import MAP_REACH
 from liftcore.scene.world import UNKNOWN, WorldFrame
@@ -39,7 +38,6 @@ NONE_FOUND = "no object: masks of three views never keep the same splats togethe
 _BLOCK = 1 << 14  # rows of features converted to f32 at once
 
 
-@deprecated_names(listed="iterate_objects")
 @dataclass(frozen=True)
 class Catalogue:
     """All objects of a lift."""

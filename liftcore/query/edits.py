@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
@@ -10,7 +9,6 @@ from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 from liftcore.errors import InvalidQuery
 from liftcore.query.question import MOST_CHARACTERS, Box, OwnCamera, Query, as_own_camera
 from liftcore.query.terms import PixelBox, Stroke, Vector, parse_example
-from liftcore.runtime.aliases import add_deprecated_properties
 from liftcore.runtime.fields import Body, NoBoolean
 
 AREAS = "VIEW:box:x0,y0,x1,y1 or VIEW:stroke:x0,y0,x1,y1,..."
@@ -32,7 +30,6 @@ class Edit(Body):
 
     model_config = ConfigDict(frozen=True)
     error_type: ClassVar = InvalidQuery
-    old_names: ClassVar[Mapping[str, str]] = {"how": "operation"}
 
     operation: Literal["set", "add", "remove", "grow", "shrink"] = Field(description="the kind of change")
     query: Query | None = Field(default=None, description="a question: the splats that answer it")
@@ -83,6 +80,3 @@ class Edit(Body):
                 example if isinstance(example, str) else str(Vector(tuple(example))) for example in query[name]
             ]
         return document
-
-
-add_deprecated_properties(Edit, {"described": "to_json"})

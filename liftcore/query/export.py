@@ -19,7 +19,6 @@ from liftcore.query.colours import NOT_SEEN_COLOUR, cluster_colours, heat_colour
 from liftcore.query.objects import MOST_SPLATS, objects
 from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.question import Answer, SceneTree
-from liftcore.values.lift_file import OLD_TENSORS
 
 if TYPE_CHECKING:  # these load torch
     from PIL.Image import Image
@@ -250,7 +249,6 @@ def layer_colours(scene: OpenedLift, layer: str) -> np.ndarray:
     Raises:
         InvalidQuery: the lift has no clusters, or no confidence.
     """
-    layer = OLD_TENSORS.get(layer, layer)
     if layer == "pca":
         colours = np.round(255 * scene.principal.numpy()).astype(np.uint8)
     elif layer == "cluster":

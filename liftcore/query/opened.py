@@ -14,9 +14,7 @@ import numpy as np
 
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound
 from liftcore.io.splats import quick_count
-from liftcore.query.question import Query
 from liftcore.query.scores import mean_direction, norms_of
-from liftcore.runtime.aliases import deprecated_keywords, deprecated_names
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.world import UNKNOWN, WorldFrame
 from liftcore.text.table import TableEncoder, own_words
@@ -40,7 +38,6 @@ MOST_OF_OBJECT = 512  # splats of an object, likewise
 MOST_PIXELS = 1 << 26  # of a picture: 67 million take a minute of one core and 2 GB
 
 
-@deprecated_names(evidence="total_weight", seen="has_feature", all_seen="all_have_features")
 class OpenedLift:
     """A lift with the splats and cameras of its scene: the state of `liftcore.query.scene.Scene`.
 
@@ -241,14 +238,13 @@ class OpenedLift:
         """Weights in histograms of the splats with a feature, their total weights; None if all are zero."""
         return self.weights_with_feature(self.total_weight)
 
-    @deprecated_keywords(weigh="weight_by")
     def splat_weights(self, weight_by: str) -> np.ndarray:
         """Return the weight of each splat, [P] f32: its total weight, or that times its confidence.
 
         Raises:
             InvalidQuery: the lift has no confidence.
         """
-        if Query.current_value("weight_by", weight_by) == "total_weight":
+        if weight_by == "total_weight":
             return self.total_weight
         if self.confidence is None:
             hint, got = "lift again with the preset default, or with robust_steps", "a lift that was not reweighted"

@@ -27,8 +27,7 @@ from pydantic_core import CoreSchema, core_schema
 
 from liftcore.errors import InvalidQuery
 from liftcore.query.terms import NOTATIONS, SETS, Example, SplatSet, Term, Vector, parse_example, parse_set
-from liftcore.runtime.aliases import add_deprecated_properties, deprecated_keywords
-from liftcore.runtime.fields import Body, NoBoolean, PlainModel, old_field, takes
+from liftcore.runtime.fields import Body, NoBoolean, PlainModel, takes
 from liftcore.scene.compositing import MAX_SIDE
 from liftcore.scene.world import WorldFrame
 
@@ -152,7 +151,6 @@ class Viewpoint(Body):
 class Picture(Viewpoint):
     """A picture of the scene."""
 
-    old_names: ClassVar[Mapping[str, str]] = {"what": "channel"}
     channel: Rendered = Field(
         default="rgb",
         description="the splats' colours, expected depth, three principal components of features, clusters, or how "
@@ -172,8 +170,6 @@ class Query(Viewpoint):
 
     model_config = ConfigDict(frozen=True)
     error_type: ClassVar = InvalidQuery
-    old_names: ClassVar[Mapping[str, str]] = {"weigh": "weight_by"}
-    old_values: ClassVar[Mapping[str, Mapping[str, str]]] = {"weight_by": {"evidence": "total_weight"}}
 
     text: Texts = Field(default=[], description="what to look for; may be given several times")
     like: Examples = Field(
@@ -357,7 +353,6 @@ class ReferenceComparison(Value):
 class Presence(Value):
     """Presence of the target in the scene."""
 
-    old_names: ClassVar[Mapping[str, str]] = {"why": "reason"}
     present: bool | None = Field(description="true if the target is in the scene; null if unknown or uncertain")
     presence: float | None = Field(description="its probability, 0..1, present from 0.5 on; null if unknown")
     reason: str = Field(description="one sentence on how it is known whether it is there, or why it is not")
@@ -365,7 +360,6 @@ class Presence(Value):
         default=None,
         description="numbers of `reason`, for one word that is absent or uncertain; null otherwise, and of a part",
     )
-    why = old_field("reason", str)
 
 
 class SelectionSummary(Presence):
@@ -401,14 +395,12 @@ class TopSplat(Value):
 class WordMatch(Value):
     """A text that the encoder's table lacks, and the word of it that stands for the text."""
 
-    old_names: ClassVar[Mapping[str, str]] = {"how": "match"}
     text: str
     word: str = Field(description="for a part: that part of the object in which it is searched")
     match: Literal["spelling", "qualifier", "synonym", "number", "head", "part"] = Field(
         description="the kind of match: letters, a word that says which is meant, meaning, one or several, the "
         "head of a phrase, or a part that it names"
     )
-    how = old_field("match", str)
 
 
 class SuggestedWord(Value):
@@ -421,12 +413,9 @@ class SuggestedWord(Value):
 class SuggestedWords(Value):
     """Words that complete a text, and words of the lift's objects."""
 
-    old_names: ClassVar[Mapping[str, str]] = {"any_text": "open_vocabulary", "here": "scene_words"}
     open_vocabulary: bool = Field(description="true if any text can be queried, not the words of a table alone")
-    any_text = old_field("open_vocabulary", bool)
     words: tuple[SuggestedWord, ...] = Field(description="those that a text may become, the likeliest first")
     scene_words: tuple[str, ...] = Field(description="words for the objects that the lift found by masks alone")
-    here = old_field("scene_words", tuple[str, ...])
 
 
 class Answer(SelectionSummary):
@@ -453,7 +442,6 @@ class Answer(SelectionSummary):
     _arrays: tuple[np.ndarray, np.ndarray, np.ndarray] = PrivateAttr()
 
     @classmethod
-    @deprecated_keywords(seen="has_feature")
     def of(
         cls, query: Query, scores: np.ndarray, has_feature: np.ndarray, selected: np.ndarray, **fields: Any
     ) -> Self:
@@ -493,9 +481,6 @@ class Answer(SelectionSummary):
         return self.present is False and self.query.absent == "drop"
 
 
-add_deprecated_properties(Answer, {"dropped": "is_dropped", "seen": "has_feature"})
-
-
 class WithUnits(Value):
     """World frame and unit of sizes and distances: metres if the length of a scene unit is known."""
 
@@ -519,10 +504,8 @@ class SelectedObject(Value):
 class Objects(WithUnits):
     """Objects of an answer."""
 
-    old_names: ClassVar[Mapping[str, str]] = {"strays": "unassigned_splats", "found": "objects"}
     objects: tuple[SelectedObject, ...] = Field(description="those with the largest total weight first")
     unassigned_splats: int = Field(description="the number of selected splats in none of them")
-    strays = old_field("unassigned_splats", int)
     _numbers: np.ndarray = PrivateAttr()
 
     @classmethod
@@ -558,15 +541,12 @@ class NamedSplats(Value):
 class LabelSummary(Value):
     """The words of a vocabulary that are in the scene."""
 
-    old_names: ClassVar[Mapping[str, str]] = {"words": "word_count", "found": "named_words"}
     word_count: int = Field(description="the number of words of the query")
-    words = old_field("word_count", int)
     splats: int = Field(description="P")
     none: int = Field(description="the number of splats without a word")
     named_words: tuple[NamedSplats, ...] = Field(
         description="the words that are there, those with the largest total weight first"
     )
-    found = old_field("named_words", tuple[NamedSplats, ...])
 
 
 class BestWord(Value):
@@ -648,12 +628,8 @@ class CoveringRegion(Value):
 
 
 def page_fields() -> dict[str, Any]:
-    """Return the JSON schema of each field that decides the answer, with its old names and values, for the page."""
+    """Return the JSON schema of each field that decides the answer, for the page."""
     fields = Query.model_json_schema()["properties"]
-    for old, new in Query.old_names.items():
-        fields[new].setdefault("old_names", []).append(old)
-    for name, old_values in Query.old_values.items():
-        fields[name]["old_values"] = old_values
     return {name: fields[name] for name in Query.deciding()}
 
 

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from liftcore.errors import InvalidInput
-from liftcore.runtime.aliases import deprecated_names
 from liftcore.values.lift import Lift
-from liftcore.values.lift_file import OLD_TENSORS, has_poses, open_lift, save_lift, tensors_of
+from liftcore.values.lift_file import has_poses, open_lift, save_lift, tensors_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
     from liftcore.values.lift import InputFile, LiftMetadata
 
 
-@deprecated_names(**OLD_TENSORS)
 @dataclass(frozen=True, repr=False)
 class LiftResult(Lift):
     """X and its supporting values, one row a splat, in the splats' order."""

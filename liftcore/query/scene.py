@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from liftcore.errors import InvalidLift
 from liftcore.query.opened import OpenedLift
-from liftcore.runtime.aliases import deprecated_keywords, deprecated_names
 from liftcore.runtime.progress import Progress, shown_progress
 
 if TYPE_CHECKING:  # these load torch
@@ -41,10 +40,6 @@ Source: TypeAlias = (  # of a file
 )
 
 
-@deprecated_names(
-    look="view_mask", what="nearest_words", counted="splat_weights", seen_alone="weights_with_feature",
-    thing_means="object_means",
-)  # fmt: skip
 class Scene(OpenedLift):
     """A lift opened for queries, with the splats and cameras of its scene.
 
@@ -183,7 +178,6 @@ class Scene(OpenedLift):
         self.selections[name] = selection
         return selection
 
-    @deprecated_keywords(what="channel")
     def render(self, view: str | Camera, channel: str = "rgb") -> np.ndarray:
         """Render a view: ``rgb``, ``pca``, ``cluster`` or ``confidence``, [H, W, 3] u8 sRGB; ``depth``, [H, W] f32.
 
@@ -366,7 +360,6 @@ class Scene(OpenedLift):
         with whole_file(Path(path)) as handle:
             handle.writelines(content)
 
-    @deprecated_keywords(seen="view_mask")
     def blocks_of(
         self,
         source: Source = None,

@@ -32,7 +32,6 @@ from liftcore.query.scores import cosines, norms_of
 from liftcore.query.selection import levels_disagree, parts_of_words
 from liftcore.query.terms import Example
 from liftcore.query.threshold import find_threshold
-from liftcore.runtime.aliases import deprecated_names
 from liftcore.runtime.one_line import one_line
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, silent
@@ -49,7 +48,6 @@ AT_ONCE = 16  # words whose cosines are in memory at once: [P, AT_ONCE] f32
 LEGEND_WORDS = 20  # words of a drawn legend
 
 
-@deprecated_names(found="named_words")
 @dataclass(frozen=True)
 class Segmentation:
     """Word of every splat, of some words."""

@@ -17,7 +17,6 @@ from liftcore.query.objects import MOST_SPLATS, object_box, objects
 from liftcore.query.opened import MOST_PIXELS, OpenedLift
 from liftcore.query.question import Answer, Box, Query
 from liftcore.query.terms import PixelBox, SplatSet, Stroke
-from liftcore.runtime.aliases import deprecated_keywords
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.touching import REACH, spreads_along, touching_pairs
 
@@ -85,7 +84,6 @@ class Selection:
         """The edits up to the present state, in their order, without undone ones."""
         return tuple(step.edit for step in self._steps[1 : self._place + 1])
 
-    @deprecated_keywords(how="operation")
     def edit(
         self, operation: str | Edit, source: Answer | Query | str | np.ndarray | int | None = None, **fields: Any
     ) -> Self:

@@ -2,18 +2,15 @@
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
     from typing import Any
 
 
-def lazy_names(
-    package: str, file: str, aliases: "Mapping[str, str] | None" = None
-) -> "tuple[Callable[[str], Any], Callable[[], list[str]]]":
+def lazy_names(package: str, file: str) -> "tuple[Callable[[str], Any], Callable[[], list[str]]]":
     """Return ``__getattr__`` and ``__dir__`` of a module with a stub (``.pyi``) of imports beside its file.
 
     Args:
         package: the module's name. file: its file.
-        aliases: new names by old ones, which are read with a `DeprecationWarning` and are in no list.
 
     The stub is read at the first access. ``__all__`` is its names, sorted, without ``__version__``.
     """
@@ -37,11 +34,6 @@ def lazy_names(
             value = sorted(homes.keys() - {"__version__"})
         elif name in homes:
             value = getattr(import_module(homes[name]), name)
-        elif aliases is not None and name in aliases:
-            import warnings
-
-            warnings.warn(f"{package}.{name} is now {aliases[name]}", DeprecationWarning, stacklevel=2)
-            return get(aliases[name])
         else:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         vars(sys.modules[package])[name] = value

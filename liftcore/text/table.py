@@ -11,7 +11,6 @@ import numpy as np
 
 from liftcore.errors import InvalidInput, InvalidQuery, InvalidTable
 from liftcore.io.safetensors_file import check_header, map_tensors
-from liftcore.runtime.aliases import deprecated_keywords
 from liftcore.runtime.one_line import one_line
 from liftcore.text import check_texts
 from liftcore.text.wording import SUGGESTED, Vocabulary, normalize_text
@@ -156,7 +155,6 @@ class TableEncoder:
         """Vocabulary that finds these words in typed text."""
         return Vocabulary(self.words)
 
-    @deprecated_keywords(here="scene_words")
     def refusal(self, text: str, scene_words: Sequence[str] = ()) -> InvalidQuery:
         """Return the error for a word that is not in the table, with suggestions.
 

@@ -6,24 +6,20 @@ Its metadata are read without torch, so that a query of a file does not load it.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict
 
-from liftcore.errors import InvalidLift, InvalidSplats
-from liftcore.runtime.aliases import AliasedDict, current_names, deprecated_names, with_old_names
-from liftcore.runtime.fields import AliasedModel
+from liftcore.errors import InvalidSplats
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.origin import FILE_ORIGIN, Origin
 from liftcore.scene.views import composed
 from liftcore.scene.world import UNKNOWN, WorldFrame
 from liftcore.text.table import TableEncoder, own_words
-from liftcore.values.lift_file import FORMAT, NODE_TENSORS, OLD_DIAGNOSTICS, OLD_TENSORS
+from liftcore.values.lift_file import FORMAT, NODE_TENSORS
 from liftcore.values.settings import LiftSettings
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     import torch
     from torch import Tensor
 
@@ -55,27 +51,11 @@ def landmarks_of(splats: Splats) -> tuple[Landmark, ...]:
     return tuple((row, x, y, z) for row, (x, y, z) in zip(rows, places, strict=True))
 
 
-class Diagnostics(AliasedDict):
-    """Measurements of a lift by their names, as plain numbers."""
-
-    aliases = OLD_DIAGNOSTICS
-
-    @classmethod
-    def of(cls, values: Mapping[str, Any]) -> Self:
-        """Return diagnostics under their new names.
-
-        Raises:
-            InvalidLift: an old and a new name have different values.
-        """
-        return cls(current_names(values, OLD_DIAGNOSTICS, InvalidLift))
-
-
-class LiftMetadata(AliasedModel):
+class LiftMetadata(BaseModel):
     """Settings, inputs and measurements of a lift."""
 
     model_config = ConfigDict(frozen=True)
 
-    old_names: ClassVar = {"certificate": "diagnostics"}
     format: str = FORMAT
     version: str
     settings: LiftSettings
@@ -86,22 +66,14 @@ class LiftMetadata(AliasedModel):
     text_space: str = ""  # the text encoder that shares the space; "" not named, "none" when there is none
     words: tuple[str, ...] = ()  # that its packs brought: it is asked in these without an encoder
     views: tuple[Annotated[str, AfterValidator(composed)], ...]  # the views that were lifted
-    poses: str = ""  # of their cameras (`liftcore.values.lift_file.poses_of`); "" in older lifts
+    poses: str = ""  # of their cameras (`liftcore.values.lift_file.poses_of`); "" after a transform
     origin: Origin = FILE_ORIGIN  # of the splats (`Splats.origin`), and of the positions in ``.splat`` and ``.spz``
     world: WorldFrame = UNKNOWN  # of the splats: as their file, else that of the cameras says it, or somebody later
-    landmarks: tuple[Landmark, ...] = ()  # positions of some splats, to verify their rows; () in older lifts
-    diagnostics: Annotated[dict[str, Any], AfterValidator(Diagnostics.of)]
+    landmarks: tuple[Landmark, ...] = ()  # positions of some splats, to verify their rows
+    diagnostics: dict[str, Any]
     timings: dict[str, float]  # seconds a stage
 
-    @field_validator("settings", mode="before")
-    @classmethod
-    def _fill_older_defaults(cls, stored: Any) -> Any:
-        """Give settings that are newer than the lift their field's default, as lifts did before, not the level's."""
-        defaults = {name: field.default for name, field in LiftSettings.model_fields.items()}
-        return defaults | LiftSettings.current_names(stored) if isinstance(stored, dict) else stored
 
-
-@deprecated_names(**OLD_TENSORS)
 @dataclass(frozen=True)
 class Lift:
     """X and what supports it, one row a splat, in the splats' order."""
@@ -157,15 +129,6 @@ class Lift:
     def diagnostics(self) -> dict[str, Any]:
         """Measurements of the lift (residual, bound, row sums, warnings, plan), as plain numbers."""
         return self.metadata.diagnostics
-
-    @staticmethod
-    def diagnostics_of_reply(diagnostics: Mapping[str, Any]) -> dict[str, Any]:
-        """Return diagnostics of a lift, of an older file too, with each old name behind its new one.
-
-        Raises:
-            InvalidLift: an old and a new name have different values.
-        """
-        return with_old_names(Diagnostics.of(diagnostics), OLD_DIAGNOSTICS)
 
     @property
     def table(self) -> TableEncoder | None:

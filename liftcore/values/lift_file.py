@@ -19,7 +19,7 @@ import re
 import unicodedata
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,7 +29,6 @@ from liftcore.io.kinds import wrong_kind
 from liftcore.io.remote import local_path, open_output
 from liftcore.io.safetensors_file import map_tensors
 from liftcore.io.shards import INDEX, SUFFIX, map_shards, write_shards
-from liftcore.runtime.aliases import current_names
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -40,17 +39,7 @@ if TYPE_CHECKING:
     from liftcore.values.lift import InputFile, Lift, LiftMetadata
 
 FORMAT = "splatlift-lift/2"
-FORMATS = ("splatlift-lift/1", FORMAT)  # that are read
 TENSORS = ("features", "total_weight", "view_consistency", "has_feature")
-OLD_TENSORS = {  # of older files: new names by old ones
-    "evidence": "total_weight",
-    "seen": "has_feature",
-    "agreement": "view_consistency",
-}
-OLD_DIAGNOSTICS = {  # of older files: new names by old ones
-    "seen_share": "feature_share",
-    "evidence_over_half_share": "total_weight_over_half_share",
-}
 CONFIDENCE = "confidence"  # in lifts that were reweighted
 NEAR = 3  # folders of an input's path, and above a lift, among which it is looked for
 MOST_BESIDE = 16  # files of one kind beside a lift, that are read to know one of them
@@ -131,7 +120,6 @@ def _read_arrays(source: Path, path: Path | str) -> tuple[dict[str, np.ndarray],
         tensors, header = map_shards(source) if (source / INDEX).is_file() else map_tensors(source)
         if "splatlift" not in header:
             raise InvalidLift(str(path), expected="a lift file", got="safetensors without lift metadata")
-        tensors = current_names(tensors, OLD_TENSORS, InvalidLift)
         missing = [name for name in TENSORS if name not in tensors]
         if missing:
             _check_format(header["splatlift"], path)
@@ -170,9 +158,9 @@ def _check_format(text: str, path: Path | str) -> None:
     """
     metadata = json.loads(text)
     name = metadata.get("format", FORMAT) if isinstance(metadata, dict) else FORMAT
-    if name not in FORMATS:
+    if name != FORMAT:
         hint = "install the version of splatlift that wrote it, or a later one"
-        raise InvalidLift(str(path), expected=f"a lift of {' or '.join(FORMATS)}", got=repr(name)[:80], hint=hint)
+        raise InvalidLift(str(path), expected=f"a lift of {FORMAT}", got=repr(name)[:80], hint=hint)
 
 
 def _no_lift(path: Path | str, error: Exception) -> InvalidLift:
@@ -331,29 +319,24 @@ def _in_store(lift: Path, sha256: str) -> Iterator[Path]:
 def has_poses(place: Path, metadata: LiftMetadata) -> bool:
     """Return True if a file or folder has the cameras of the lifted views as they were, whatever others it has.
 
-    Lifts from before poses were kept have none to compare: then it has not.
-
     Raises:
         InvalidCameras: it does not read.
     """
     from liftcore.io.cameras import read_cameras
 
-    if not metadata.poses:
-        return False
     cameras = read_cameras(place, choosing=False, views=metadata.views)
     matches = [cameras[view] for view in metadata.views if view in cameras]
     if len(matches) != len(metadata.views):
         return False
-    # Lifts from before names were composed have the digest of those that a Mac gave.
-    return metadata.poses in (poses_of(matches), poses_of(matches, "NFD"))
+    return metadata.poses == poses_of(matches)
 
 
-def poses_of(cameras: Sequence[Camera], form: Literal["NFC", "NFD"] = "NFC") -> str:
-    """Return a digest of what cameras see, in their order, with their names in a form of Unicode."""
+def poses_of(cameras: Sequence[Camera]) -> str:
+    """Return a digest of what cameras see, in their order, with their names in composed form."""
     total = hashlib.sha256()
     for camera in cameras:
         total.update(camera.viewmat.tobytes() + camera.K.tobytes())
-        description = (unicodedata.normalize(form, camera.name), camera.width, camera.height, camera.lens)
+        description = (unicodedata.normalize("NFC", camera.name), camera.width, camera.height, camera.lens)
         total.update(repr(description if camera.face is None else (*description, camera.face)).encode())
     return total.hexdigest()
 

@@ -18,7 +18,6 @@ from torch import Tensor
 
 from liftcore.errors import InvalidInput, Unavailable
 from liftcore.io.safetensors_file import map_tensors, write_tensors
-from liftcore.runtime.aliases import current_names, deprecated_keywords, deprecated_names
 from liftcore.runtime.cores import cores
 from liftcore.runtime.device import out_of_memory
 from liftcore.runtime.memory import zeros
@@ -26,15 +25,12 @@ from liftcore.runtime.one_line import one_line
 from liftcore.runtime.one_thread import one_thread
 
 FORMAT = "splatlift-weights/2"
-OLD_FORMAT = "splatlift-weights/1"  # with other names of tensors
-OLD_TENSORS = {"evidence": "total_weight", "evidence_splats": "total_weight_splats"}
 MEMORY_LIMIT = 1 << 28  # bytes of W that stay in memory; what is beyond lies in mapped files
 MOST_REGIONS = 2**31 - 1  # of all views: an entry names its region in four bytes
 BLOCK_ENTRIES = 1 << 17  # that a thread works on at a time, unless a splat alone has more
 BLOCK_ROWS = 1 << 11
 
 
-@deprecated_names(**OLD_TENSORS)
 @dataclass(frozen=True)
 class RegionWeights:
     """``W = A'^T S`` of one view or of many, CSR by splat, and the total weight ``A^T 1``.
@@ -170,7 +166,6 @@ class RegionWeights:
         indptr = np.concatenate([[0], np.cumsum(lengths)])
         return csr_array((host.weight.numpy(), host.region.numpy(), indptr), shape=(splats, int(host.offsets[-1])))
 
-    @deprecated_keywords(others="extra_tensors")
     def save(self, path: Path | str, extra_tensors: Mapping[str, Tensor] | None = None) -> None:
         """Write one safetensors file, whole or not at all: its tensors by name, and ``views`` in the metadata.
 
@@ -197,8 +192,7 @@ class RegionWeights:
             arrays, metadata = map_tensors(Path(path))
         except (OSError, ValueError, SafetensorError) as error:
             raise InvalidInput("weights", expected=f"a file of {FORMAT}", got=str(error), hint=hint) from None
-        arrays = current_names(arrays, OLD_TENSORS)
-        if metadata.get("format") not in (FORMAT, OLD_FORMAT) or not set(names) <= arrays.keys():
+        if metadata.get("format") != FORMAT or not set(names) <= arrays.keys():
             raise InvalidInput("weights", expected=f"a file of {FORMAT}", got="another safetensors file", hint=hint)
         tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
         extra_tensors = {name: tensor for name, tensor in tensors.items() if name not in names}

@@ -8,13 +8,12 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Mapping
 from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
 from liftcore.errors import InvalidSettings
-from liftcore.runtime.aliases import add_deprecated_properties, deprecated_keywords
 from liftcore.runtime.device_name import device_name
 from liftcore.runtime.fields import PlainModel
 from liftcore.runtime.nearest import nearest
@@ -128,8 +127,6 @@ class LiftSettings(PlainModel):
     """All that decides the result of a lift, and where it runs. Knobs left out take the preset's values."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
-    old_names: ClassVar = {"certificate_rays": "diagnostic_rays", "speed": "quality"}
-    error_type: ClassVar = InvalidSettings
 
     preset: Preset = Field(
         Preset.DEFAULT,
@@ -335,7 +332,6 @@ class LiftSettings(PlainModel):
     def _fill_from_preset_and_quality(cls, values: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
         if not isinstance(values, dict):
             return handler(values)
-        values = cls.current_names(values)
         if "device" in values:
             values = values | {"device": device_name(values["device"])}
         preset, quality = values.get("preset", Preset.DEFAULT), values.get("quality", Quality.EXACT)
@@ -517,14 +513,12 @@ class LiftSettings(PlainModel):
         return cls.of() if settings is None else settings
 
     @classmethod
-    @deprecated_keywords(others="changes")
     def from_preset(cls, preset: Preset | str | Self, changes: Mapping[str, Any]) -> Self:
         """Return a preset by its name, or settings as they are, with others in place of some.
 
         Raises:
             InvalidSettings: an unknown name or a value out of range.
         """
-        changes = cls.current_names(dict(changes))
         if not isinstance(preset, cls):
             return cls.of(preset=preset, **changes)
         if not changes:
@@ -534,7 +528,7 @@ class LiftSettings(PlainModel):
         explicit = preset.model_fields_set
         explicit = explicit if len(explicit) < len(values) else set()  # all of them: settings of a file
         overrides = {name: value for name, value in values.items() if name in explicit or value != defaults[name]}
-        return cls.of(**base | overrides | changes)
+        return cls.of(**base | overrides | {**changes})
 
     @classmethod
     def hint_of_name(cls, name: str) -> str:
@@ -564,9 +558,6 @@ class LiftSettings(PlainModel):
             expected, got = f"at most {MOST_DIAGNOSTIC_RAYS} rays", str(settings.diagnostic_rays)
             raise InvalidSettings("diagnostic_rays", expected=expected, got=got)
         return settings
-
-
-add_deprecated_properties(LiftSettings, {"chosen": "from_preset", "asks_consensus": "uses_consensus"})
 
 
 def _settings_error(error: ValidationError, known_names: Iterable[str]) -> InvalidSettings:

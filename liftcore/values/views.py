@@ -14,7 +14,6 @@ from torch import Tensor
 
 from liftcore.errors import InvalidFeatures
 from liftcore.io.npy import without_unit_axes
-from liftcore.runtime.aliases import deprecated_keywords
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.splats import shared_tensor
 
@@ -61,14 +60,12 @@ class Regions:
     codebook: Tensor
     """[M, F] f16 or f32"""
 
-    @deprecated_keywords(where="context")
     def __init__(self, labels: Array, codebook: Array, *, context: str = "") -> None:
         rows = _features(codebook, "M, F", f"{context} codebook".strip())
         object.__setattr__(self, "codebook", rows)
         object.__setattr__(self, "labels", _labels(labels, len(rows), f"{context} labels".strip()))
 
     @classmethod
-    @deprecated_keywords(where="context")
     def from_masks(
         cls,
         masks: Array | Sequence[Array],
@@ -151,7 +148,6 @@ class FeatureGrid:
     grid: Tensor
     """[h, w, F] f16 or f32"""
 
-    @deprecated_keywords(where="context")
     def __init__(self, grid: Array, *, context: str = "") -> None:
         cells = _features(grid, "h, w, F", f"{context} grid".strip())
         object.__setattr__(self, "grid", cells)

@@ -129,7 +129,7 @@ def _planned(order: models.LiftRequest, deps: AppState) -> models.Plan:
 
 
 def _compare(order: models.TradeoffRequest, deps: AppState, key: str | None) -> Response:
-    settings = LiftSettings.current_names(order.settings)
+    settings = order.settings
     if models.TRADEOFF_SETTING in settings:
         expected, got = "settings that are the same in all runs", "one that is compared"
         raise InvalidSettings(models.TRADEOFF_SETTING, expected=expected, got=got)
@@ -251,10 +251,7 @@ def shape(job: JobRecord) -> models.Job:
         links["cancel"] = f"/jobs/{job.id}/cancel"
     if job.state is models.JobState.SUCCEEDED:
         links |= RESULT_LINKS[job.kind](job.id)
-    settings = LiftSettings.with_old_names(job.settings)
-    return models.Job.model_validate(
-        {**vars(job), "settings": settings, "problem": _problem(job.problem), "links": links}
-    )
+    return models.Job.model_validate({**vars(job), "problem": _problem(job.problem), "links": links})
 
 
 def _problem(fault: Mapping[str, str] | None) -> models.Problem | None:

@@ -10,7 +10,6 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 
-from liftcore import LiftResult, LiftSettings
 from liftcore.errors import NotFound
 from liftcore.files import in_camera_orientation
 from service import models
@@ -357,8 +356,6 @@ def shape_lift(lift: LiftRecord) -> models.LiftResult:
         "origin": (0.0, 0.0, 0.0),
         "world": {},
         **lift.metadata,
-        "settings": LiftSettings.with_old_names(lift.metadata["settings"]),
-        "diagnostics": LiftResult.diagnostics_of_reply(lift.metadata["diagnostics"]),
         **vars(lift),
         "links": links,
     }
@@ -371,10 +368,4 @@ def shape_tradeoff(tradeoff: TradeoffRecord) -> models.Tradeoff:
     links = {"self": path, "job": f"/jobs/{tradeoff.id}", "chart": f"{path}/chart", "table": f"{path}/table"}
     names = ("id", "splats", "cameras", "features", "labels", "created")
     fields = {name: getattr(tradeoff, name) for name in names}
-    runs = [_run_with_old_names(run) for run in tradeoff.document["runs"]]
-    return models.Tradeoff.model_validate({**tradeoff.document, "runs": runs, **fields, "links": links})
-
-
-def _run_with_old_names(run: dict[str, Any]) -> dict[str, Any]:
-    settings = {name: LiftSettings.with_old_names(run[name]) for name in ("options", "settings") if name in run}
-    return LiftResult.diagnostics_of_reply(run) | settings
+    return models.Tradeoff.model_validate({**tradeoff.document, **fields, "links": links})

@@ -139,7 +139,7 @@ def order_of(metadata: Mapping[str, Any]) -> JobOrder:
     """
     files = (metadata["splats"], metadata["cameras"], *metadata["features"])
     splats, cameras, *features = [f"sha256:{file['sha256']}" for file in files]
-    settings, diagnostics = dict(metadata["settings"]), _by_current_names(metadata).get("diagnostics")
+    settings, diagnostics = dict(metadata["settings"]), metadata.get("diagnostics")
     plan = diagnostics.get("plan") if isinstance(diagnostics, Mapping) else None
     if isinstance(plan, Mapping) and BY_HAND not in str(plan.get("rendering", BY_HAND)):
         settings["antialiased"] = "auto"  # the lift records the resolved value
@@ -279,7 +279,7 @@ class LiftStore:
     def _insert(
         self, connection: sqlite3.Connection, job: str, result: FinishedLift, size: int, created: float
     ) -> None:
-        values = _by_current_names(result.metadata)
+        values = dict(result.metadata)
         metadata, views = json.dumps(values), values["views"]
         if len(metadata) > SHOWN_BYTES:
             diagnostics = _without(values["diagnostics"], *NAMES_OF_VIEWS)
@@ -355,14 +355,9 @@ class LiftStore:
             LiftRecord,
             row,
             path=self._files.root / row["file"],
-            metadata=_by_current_names(json.loads(row["metadata"])),
+            metadata=json.loads(row["metadata"]),
             features=tuple(json.loads(row["features"])),
         )
-
-
-def _by_current_names(metadata: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the metadata of a lift, of 0.4 too, by today's names."""
-    return {"diagnostics" if name == "certificate" else name: value for name, value in metadata.items()}
 
 
 def _without(values: dict[str, Any], *names: str) -> dict[str, Any]:

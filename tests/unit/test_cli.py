@@ -46,7 +46,7 @@ def test_scene_is_lifted_inspected_and_queried(scene: Path, capsys: pytest.Captu
     document = json.loads(out)
     assert (document["splats"], document["channels"], document["views"]) == (2, 3, 1)
     assert document["settings"]["preset"] == "row-sum"
-    assert document["feature_share"] == document["seen_share"] == 1
+    assert document["feature_share"] == 1
     assert document["warnings"] == ["1 views have features but no camera and were skipped: lost"]
     assert {"diagnostics", "timings", "out"} <= set(document)
     features = load_lift(scene / "lift.safetensors").features
@@ -61,8 +61,8 @@ def test_scene_is_lifted_inspected_and_queried(scene: Path, capsys: pytest.Captu
     status, out, err = run(capsys, *question, "--view", "front", "--top", 1, "--json", *options)
     assert (status, err) == (0, "")
     document = json.loads(out)
-    assert document["selected"] == 1
-    assert document["top"][0]["splat"] == 0
+    assert document["answer"]["count"] == 1
+    assert document["answer"]["top"][0]["splat"] == 0
     assert document["files"] == {kind: str(path) for kind, path in files.items()}
     scores = np.load(files["scores"])
     assert scores.dtype == np.float32
@@ -76,8 +76,8 @@ def test_scene_is_lifted_inspected_and_queried(scene: Path, capsys: pytest.Captu
     assert re.search(r"  splat 0: score \S+ at \(\S+, \S+, \S+\)\n  splat 1: ", out)
     assert "\n  object 1: 1 splats, 100.0% of the selection, score 0.9" in out and "in no object" not in out
     status, out, err = run(capsys, *question, "--objects", "--json")
-    (obj,) = json.loads(out)["objects"]
-    assert obj["splats"] == 1 and obj["box"] == [obj["centre"]] * 2
+    (obj,) = json.loads(out)["answer"]["objects"]
+    assert obj["splats"] == 1 and [*obj["box"].values()] == [obj["centre"]] * 2
     assert json.loads(out)["answer"]["unassigned_splats"] == 0
     status, out, err = run(capsys, "inspect", scene / "lift.safetensors", "--json")
     assert json.loads(out)["kind"] == "lift"

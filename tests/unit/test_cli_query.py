@@ -108,7 +108,11 @@ def test_the_table_that_ships_answers_where_weights_of_its_space_cannot_be_had(
     save_lift(replace(lift, **dict.fromkeys(NODE_TENSORS)), scene / "clip.safetensors")
     status, out, _ = run(capsys, "query", scene / "clip.safetensors", "cat", "--json")
     document, name = json.loads(out), open_encoder("lvis").name
-    assert (status, document["encoder"], document["statistics"]["max"]) == (0, name, pytest.approx(1.0, abs=1e-3))
+    assert (status, document["encoder"], document["answer"]["statistics"]["max"]) == (
+        0,
+        name,
+        pytest.approx(1.0, abs=1e-3),
+    )
     assert "using the table lvis" in caplog.text
     # By all words that happen to be here: not asked.
     assert run(capsys, "segment", scene / "clip.safetensors")[0] == 2

@@ -140,8 +140,8 @@ def test_lift_is_described(tmp_path: Path) -> None:
     (tmp_path / "splats.ply").unlink()
     report = inspected(tmp_path / "l")
     assert (report["kind"], report["splats"], report["channels"]) == ("lift", count, len(WORDS))
-    assert report["feature_share"] == report["seen_share"] == pytest.approx(1 - unseen / count)
-    assert report["view_consistency"] == report["agreement"] and report["settings"]["preset"] == "row-sum"
+    assert report["feature_share"] == pytest.approx(1 - unseen / count)
+    assert report["view_consistency"] and report["settings"]["preset"] == "row-sum"
     expected = f"{unseen} of {count} splats were reached by no labelled ray; they have no features of their own"
     assert report["warnings"][0] == expected and "no longer at" in report["warnings"][1]
 

@@ -265,9 +265,6 @@ def test_plan_warns_of_splats_with_activated_opacities_and_scales(scene):
     plan = lc.plan(replace(splats, opacity_logits=opacities, log_scales=scales), cameras, views)
     warnings = plan.input_warnings
     assert any("no logits" in text for text in warnings) and any("no logarithms" in text for text in warnings)
-    for old, new in (("told", "input_warnings"), ("there", "available_views"), ("kept_on_card", "gpu_weight_bytes")):
-        with pytest.deprecated_call(match=f"{old} is now {new}"):
-            assert getattr(plan, old) == getattr(plan, new)
     assert plan.available_views == len(views)
     assert not any("as if they were no" in text for text in lc.plan(splats, cameras, views).input_warnings)
 

@@ -30,7 +30,6 @@ from liftcore.lifting.planning.plan import PlannedScene, planned_scene, scene_wa
 from liftcore.lifting.planning.views import SAMPLE, WELL_COVERED, greedy, spaced_indices
 from liftcore.raster import check_splats_and_threads, open_raster
 from liftcore.raster.base import Raster, ViewRequest
-from liftcore.runtime.aliases import deprecated_names, with_old_names
 from liftcore.runtime.device import CPU
 from liftcore.runtime.one_line import join_names, one_line
 from liftcore.runtime.one_thread import one_thread
@@ -61,7 +60,6 @@ class PhotoCoverage:
     seconds: float  # estimate of the geometry of a lift with them, on this machine now
 
 
-@deprecated_names(shown="coverage")
 @dataclass(frozen=True)
 class PhotoPlan(PlannedScene):
     """An order of photos to encode. Plain values; except for the seconds, the same inputs give the same plan."""
@@ -79,7 +77,7 @@ class PhotoPlan(PlannedScene):
 
     def facts(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        return {**with_old_names(asdict(self), {"shown": "coverage"}), "photos": len(self.order)}
+        return {**asdict(self), "photos": len(self.order)}
 
     def lines(self, *, verbose: bool = False) -> Iterator[str]:
         """Yield lines of the plan for people.

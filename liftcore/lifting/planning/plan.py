@@ -26,7 +26,6 @@ from liftcore.lifting.planning.views import (
 )
 from liftcore.raster import open_raster
 from liftcore.raster.base import Raster
-from liftcore.runtime.aliases import deprecated_names
 from liftcore.runtime.device import CPU, Device
 from liftcore.runtime.memory import check_disk, free_memory, lack_of_disk
 from liftcore.runtime.one_line import join_names, one_line
@@ -104,7 +103,6 @@ def scene_warnings(
     return *splats.warnings, *rendering, *cameras.warnings, *distortion_warning(views)
 
 
-@deprecated_names(told="input_warnings", there="available_views", kept_on_card="gpu_weight_bytes")
 @dataclass(frozen=True)
 class Plan(PlannedScene):
     """The plan of a lift. Plain values: the same inputs and settings give the same plan."""

@@ -23,12 +23,11 @@ from liftcore.evaluate import tradeoff_report as report
 from liftcore.evaluate.accuracy import centred_cosines, class_ious, cosine_figures, shared_pixels
 from liftcore.evaluate.ranking import accuracy_of, choose
 from liftcore.evaluate.tradeoff import RunSpec, SceneFiles, candidates_of, measure_run
-from liftcore.evaluate.tradeoff_report import TradeoffDocument, table_of
+from liftcore.evaluate.tradeoff_report import table_of
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import dense_view, reading_matrix
 from liftcore.runtime.progress import silent
 from liftcore.scene.compositing import CompositingParams
-from liftcore.values.settings import LiftSettings
 from liftcore.values.views import FeatureGrid
 from tests.scenes import centred, observed, random_camera, random_splats, write_scene
 
@@ -242,8 +241,6 @@ def test_chart_table_and_json_are_written(tmp_path):
     assert [line.split(" | ")[0] for line in table_of(document)[2:]] == [
         "| **unclear**", "| **distinct**", "| **equal**", "| **exact**",
     ]  # fmt: skip
-    old = {{"over_budget": "skipped", "invalid_runs": "refused"}.get(name, name): document[name] for name in document}
-    assert report.page_of(old) == report.page_of(document)
     single = document | {"runs": runs[:1], "choice": choice_of(RUNS[0])}
     report.save(single, tmp_path / "alone")
     assert "\nNothing can be recommended: exact alone fitted" in "\n".join(report.page_of(single))
@@ -259,14 +256,7 @@ def test_command_compares_in_processes_of_their_own(tmp_path, capsys):
     assert document["runs"][0]["cosine"] == pytest.approx(1.0)
     assert all(Path(file).is_file() for file in document["files"])
     saved = json.loads((tmp_path / "out" / "tradeoff.json").read_text())
-    for new, old in (("over_budget", "skipped"), ("invalid_runs", "refused")):
-        assert document[old] == document[new] == saved[new] and old not in saved
-        with pytest.deprecated_call(match=f"{old} is now {new}"):
-            assert TradeoffDocument(saved)[old] == saved[new]
-    run = document["runs"][0]
-    assert run["feature_share"] == run["seen_share"] and run["options"]["speed"] == run["options"]["quality"]
-    for old, new in LiftSettings.old_names.items():
-        assert run["settings"][old] == run["settings"][new]
+    assert all(document[name] == saved[name] for name in ("over_budget", "invalid_runs"))
     assert np.isfinite(document["runs"][0]["wall_with_reading_ratio"])
     repeated_options = vars(cli.build_parser().parse_args(shlex.split(document["command"])[1:]))
     options = vars(cli.build_parser().parse_args([*command, "--set", "diagnostic_rays=0", "--threads", "1"]))

@@ -207,11 +207,14 @@ def test_a_lift_of_prompts_is_asked_in_its_words_alone(tmp_path: Path, capsys: p
     assert run(capsys, "lift", tmp_path / "scene.ply", tmp_path / "cameras.json", pack, "-o", lifted)[0] == 0
     pack.unlink()  # queries need the lift only
     status, out, err = run(capsys, "query", lifted, "a red apple", "--json")
-    assert (status, err, json.loads(out)["selected"]) == (0, "", 20)
+    assert (status, err, json.loads(out)["answer"]["count"]) == (0, "", 20)
     # As no other words compete.
-    assert json.loads(out)["present"] is None and "not known" in json.loads(out)["answer"]["reason"]
+    assert json.loads(out)["answer"]["present"] is None and "not known" in json.loads(out)["answer"]["reason"]
     status, out, _ = run(capsys, "segment", lifted, "--json")
-    assert (status, {entry["word"] for entry in json.loads(out)["found"]}) == (0, {"Lamp", "red apple"})
+    assert (status, {entry["word"] for entry in json.loads(out)["answer"]["named_words"]}) == (
+        0,
+        {"Lamp", "red apple"},
+    )
     status, _, err = run(capsys, "query", lifted, "red ample")
     assert status == 2 and "nearest: red apple" in err
     assert_one_line(err)

@@ -67,10 +67,6 @@ def test_command_without_features_tells_what_to_encode_first(tmp_path, capsys):
     assert reply["order"] == list(plan.order) and reply["photos"] == 3
     [first, *_] = reply["coverage"]
     assert first["once"] == pytest.approx(plan.coverage[0].once) and first["seconds"] > 0
-    assert reply["shown"] == reply["coverage"]
-    old_name = "shown"
-    with pytest.deprecated_call(match="shown is now coverage"):
-        assert getattr(plan, old_name) is plan.coverage
     assert cli.main(["plan", *map(str, paths[:2])]) == 0
     assert f"encode first: {', '.join(plan.order)}" in capsys.readouterr().out
 

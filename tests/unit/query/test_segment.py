@@ -204,24 +204,17 @@ def test_command_names_splats_and_examples(tiny_lift: Path, tmp_path: Path, caps
     command = ["segment", str(tiny_lift), "--table", str(tmp_path / "table.safetensors")]
     assert cli.main([*command, "--view", "middle", *options, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
-    assert {label["word"] for label in document["found"]} == {"apple", "book", "lamp"}
-    answer = document["answer"]  # as HTTP has it; the other keys are the older ones
-    assert {name: document[name] for name in ("words", "splats", "none")} == {
-        "words": 3,
-        "splats": 60,
-        "none": answer["none"],
-    }
-    boxes = [[*entry["box"].values()] for entry in answer["named_words"]]
-    assert boxes == [entry["box"] for entry in document["found"]]
+    assert {label["word"] for label in document["answer"]["named_words"]} == {"apple", "book", "lamp"}
+    assert (document["words"], document["answer"]["splats"]) == (3, 60)
     assert document["files"] == {kind: str(path) for kind, path in files.items()}
     values = np.load(files["splat_labels"])
-    for label in document["found"]:
+    for label in document["answer"]["named_words"]:
         assert (values == label["value"]).sum() == label["splats"]
     arguments = [*command, "--words", str(tmp_path / "words.txt"), "--example", "splat:0", "--top", "1"]
     assert cli.main([*arguments, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     (best,) = document["examples"]
-    assert best["example"] == "splat:0" and best["words"] == document["what"]["splat:0"]
+    assert best["example"] == "splat:0" and best["words"][0]["word"] == "apple"
     assert cli.main(arguments) == 0
     assert capsys.readouterr().out.startswith("splat:0: apple ")
     assert cli.main([*command, "--words", str(tmp_path / "words.txt")]) == 0

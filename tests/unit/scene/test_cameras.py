@@ -241,25 +241,24 @@ def test_error_in_a_zip_names_the_zip(tmp_path: Path) -> None:
         read_cameras(path)
 
 
-def test_lifts_that_remember_names_as_a_mac_wrote_them_know_their_cameras(tmp_path: Path) -> None:
-    """Earlier lifts stored decomposed names (NFD), and a digest of poses under these names."""
+def test_lifts_know_cameras_whose_names_a_mac_wrote(tmp_path: Path) -> None:
     frames = [{"file_path": f"Ku\u0308che_{k}.png", "transform_matrix": np.eye(4).tolist()} for k in range(2)]
     path = with_json(tmp_path, {"w": 4, "h": 3, "fl_x": 4.0, "fl_y": 4.0, "frames": frames})
     cameras = read_cameras(path)
     assert [*cameras] == ["K\u00fcche_0", "K\u00fcche_1"]
     views = tuple(f"Ku\u0308che_{k}" for k in range(2))
     view_cameras = [cameras[view] for view in views]
-    old = LiftMetadata(
-        version="0.4.0",
+    metadata = LiftMetadata(
+        version="0",
         settings=LiftSettings.of(),
         views=views,
-        poses=poses_of(view_cameras, "NFD"),
+        poses=poses_of(view_cameras),
         diagnostics={},
         timings={},
     )
-    assert old.views == tuple(cameras) and has_poses(path, old)
-    assert has_poses(path, old.model_copy(update={"poses": poses_of(view_cameras)}))
-    assert not has_poses(path, old.model_copy(update={"poses": poses_of(view_cameras[:1])}))
+    assert metadata.views == tuple(cameras) and has_poses(path, metadata)
+    assert has_poses(path, metadata.model_copy(update={"poses": poses_of(view_cameras)}))
+    assert not has_poses(path, metadata.model_copy(update={"poses": poses_of(view_cameras[:1])}))
 
 
 def named_model(*names: str, shift: float = 0.0) -> dict[str, bytes]:

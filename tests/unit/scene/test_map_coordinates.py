@@ -382,9 +382,11 @@ def test_the_command_line_tells_places_in_the_frame_of_the_file(
     for name, lift in tiny.items():
         status, out, err = run(capsys, "query", lift, *options, "--object", tmp_path / f"{name}.ply", "--json")
         assert (status, err) == (0, "")
-        answers[name] = json.loads(out)
-    near, far = ([*(hit["position"] for hit in answer["top"]), *answer["box"], *answer["objects"][0]["box"]]
-                 for answer in answers.values())  # fmt: skip
+        answers[name] = json.loads(out)["answer"]
+    near, far = (
+        [*(hit["position"] for hit in answer["top"]), *answer["box"].values(), *answer["objects"][0]["box"].values()]
+        for answer in answers.values()
+    )
     assert np.abs(np.array(far) - np.array(near) - UTM).max() < ROUNDING
     assert [hit["splat"] for hit in answers["far"]["top"]] == [hit["splat"] for hit in answers["here"]["top"]]
     positions = [read_splats(tmp_path / f"{name}.ply").positions() for name in answers]

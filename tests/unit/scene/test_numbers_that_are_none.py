@@ -158,8 +158,8 @@ def test_questions_take_what_the_lift_took(tmp_path: Path, capsys: pytest.Captur
     ask = ["query", scene / "lift.safetensors", "--like", scene / "like.npy"]
     status, out, err = run(capsys, *ask, "--objects", "--json")
     assert status == 0, err
-    answer = json.loads(out)
-    assert all(np.isfinite(box).all() for box in (entry["box"] for entry in answer["objects"]))
+    answer = json.loads(out)["answer"]
+    assert all(np.isfinite([*entry["box"].values()]).all() for entry in answer["objects"])
     for options in (["--mask", scene / "m.png"], ["--overlay", scene / "r.png"], ["--attention", scene / "a.png"]):
         assert run(capsys, *ask, "--view", "front", *options)[0] == 0
     assert run(capsys, *ask, "--coloured", scene / "c.ply")[0] == 0
