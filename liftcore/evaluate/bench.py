@@ -112,7 +112,7 @@ def time_lift(work: Workload, preset: Preset, device: Device, threads: int | Non
         start = time.perf_counter()
         W, codebook = weigh_regions(raster, work.views, parameters, count, threads)
         middle = time.perf_counter()
-        solve(W, codebook, torch.float16, means=work.splats.means, threads=threads, device=device)
+        solve(W, codebook, torch.float16, means=work.splats.means, threads=threads)
         geometry.append((middle - start) / len(work.views))
         solution.append((time.perf_counter() - middle) / len(work.views))
         entries = W.region.shape[0]

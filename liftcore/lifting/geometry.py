@@ -93,7 +93,6 @@ def weigh_views(
     *,
     by_rows: bool,
     checkpoint: Checkpoint | None = None,
-    device_bytes: int = 0,
     threads: int | None = None,
     first: Sequence[int] = (),
     on_first: Callable[[Geometry], None] | None = None,
@@ -104,7 +103,6 @@ def weigh_views(
         splats: P. views: in the order of the sums.
         by_rows: True if each region must be a row of a codebook, False if it may be a tuple of labels (`as_regions`).
         checkpoint: the raster's stored answers, to which new ones are added.
-        device_bytes: of W that may stay on the device that computed it.
         first: numbers of the views to begin with. The result is bitwise identical for any.
         on_first: called with the geometry of these views alone, as soon as they are done. An exception from it stops
             the work.
@@ -119,17 +117,13 @@ def weigh_views(
             yield waiting[-1].request
 
     answers = raster.iterate_views(requests()) if checkpoint is None else checkpoint.answers(raster, requests())
-    on_device = in_memory = 0
+    in_memory = 0
     with closing(answers):
         for number, answer in zip(order, answers, strict=True):
             request = waiting.popleft()
-            part = request.weights(answer)
-            if part.region.is_cuda and on_device + part.nbytes <= device_bytes:
-                on_device += part.nbytes
-            else:
-                part = part.cpu()
-                in_memory += part.nbytes
-                part = part if in_memory <= MEMORY_LIMIT else part.in_files()
+            part = request.weights(answer).cpu()
+            in_memory += part.nbytes
+            part = part if in_memory <= MEMORY_LIMIT else part.in_files()
             sample = SampledRays(answer.rows, request.readout)
             by_number[number] = _ViewBlock(part, sample, request.codebook, request.levels)
             del answer, part, request  # frees their memory before the raster computes the next one

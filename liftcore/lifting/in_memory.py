@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,33 +20,28 @@ from liftcore.lifting.planning.plan import TIMED_VIEWS, Plan, plan_lift
 from liftcore.query.result import LiftResult
 from liftcore.raster import open_raster
 from liftcore.raster.base import Raster
-from liftcore.runtime.device import Device, give_back_memory, out_of_memory
+from liftcore.runtime.device import Device
 from liftcore.runtime.progress import Timings
 from liftcore.scene.neighbours import SplatGraph
 from liftcore.scene.splats import Splats
 from liftcore.solve.aggregate import Aggregation, aggregate, solve_from_kept_regions
 from liftcore.solve.closed_form import solve
 from liftcore.solve.consensus import mask_consensus
-from liftcore.solve.consensus_on_card import MOST_MASKS, mask_consensus_on_card
 from liftcore.solve.diagnostics import ViewMeasures, measure_samples
 from liftcore.solve.directions import region_totals
 from liftcore.solve.least_squares import AllRays, reference, refine
 from liftcore.solve.loss import huber_factors
 from liftcore.solve.mask_edges import weaken_edges
 from liftcore.solve.membership import Memberships, RegionGroups, memberships
-from liftcore.solve.membership_on_card import MembershipsOnCard, memberships_on_card
 from liftcore.solve.objects import NodeVectors, RegionObjects, region_objects
 from liftcore.solve.reweight import Reweighting, reweighting_factors, scale_weights, whole_regions
 from liftcore.solve.smooth import smooth
 from liftcore.solve.smooth_by_halves import choose_smoothness
 from liftcore.solve.sums import sum_pieces
-from liftcore.solve.sums_on_card import region_totals_on_card
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import LiftSettings
 from liftcore.values.views import ViewFeatures
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -60,7 +55,7 @@ class SceneWeights:
     geometry: Geometry  # its W is that of the solve
     sums: np.ndarray | None = None  # [P] f64, of the rows of W before reweighting; None: W is not reweighted
     threads: int | None = None  # None: the cores that this process may use
-    consensus: Tensor | None = None  # [nnz] f32, until W is reweighted; where it was computed
+    consensus: Tensor | None = None  # [nnz] f32, until W is reweighted
     reweighting: Reweighting | None = None
 
     @property
@@ -69,48 +64,18 @@ class SceneWeights:
         return self.geometry.weights
 
     @cached_property
-    def on_processor(self) -> RegionWeights:
-        """W on the CPU, copied once."""
-        return self.weights.cpu()
-
-    @property
-    def groups(self) -> RegionGroups:
-        """The views and groups of the regions."""
-        return RegionGroups.of(self.weights.offsets.numpy(), self.geometry.levels)
-
-    @cached_property
     def members(self) -> Memberships:
-        """The memberships of W, which objects and consensus share, on the CPU."""
-        return memberships(self.on_processor, self.groups, self.threads)
-
-    @cached_property
-    def members_on_card(self) -> MembershipsOnCard:
-        """The memberships of W on its device."""
-        return memberships_on_card(self.weights, self.groups)
-
-    def where_it_fits(self, compute: Callable[[RegionWeights, bool], T]) -> T:
-        """Return ``compute(W, on_card)``, for W on the GPU if it lies and fits there, else on the CPU."""
-        if self.device.kind == "cpu" or self.weights.device != self.device.place:
-            return compute(self.on_processor, False)
-        try:
-            return compute(self.weights, True)
-        except RuntimeError as error:
-            if not out_of_memory(error):
-                raise
-        give_back_memory()  # after the except block, where the error no longer references tensors
-        return compute(self.on_processor, False)
+        """The memberships of W, which objects and consensus share."""
+        groups = RegionGroups.of(self.weights.offsets.numpy(), self.geometry.levels)
+        return memberships(self.weights, groups, self.threads)
 
     def row_sums(self) -> np.ndarray:
         """Return the sums of rows [P] f64 of W before reweighting."""
-        return self.weights.row_sums().cpu().numpy() if self.sums is None else self.sums
+        return self.weights.row_sums().numpy() if self.sums is None else self.sums
 
-    def with_factors(self, W: RegionWeights, factors: Tensor) -> SceneWeights:
-        """Multiply each entry of W by its factor [nnz] f32.
-
-        Args:
-            W: this W on the CPU.
-        """
-        geometry = replace(self.geometry, weights=scale_weights(W, factors))
+    def with_factors(self, factors: Tensor) -> SceneWeights:
+        """Multiply each entry of W by its factor [nnz] f32."""
+        geometry = replace(self.geometry, weights=scale_weights(self.weights, factors))
         return replace(self, geometry=geometry, sums=self.row_sums())
 
 
@@ -131,7 +96,7 @@ class InMemory(LiftSteps[SceneWeights]):
     def weigh(
         self, views: LiftViews, plan: Plan, on_plan: Callable[[Plan], None]
     ) -> tuple[SceneWeights, WeightStatistics]:
-        raster = open_raster(self.splats, plan.device, self.threads, plan.gpu_weight_bytes)
+        raster = open_raster(self.splats, plan.device, self.threads)
         first, begin = probe_views(len(views)), time.perf_counter()
         plans = [plan]
 
@@ -146,7 +111,7 @@ class InMemory(LiftSteps[SceneWeights]):
 
         geometry = weigh_views(
             raster, self.splats.count, views, self.settings, self.timings.progress,
-            by_rows=self.settings.weighs_rows, device_bytes=plan.gpu_weight_bytes, threads=self.threads,
+            by_rows=self.settings.weighs_rows, threads=self.threads,
             checkpoint=self.checkpoint.of(self.splats, plan.device.facts()) if self.checkpoint else None,
             first=first, on_first=check_first,
         )  # fmt: skip
@@ -154,54 +119,37 @@ class InMemory(LiftSteps[SceneWeights]):
         return W, WeightStatistics(plans[-1], geometry.levels, W.weights.region.shape[0], geometry.blind)
 
     def find_objects(self, W: SceneWeights) -> RegionObjects:
-        levels, total_weight = W.geometry.levels, W.geometry.total_weight().numpy()
-        return W.where_it_fits(
-            lambda weights, on_card: region_objects(
-                weights, levels, total_weight, self.threads, members=W.members_on_card if on_card else W.members
-            )
-        )
+        total_weight = W.geometry.total_weight().numpy()
+        return region_objects(W.weights, W.geometry.levels, total_weight, self.threads, members=W.members)
 
     def node_vectors(self, W: SceneWeights, objects: RegionObjects) -> NodeVectors:
-        def sum_by_region(weights: RegionWeights, on_card: bool) -> np.ndarray:
-            if on_card:
-                return region_totals_on_card(weights).numpy()
-            return sum_pieces(region_totals(weights, self.threads), (1, int(weights.offsets[-1])))[0]
-
-        return NodeVectors.of(W.geometry.codebook, W.where_it_fits(sum_by_region), objects)
+        totals = sum_pieces(region_totals(W.weights, self.threads), (1, int(W.weights.offsets[-1])))[0]
+        return NodeVectors.of(W.geometry.codebook, totals, objects)
 
     def compare_masks(self, W: SceneWeights) -> SceneWeights:
-        means, levels = self.splats.means, W.geometry.levels
-
-        def compare(weights: RegionWeights, on_card: bool) -> Tensor:
-            if on_card:
-                return mask_consensus_on_card(weights, levels, means=means, members=W.members_on_card)
-            return torch.from_numpy(mask_consensus(weights, levels, self.threads, means=means, members=W.members))
-
-        is_few = np.count_nonzero(levels >= 0) <= MOST_MASKS
-        return replace(W, consensus=W.where_it_fits(compare) if is_few else compare(W.on_processor, False))
+        consensus = mask_consensus(
+            W.weights, W.geometry.levels, self.threads, means=self.splats.means, members=W.members
+        )
+        return replace(W, consensus=torch.from_numpy(consensus))
 
     def reweight(self, W: SceneWeights, levels_apart: bool) -> tuple[SceneWeights, float | None]:
-        def apply_reweighting(weights: RegionWeights, on_card: bool) -> tuple[SceneWeights, float | None]:
-            consensus = W.consensus if on_card or W.consensus is None else W.consensus.cpu()
-            reweighting = reweighting_factors(
-                weights, W.geometry.codebook, self.settings.robust_steps, self.timings.progress,
-                principal=self.settings.robust_directions, means=self.splats.means, threads=self.threads,
-                reliability=whole_regions(self.settings.reliability, W.geometry.levels), consensus=consensus,
-                levels=W.geometry.levels if levels_apart else None, on_card=on_card,
-            )  # fmt: skip
-            result = replace(W.with_factors(weights, reweighting.factors), consensus=None, reweighting=reweighting)
-            return result, reweighting.reliability
-
-        return W.where_it_fits(apply_reweighting)
+        reweighting = reweighting_factors(
+            W.weights, W.geometry.codebook, self.settings.robust_steps, self.timings.progress,
+            principal=self.settings.robust_directions, means=self.splats.means, threads=self.threads,
+            reliability=whole_regions(self.settings.reliability, W.geometry.levels), consensus=W.consensus,
+            levels=W.geometry.levels if levels_apart else None,
+        )  # fmt: skip
+        result = replace(W.with_factors(reweighting.factors), consensus=None, reweighting=reweighting)
+        return result, reweighting.reliability
 
     def discount_distance(self, W: SceneWeights) -> SceneWeights:
-        weights, keywords = W.on_processor, {"means": self.splats.means, "threads": self.threads}
-        return W.with_factors(weights, huber_factors(weights, W.geometry.codebook, self.timings.progress, **keywords))
+        keywords = {"means": self.splats.means, "threads": self.threads}
+        return W.with_factors(huber_factors(W.weights, W.geometry.codebook, self.timings.progress, **keywords))
 
     def solve(self, W: SceneWeights, clusters: RegionObjects | None) -> tuple[Tensor, SplatSupport]:
         solution = solve(
             W.weights, W.geometry.codebook, getattr(torch, self.settings.dtype), self.timings.progress,
-            means=self.splats.means, threads=self.threads, device=W.device, memory=W.memory,
+            means=self.splats.means, threads=self.threads, memory=W.memory,
         )  # fmt: skip
         confidence = W.reweighting.confidence if W.reweighting else None
         return solution.features, SplatSupport(
@@ -226,7 +174,7 @@ class InMemory(LiftSteps[SceneWeights]):
         return X, facts
 
     def smooth(self, W: SceneWeights, X: Tensor, support: SplatSupport) -> tuple[Tensor, dict[str, Any]]:
-        weights, strength, choice = W.on_processor, self.settings.smoothness, dict[str, Any]()
+        weights, strength, choice = W.weights, self.settings.smoothness, dict[str, Any]()
         graph, weakened_edges = weaken_edges(
             SplatGraph.of(self.splats, self.threads), weights, W.geometry.levels, self.threads
         )  # fmt: skip
@@ -240,14 +188,14 @@ class InMemory(LiftSteps[SceneWeights]):
         visible = torch.from_numpy(support.sums > 0)
         X, facts = smooth(
             X, graph, support.total_weight, support.confidence, visible, strength, self.timings.progress,
-            self.threads, device=W.device,
+            self.threads,
         )  # fmt: skip
         return X, facts | {"parted": weakened_edges} | choice
 
     def aggregate(self, W: SceneWeights, X: Tensor, clusters: RegionObjects | None) -> tuple[Tensor, Aggregation]:
         settings, reweighting, guard_inputs = self.settings, W.reweighting, None
         if settings.aggregation_guard and reweighting and reweighting.feature_consistency is not None:
-            guard_inputs = W.on_processor, reweighting.directions, reweighting.feature_consistency
+            guard_inputs = W.weights, reweighting.directions, reweighting.feature_consistency
         X, aggregation = aggregate(
             X, W.geometry.total_weight().numpy(), self.splats, W.raster, W.views, settings, self.timings.progress,
             self.threads, objects=clusters, guard_inputs=guard_inputs,
@@ -256,7 +204,7 @@ class InMemory(LiftSteps[SceneWeights]):
             return X, aggregation
         with self.timings.stage("resolve"):
             X, facts = solve_from_kept_regions(
-                X, aggregation, W.on_processor, W.geometry.codebook, W.row_sums(), self.timings.progress,
+                X, aggregation, W.weights, W.geometry.codebook, W.row_sums(), self.timings.progress,
                 means=self.splats.means, threads=self.threads,
             )  # fmt: skip
         return X, replace(aggregation, facts=aggregation.facts | facts)

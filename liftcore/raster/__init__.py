@@ -13,12 +13,11 @@ if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
 
 
-def open_raster(splats: Splats, device: Device, threads: int | None = None, resident_bytes: int = 0) -> Raster:
+def open_raster(splats: Splats, device: Device, threads: int | None = None) -> Raster:
     """Return A for one scene on the device: numba kernels on the CPU, Triton kernels on a GPU.
 
     Args:
         threads: CPU threads; None uses the cores that this process may use. The result is bitwise identical for any.
-        resident_bytes: region weights that may stay in GPU memory during the views; 0 copies them to the CPU.
     """
     if device.kind == "cpu":
         from liftcore.raster.cpu.raster import CpuRaster  # loads numba
@@ -26,7 +25,7 @@ def open_raster(splats: Splats, device: Device, threads: int | None = None, resi
         return CpuRaster(splats, threads)
     from liftcore.raster.gpu.raster import GpuRaster  # loads triton
 
-    return GpuRaster(splats, device.place, stays=resident_bytes > 0)
+    return GpuRaster(splats, device.place)
 
 
 def check_splats_and_threads(splats: Splats, threads: int | None) -> Splats:

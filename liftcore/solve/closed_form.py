@@ -1,8 +1,7 @@
 """The closed form: ``x_j = sum_v W_v[j] E_v / sum W[j]`` (paper Eq. 6, App. Tikhonov for squared weights).
 
-On the CPU `liftcore.solve.shared_rows` computes the sums, on a device torch's ``embedding_bag``: one thread adds a
-row in a fixed order, so the result is bitwise identical for any number of threads. A product with a sparse tensor
-would use cuSPARSE's default algorithm, and ``index_add_`` atomic sums: neither has a fixed order.
+`liftcore.solve.shared_rows` computes the sums: one thread adds a row in a fixed order, so the result is bitwise
+identical for any number of threads.
 
 Weights are divided by their sum before the product with the codebook. So a mean cannot overflow if its inputs do not,
 and faint splats keep their precision. At most LONG terms of a splat are added one by one in float32; more terms are
@@ -11,15 +10,13 @@ added in pieces of LONG, as a plain float32 sum of ten million equal terms is wr
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from liftcore.runtime.cores import cores
-from liftcore.runtime.device import CPU, Device, give_back_memory, out_of_memory
+from liftcore.runtime.device import give_back_memory
 from liftcore.runtime.memory import zeros
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, silent
@@ -27,13 +24,8 @@ from liftcore.solve.codebook import Codebook
 from liftcore.solve.shared_rows import LONG, flat_table, sum_rows
 from liftcore.values.region_weights import BLOCK_ENTRIES, BLOCK_ROWS, RegionWeights, from_zero, row_blocks, run_each
 
-DEVICE_ROWS, DEVICE_ENTRIES = 1 << 16, 1 << 24  # of a block on a device; halved if its memory runs out
-LEAST_ROWS = 256  # of a block that is not halved further
-CONCURRENT_BLOCKS = 4  # on a device: copying a block to X takes longer than its sums
-
-BlockMeans = Callable[
-    [Tensor], tuple[Tensor, Tensor]
-]  # rows [n] i64 -> means of vectors, of unit vectors, [n, C] f32
+# rows [n] i64 -> means of vectors, of unit vectors, [n, C] f32
+BlockMeans = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 @dataclass(frozen=True)
@@ -53,18 +45,16 @@ def solve(
     *,
     means: Tensor | None = None,
     threads: int | None = None,
-    device: Device = CPU,
     memory: int | None = None,
 ) -> Solution:
     """Return ``X = D^-1 W E`` and the consistency of the vectors that views give each splat.
 
     Args:
-        W: of all views, with a row for every splat, on any device.
+        W: of all views, with a row for every splat, on the CPU.
         dtype: of X; float16 becomes float32 if the codebooks are too large or too small for it.
         means: [P, 3] f32, centres of the splats: neighbours read the same codebook rows, so they are solved in one
             block. None solves in the order of the rows.
-        threads: of the CPU. None uses the cores that this process may use. The result is bitwise identical for any.
-        device: of the sums; X is returned on the CPU.
+        threads: None uses the cores that this process may use. The result is bitwise identical for any.
         memory: bytes above which X is stored in a mapped file; None for no limit.
     """
     if dtype == torch.float16 and not codebook.fits_float16():
@@ -73,7 +63,7 @@ def solve(
     size = shape[0] * shape[1] * dtype.itemsize
     X = zeros(shape, dtype, name="features", in_file=memory is not None and size > memory)
     rows = torch.nonzero(W.indptr.diff())[:, 0]
-    squares = solve_rows(X, rows, W, codebook, progress, means=means, threads=threads, device=device)
+    squares = solve_rows(X, rows, W, codebook, progress, means=means, threads=threads)
     give_back_memory()
     return Solution(X, squares.sqrt().clamp(0.0, 1.0).float())
 
@@ -87,67 +77,46 @@ def solve_rows(
     *,
     means: Tensor | None = None,
     threads: int | None = None,
-    device: Device = CPU,
-    sums: Tensor | None = None,
-    unit: Tensor | None = None,
 ) -> Tensor:
     """Solve for some splats, by their numbers [n] i64, and write their rows of X [P, F].
-
-    Args:
-        sums: [P] f64, row sums of the full W of which this W is a part; None: of this W.
-        unit: [P, F] f32, overwritten with the same means of unit vectors.
 
     Returns:
         [P] f64, squared lengths of the means of unit vectors; zero for the other splats.
     """
-    sums = W.row_sums() if sums is None else sums
+    sums = W.row_sums()
     scale = torch.where(sums > 0, 1.0 / sums, 0.0)
     squares = torch.zeros(X.shape[0], dtype=torch.float64)
     if means is not None:
-        rows = rows[torch.argsort(morton_codes(means.cpu()[rows.cpu()])).to(rows.device)]
-    limits = (BLOCK_ROWS, BLOCK_ENTRIES) if device.kind == "cpu" else (DEVICE_ROWS, DEVICE_ENTRIES)
-    blocks = row_blocks(W.indptr.diff()[rows].cpu().numpy(), *limits)
+        rows = rows[torch.argsort(morton_codes(means.cpu()[rows]))]
+    blocks = row_blocks(W.indptr.diff()[rows].numpy(), BLOCK_ROWS, BLOCK_ENTRIES)
     slices = list(codebook.slices())
-    inverse = None if codebook.unit or codebook.inverse_lengths is None else codebook.inverse_lengths.to(device.place)
+    inverse = None if codebook.unit or codebook.inverse_lengths is None else codebook.inverse_lengths
     for number, channels in enumerate(slices):
-        table = codebook.values(channels, device.place)
-        units = None if codebook.unit or inverse is not None else codebook.unit_values(channels, device.place)
-
-        if device.kind == "cpu":
-            means_of = _means_on_cpu(W, scale, table, units, inverse)
-        else:
-            means_of = _means_on_device(W, scale, table, units, inverse)
+        table = codebook.values(channels, X.device)
+        units = None if codebook.unit or inverse is not None else codebook.unit_values(channels, X.device)
+        means_of = _block_means(W, scale, table, units, inverse)
 
         def solve_block(first: int, last: int, means_of: BlockMeans = means_of, channels: slice = channels) -> None:
             block_rows = rows[first:last]
             block_means, unit_means = means_of(block_rows)
-            block_rows = block_rows.cpu()
-            X[:, channels].index_copy_(0, block_rows, block_means.to(X.dtype).cpu())
-            if unit is not None:
-                unit[:, channels].index_copy_(0, block_rows, unit_means.cpu())
-            squares[block_rows] += torch.linalg.vector_norm(unit_means, dim=1).double().square().cpu()
+            X[:, channels].index_copy_(0, block_rows, block_means.to(X.dtype))
+            squares[block_rows] += torch.linalg.vector_norm(unit_means, dim=1).double().square()
 
-        if device.kind == "cpu":
-            run_each(solve_block, blocks, threads)
-        else:
-            workers, deferred = threads or cores(), list[tuple[int, int]]()
-            run_each(partial(_run_or_defer, solve_block, deferred), blocks, min(workers, CONCURRENT_BLOCKS))
-            for block in deferred:
-                _run_or_halve(solve_block, *block)
+        run_each(solve_block, blocks, threads)
         progress("solve", number + 1, len(slices), "slices")
     return squares
 
 
-def _means_on_cpu(
+def _block_means(
     W: RegionWeights, scale: Tensor, table: Tensor, units: Tensor | None, inverse: Tensor | None
 ) -> BlockMeans:
-    """Return a function for the means of rows of W, on the CPU.
+    """Return a function for the means of rows of W.
 
     Args:
         scale: [P] f64, 1 / row sum. table: [M, C] f32. units: [M, C] f32, unit rows of the table. inverse: [M] f32,
             inverse lengths of its rows. At most one of the two is given; neither if the rows have unit length.
     """
-    indptr, region, weight, scales = (part.cpu().numpy() for part in (W.indptr, W.region, W.weight, scale))
+    indptr, region, weight, scales = (part.numpy() for part in (W.indptr, W.region, W.weight, scale))
     flat, width, none = flat_table(table), table.shape[1], np.empty(0, np.float32)
     flat_units = None if units is None else flat_table(units)
     inverse_lengths = none if inverse is None else inverse.numpy()
@@ -158,36 +127,11 @@ def _means_on_cpu(
         return torch.from_numpy(sums)
 
     def means_of(block_rows: Tensor) -> tuple[Tensor, Tensor]:
-        rows = block_rows.cpu().numpy()
+        rows = block_rows.numpy()
         means = sum_table(rows, flat)
         if flat_units is not None:
             return means, sum_table(rows, flat_units)
         return means, means if inverse is None else sum_table(rows, flat, inverse_lengths)
-
-    return means_of
-
-
-def _means_on_device(
-    W: RegionWeights, scale: Tensor, table: Tensor, units: Tensor | None, inverse: Tensor | None
-) -> BlockMeans:
-    """Return a function for the means of rows of W on the device of the table; arguments as of `_means_on_cpu`.
-
-    W may be on any device.
-    """
-    place = table.device
-
-    def means_of(block_rows: Tensor) -> tuple[Tensor, Tensor]:
-        starts, entries = W.take(block_rows)
-        scales = scale[block_rows].repeat_interleave(starts.diff(), output_size=entries.shape[0])
-        shares = (W.weight.index_select(0, entries) * scales).float().to(place)
-        region, starts = W.region.index_select(0, entries).to(place), starts.to(place)
-        del entries, scales
-        means = bag_sums(region, table, starts, shares)
-        if units is not None:
-            return means, bag_sums(region, units, starts, shares)
-        if inverse is not None:
-            return means, bag_sums(region, table, starts, shares.mul_(inverse.index_select(0, region)))
-        return means, means
 
     return means_of
 
@@ -214,35 +158,6 @@ def _bags(index: Tensor, table: Tensor, starts: Tensor, shares: Tensor | None) -
     return embedding_bag(
         index, table, starts.to(index.dtype), mode="sum", per_sample_weights=shares, include_last_offset=True
     )
-
-
-def _run_or_defer(work: Callable[[int, int], None], deferred: list[tuple[int, int]], first: int, last: int) -> None:
-    """Run a block, or defer it if the device has not enough memory for it beside the others."""
-    try:
-        work(first, last)
-    except RuntimeError as error:
-        if not out_of_memory(error):
-            raise
-        deferred.append((first, last))
-
-
-def _run_or_halve(work: Callable[[int, int], None], first: int, last: int) -> None:
-    """Run a block, in halves if the device has not enough memory.
-
-    Raises:
-        RuntimeError: LEAST_ROWS do not fit either (`device.out_of_memory`).
-    """
-    try:
-        work(first, last)
-    except RuntimeError as error:
-        if not out_of_memory(error) or last - first <= LEAST_ROWS:
-            raise
-    else:
-        return
-    torch.cuda.empty_cache()  # outside the except clause, whose error keeps the block's tensors alive
-    middle = (first + last) // 2
-    _run_or_halve(work, first, middle)
-    _run_or_halve(work, middle, last)
 
 
 def morton_codes(points: Tensor, bounds: Tensor | None = None) -> Tensor:

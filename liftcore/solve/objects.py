@@ -34,7 +34,6 @@ from liftcore.runtime.jit import kernel
 from liftcore.solve.codebook import Codebook
 from liftcore.solve.consensus import SplatTuples
 from liftcore.solve.membership import Memberships, RegionGroups, memberships
-from liftcore.solve.membership_on_card import MembershipsOnCard
 from liftcore.solve.region_tree import NO_NODE, SPLIT, UNSEEN, RegionTree, node_groups, region_tree
 from liftcore.solve.sums import PieceSums, in_order, piece_sums, pieces, sum_pieces
 from liftcore.values.region_weights import RegionWeights, row_blocks, run_each
@@ -94,25 +93,19 @@ def region_objects(
     total_weight: np.ndarray,
     threads: int | None = None,
     *,
-    members: Memberships | MembershipsOnCard | None = None,
+    members: Memberships | None = None,
 ) -> RegionObjects:
     """Return the objects and parts of a scene whose W is in one piece.
 
     Args:
-        W: of all views, by rows of codebooks, on the CPU, or on the device of its memberships.
+        W: of all views, by rows of codebooks, on the CPU.
         levels: [M] i8, the level of each region in its view; -1 for cells of grids, which are ignored.
         total_weight: [P], sums of unscaled weights; objects are numbered by it.
         threads: None uses the cores that this process may use. The result is bitwise identical for any number.
-        members: of W, if computed before; those on a GPU have all of W read there
-            (`liftcore.solve.objects_on_card`).
+        members: of W, if computed before.
     """
     groups = RegionGroups.of(W.offsets.numpy(), levels)
-    if isinstance(members, MembershipsOnCard):
-        from liftcore.solve.objects_on_card import TreeInputsOnCard
-
-        inputs: TreeInputs | TreeInputsOnCard = TreeInputsOnCard(W, groups, members)
-    else:
-        inputs = TreeInputs(W, groups, members or memberships(W, groups, threads), threads)
+    inputs = TreeInputs(W, groups, members or memberships(W, groups, threads), threads)
     nodes, other_masks = choose_nodes(groups, inputs.region_sizes())
     tree = region_tree(nodes, groups, inputs.containers(nodes), threads)
     number = tree.parents.size
@@ -127,7 +120,7 @@ def region_objects(
 
 @dataclass(frozen=True)
 class TreeInputs:
-    """The inputs of the tree and of its numbering that are read from a W on the CPU."""
+    """The inputs of the tree and of its numbering that are read from W."""
 
     W: RegionWeights  # of all views and splats
     groups: RegionGroups

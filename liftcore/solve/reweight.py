@@ -133,29 +133,20 @@ def reweighting_factors(
     reliability: Tensor | None = None,
     consensus: Tensor | None = None,
     levels: np.ndarray | None = None,
-    on_card: bool = False,
 ) -> Reweighting:
     """Return the factor of each entry of W after ``steps`` steps, for a scene whose W is in one piece.
 
     Args:
-        W: of all views by rows of codebooks, on the CPU or on the device of the solve.
+        W: of all views by rows of codebooks, on the CPU.
         principal: directions in which regions are compared (`RegionDirections`). means: [P, 3] of the splats;
             neighbours are processed together.
         threads: None uses the cores that this process may use. The result is bitwise identical for any number.
         reliability: [M] bool, the regions with a reliability; None: none.
         consensus: [nnz] f32 of each entry (`mask_consensus`).
         levels: [M] i8, the level of each region in its view, -1 for cells of grids; None: one level.
-        on_card: compute on W's device, by `liftcore.solve.reweight_on_card`.
     """
-    if on_card:
-        from liftcore.solve.reweight_on_card import BlockReweighterOnCard
-        from liftcore.solve.sums_on_card import region_totals_on_card
-
-        block: BlockReweighter | BlockReweighterOnCard = BlockReweighterOnCard(W, levels)
-        directions = RegionDirections(codebook, region_totals_on_card(W), W.region.shape[0], principal)
-    else:
-        block = BlockReweighter(W, means, threads, levels)
-        directions = RegionDirections.of_weights(W, codebook, principal, threads)
+    block = BlockReweighter(W, means, threads, levels)
+    directions = RegionDirections.of_weights(W, codebook, principal, threads)
     factors, scores, scene = None, torch.zeros(2, 0, dtype=torch.float32), None
     for step in range(steps):
         table = np.zeros((2, codebook.regions + block.levels))

@@ -33,13 +33,11 @@ from torch import Tensor
 
 from liftcore.raster.cpu.simd import LANES, in_all_lanes, lanes_at, plus, plus_product, store_lanes, times
 from liftcore.runtime.cores import cores
-from liftcore.runtime.device import CPU, Device
 from liftcore.runtime.jit import kernel
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, silent
 from liftcore.scene.neighbours import SplatGraph
 from liftcore.scene.splats import Splats
-from liftcore.solve.smooth_on_card import SmoothingSystem
 
 LEAST_CONFIDENCE = 0.02  # lower bound of c, for splats of a single view
 LEAST_WEIGHT = 1e-30  # of the largest; a splat below it has no total weight
@@ -80,14 +78,6 @@ class _System:
         diagonal, inverse = diagonal.astype(np.float32), inverse.astype(np.float32)
         return cls(graph, weights.astype(np.float32), couplings, diagonal, inverse, relative)
 
-    def on_card(self, place: torch.device) -> SmoothingSystem:
-        """Return the system on a device."""
-        indices = (
-            torch.from_numpy(part).to(place, torch.int64) for part in (self.graph.starts, self.graph.neighbours)
-        )
-        values = (torch.from_numpy(part).to(place).double() for part in (self.couplings, self.weights, self.inverse))
-        return SmoothingSystem(*indices, *values)
-
 
 @one_thread()
 def smooth(
@@ -99,8 +89,6 @@ def smooth(
     smoothness: float,
     progress: Progress = silent,
     threads: int | None = None,
-    *,
-    device: Device = CPU,
 ) -> tuple[Tensor, dict[str, Any]]:
     """Smooth the features of splats that are near in position and colour.
 
@@ -111,7 +99,6 @@ def smooth(
         solved: [P] bool, the splats with a row of X from the solve; the others take their neighbours' features.
         smoothness: lambda; zero does not change X.
         threads: None uses the cores that this process may use. The result is bitwise identical for any number.
-        device: of the steps.
 
     Returns:
         X, and its facts for the diagnostics: ``smoothness``, the ``steps``, the ``residual`` (the preconditioned
@@ -127,20 +114,18 @@ def smooth(
         has_feature[rows] = True
     count, channels = X.shape
     squares, steps, residual = np.zeros((2, channels)), list[Step](), 0.0
-    gpu_system = None if device.kind == "cpu" else system.on_card(device.place)
-    block = BLOCK if gpu_system is None else min(gpu_system.channels, channels)
     with ThreadPoolExecutor(threads or cores()) as pool:
         if smoothness and has_weight.any():
             _, steps, residual = _conjugate_gradients(system, _probe(X, graph.order, has_weight, pool), pool)
-            staged = torch.empty(count, block, dtype=X.dtype)  # a block in the graph's order, in X's dtype
+            staged = torch.empty(count, BLOCK, dtype=X.dtype)  # a block in the graph's order, in X's dtype
             source, target = _in_words(X, staged)
-            values, *iterates = (np.zeros((count, block), np.float32) for _ in range(3 if gpu_system is None else 1))
-            for begin in range(0, channels, block):
-                width = min(block, channels - begin)
+            values, *iterates = (np.zeros((count, BLOCK), np.float32) for _ in range(3))
+            for begin in range(0, channels, BLOCK):
+                width = min(BLOCK, channels - begin)
 
                 def read(rows: slice, begin: int = begin, width: int = width) -> tuple[np.ndarray, np.ndarray]:
                     """Copy rows of X in the graph's order; return the minimum and maximum of each channel."""
-                    take_rows(rows.start, rows.stop, graph.order, source, begin // block * target.shape[1], target)
+                    take_rows(rows.start, rows.stop, graph.order, source, begin // BLOCK * target.shape[1], target)
                     torch.from_numpy(values[rows, :width]).copy_(staged[rows, :width])
                     low, high = np.full(width, np.inf, np.float32), np.full(width, -np.inf, np.float32)
                     bound_rows(rows.start, rows.stop, has_weight, values, low, high)
@@ -150,12 +135,7 @@ def smooth(
 
                 lows, highs = zip(*_map_rows(read, count, pool), strict=True)
                 low, high = np.min(lows, axis=0), np.max(highs, axis=0)
-                if gpu_system is None:
-                    solution = _descend(system, values, iterates, steps, pool)
-                else:
-                    start = torch.from_numpy(values[:, :width]).to(device.place).double()
-                    solution = gpu_system.descend(start, [(float(length), float(turn)) for length, turn in steps])
-                    solution = solution.float().cpu().numpy()
+                solution = _descend(system, values, iterates, steps, pool)
                 arguments = system.weights, values, low, high, solution
                 squares[:, begin : begin + width] = _row_sums(clip_rows, arguments, (2, width), count, pool)
                 for rows, shares in rings:
@@ -166,7 +146,7 @@ def smooth(
                 ) -> None:
                     """Copy rows back to X."""
                     staged[rows, :width].copy_(torch.from_numpy(solution[rows, :width]))
-                    first_word = begin // block * target.shape[1]
+                    first_word = begin // BLOCK * target.shape[1]
                     put_rows(rows.start, rows.stop, graph.order, has_feature, target, first_word, source)
 
                 _map_rows(write, count, pool)

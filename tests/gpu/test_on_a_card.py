@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
 import liftcore as lc
-from liftcore.solve.directions import region_totals
-from liftcore.solve.membership import RegionGroups
-from liftcore.solve.membership_on_card import memberships_on_card
-from liftcore.solve.objects import region_objects
-from liftcore.solve.sums import sum_pieces
-from liftcore.solve.sums_on_card import region_totals_on_card
 from tests import paper_card
 from tests.backends import needs_triton
 from tests.tiny_scene import WORDS, make_scene
-from tests.unit.solve.test_objects_on_card import nested_scene
 
 pytestmark = needs_triton
 FEW: dict[str, Any] = {"diagnostic_rays": 6}  # as the interpreter traces one in a thirtieth of a second
@@ -71,19 +62,6 @@ def test_a_lift_on_a_card_is_the_processors(paths: list[Path], grids: bool, opti
         left, right = getattr(on_cpu, name), getattr(on_gpu, name)
         assert (left is None) == (right is None) and (left is None or torch.equal(left, right)), name
     assert torch.equal(on_cpu.has_feature, on_gpu.has_feature)
-
-
-def test_objects_with_parts_are_the_processors() -> None:
-    W, levels = nested_scene(0, 270, equal_weights=False)
-    on_card = replace(W, **{name: part.to("cuda") for name, part in W.tensors().items() if name != "offsets"})
-    groups, total_weight = RegionGroups.of(W.offsets.numpy(), levels), np.ones(270)
-    expected = region_objects(W, levels, total_weight)
-    got = region_objects(on_card, levels, total_weight, members=memberships_on_card(on_card, groups))
-    assert (expected.tree.parents >= 0).any()
-    for name in ("labels", "node", "node_views"):
-        np.testing.assert_array_equal(getattr(got, name), getattr(expected, name))
-    totals = torch.from_numpy(sum_pieces(region_totals(W), (1, levels.size))[0])
-    assert torch.allclose(region_totals_on_card(on_card), totals, rtol=1e-12)
 
 
 def test_what_follows_a_lift_takes_it_from_the_card(paths: list[Path], tmp_path: Path) -> None:

@@ -36,7 +36,6 @@ from liftcore.io.safetensors_file import map_tensors, write_tensors
 from liftcore.io.shards import shard_at, write_rows
 from liftcore.lifting.engines import blocks
 from liftcore.lifting.engines.blocks import Job, file_version, read_weights, scene_of
-from liftcore.runtime.device import choose_device
 from liftcore.runtime.one_thread import one_thread
 from liftcore.solve.aggregate import assign_features as give_features
 from liftcore.solve.aggregate import cluster_sums, guard, with_feature
@@ -439,8 +438,8 @@ def solve(job: Job, piece: int, threads: int | None) -> None:
     if settings.loss == "huber":
         W = scale_weights(W, huber_factors(W, codebook, means=block.means, threads=threads, delta=job.delta))
     X = torch.zeros(block.last - block.first, job.channels, dtype=job.dtype)
-    rows, device = torch.nonzero(W.indptr.diff())[:, 0], choose_device(settings.device)
-    squares = solve_rows(X, rows, W, codebook, means=block.means, threads=threads, device=device)
+    rows = torch.nonzero(W.indptr.diff())[:, 0]
+    squares = solve_rows(X, rows, W, codebook, means=block.means, threads=threads)
     write_rows(features_file, X)
     columns = {"view_consistency": squares.sqrt().clamp(0.0, 1.0).float()}
     if scores is not None:

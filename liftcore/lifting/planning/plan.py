@@ -120,7 +120,6 @@ class Plan(PlannedScene):
     memory_phases: Mapping[str, Mapping[str, int]]  # bytes a part in each phase, about; what a phase frees is gone
     weight_bytes: int  # of W of all views, about
     device: Device  # of rasterization and solve
-    gpu_weight_bytes: int  # bytes of W that may stay on a GPU between the phases
     features_room: int | None  # bytes of this machine's memory that X may take today; None for no limit
     seconds: float | None  # estimate for the geometry of all views on this machine now; None for few views
     warnings: tuple[str, ...]  # of this machine, today
@@ -145,7 +144,7 @@ class Plan(PlannedScene):
     @property
     def in_files(self) -> int:
         """Bytes of W beyond those that stay in memory, about."""
-        return max(0, self.weight_bytes - MEMORY_LIMIT - self.gpu_weight_bytes)
+        return max(0, self.weight_bytes - MEMORY_LIMIT)
 
     def facts(self) -> dict[str, Any]:
         """Return plain values for the diagnostics, without those that depend on this machine alone."""
@@ -247,9 +246,8 @@ def plan_lift(
     entries = _entries(visible, cameras, features, names, settings, hit_share)
     weights = weight_bytes(visible, entries, settings)
     phases = memory_phases(splats, visible, cameras, features, names, settings, entries)
-    free, gpu_bytes = (None, None) if in_workers else (free_memory(), None if short else device.free_bytes())
-    device_weights = 0 if gpu_bytes is None else min(weights, int(DEVICE_SPARE * gpu_bytes) // 4)
-    in_files = 0 if in_workers else max(0, weights - MEMORY_LIMIT - device_weights)
+    free = None if in_workers else free_memory()
+    in_files = 0 if in_workers else max(0, weights - MEMORY_LIMIT)
     lifted = set(names)
     return Plan(
         **vars(planned_scene(splats, settings)),
@@ -266,7 +264,6 @@ def plan_lift(
         memory_phases=phases,
         weight_bytes=weights,
         device=device,
-        gpu_weight_bytes=device_weights,
         features_room=features_room(phases, free),
         seconds=seconds,
         warnings=(*short, *check_memory(phases, free), *check_weights(in_files)),

@@ -87,17 +87,16 @@ class GpuRaster:
         device: a CUDA device; the CPU if Triton's interpreter is on.
         block: items of tile lists in memory at a time, halved where memory runs out. The result is bitwise identical
             for any value.
-        stays: leave region weights on the device, for a solve there.
 
     Raises:
         Unavailable: the device cannot run the kernels.
     """
 
-    def __init__(self, splats: Splats, device: torch.device, block: int = BLOCK, *, stays: bool = False) -> None:
+    def __init__(self, splats: Splats, device: torch.device, block: int = BLOCK) -> None:
         check_device(device)
         self.splats = splats
         self.device = indexed(device)
-        self._block, self._stays = block, stays
+        self._block = block
         self._host = activate_splats(splats, 1.0)
         self._scale = 1.0  # of the scene's opacity logits
         self._scene: DeviceScene | None = None
@@ -117,9 +116,8 @@ class GpuRaster:
         self, camera: Camera, observation: ViewFeatures, params: CompositingParams, weighting: Weighting
     ) -> RegionWeights:
         """Return ``A'^T S`` of a view and the total weight of unscaled weights. See the protocol."""
-        return self._to_output_device(
-            self._view_weights(self._read(observation, camera, params), camera, params, weighting)
-        )
+        # Copied outside of the function that retries: smaller blocks do not help a host without memory.
+        return self._view_weights(self._read(observation, camera, params), camera, params, weighting).cpu()
 
     @_within_memory
     def _view_weights(
@@ -127,13 +125,6 @@ class GpuRaster:
     ) -> RegionWeights:
         choice, frame = choice_of(weighting), self._frame(camera, params)
         return weights.region_weights(frame, reading, choice, params.opacity_logit_scale != 1.0, self.splats.count)
-
-    def _to_output_device(self, weights: RegionWeights) -> RegionWeights:
-        """Return the weights on the device if they stay there, else on the CPU.
-
-        Not decorated to retry: smaller blocks on the device do not help a host without memory.
-        """
-        return weights if self._stays else weights.cpu()
 
     def iterate_views(self, requests: Iterable[ViewRequest]) -> Generator[ViewWeights]:
         """Yield ``region_weights`` and ``ray_rows`` of views, one at a time; the next is read while the GPU works."""
@@ -145,9 +136,7 @@ class GpuRaster:
             with closing(prefetch(requests, read)) as views:
                 for request, reading in views:
                     yield ViewWeights(  # not bound to a name, which would keep it in memory with the next one
-                        self._to_output_device(
-                            self._view_weights(reading, request.camera, request.params, request.weighting)
-                        ),
+                        self._view_weights(reading, request.camera, request.params, request.weighting).cpu(),
                         self.ray_rows(request.camera, request.pixels, request.params),
                     )
         finally:

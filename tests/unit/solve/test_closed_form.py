@@ -1,8 +1,7 @@
-"""The closed form against its definition, on the CPU and by what a device does, however it is cut."""
+"""The closed form against its definition, however it is cut."""
 
 from __future__ import annotations
 
-import threading
 from dataclasses import replace
 
 import numpy as np
@@ -12,16 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from liftcore.runtime.device import CPU, Device
-from liftcore.solve import closed_form
 from liftcore.solve.closed_form import LONG, Solution, solve
 from liftcore.values.region_weights import RegionWeights, stacked
 from tests.unit.solve.sparse_views import codebook_of, defined, of_dense, random_view
 
-PLACE = torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
-DEVICES = [CPU, Device("cuda", PLACE)]
 SPLATS = 700
-every_device = pytest.mark.parametrize("device", DEVICES, ids=["cpu", "device"])
 
 
 def scene(channels: int = 33, unit: bool = False) -> tuple[list[RegionWeights], list[Tensor]]:
@@ -39,20 +33,19 @@ def assert_same_bits(first: Solution, second: Solution) -> None:
     assert torch.equal(first.view_consistency, second.view_consistency)
 
 
-@every_device
 @pytest.mark.parametrize("channels", [1, 3, 70])
 @pytest.mark.parametrize("unit", [True, False])
-def test_features_and_view_consistency_equal_their_definition(device, channels, unit):
+def test_features_and_view_consistency_equal_their_definition(channels, unit):
     views, books = scene(channels, unit)
     expected, sums = defined(views, books, SPLATS)
-    solution = solved(views, books, device=device)
+    solution = solved(views, books)
     np.testing.assert_allclose(solution.features.numpy(), expected, rtol=1e-5, atol=1e-6)
     units = [torch.nn.functional.normalize(book.double(), dim=1) for book in books]
     lengths = np.linalg.norm(defined(views, units, SPLATS)[0], axis=1)
     np.testing.assert_allclose(solution.view_consistency.numpy(), lengths, atol=1e-3 if unit else 1e-6)
     unseen = torch.from_numpy(sums == 0)
     assert unseen.any() and not solution.features[unseen].any() and not solution.view_consistency[unseen].any()
-    halves = solved(views, books, torch.float16, device=device).features
+    halves = solved(views, books, torch.float16).features
     assert halves.dtype == torch.float16
     torch.testing.assert_close(halves.float(), solution.features, rtol=2**-10, atol=2**-24)
 
@@ -66,101 +59,52 @@ def test_neither_threads_nor_order_nor_files_change_a_bit():
     assert_same_bits(expected, solved([view.in_files() for view in views], books, means=means))
 
 
-@every_device
 @pytest.mark.parametrize("size", [1e5, 1e-9, 3e38])
-def test_what_float16_cannot_hold_is_float32(device, size):
+def test_what_float16_cannot_hold_is_float32(size):
     views, books = scene(4)
     large = [size * book.clamp(-1, 1) for book in books]
-    solution = solved(views, large, torch.float16, device=device).features
+    solution = solved(views, large, torch.float16).features
     assert solution.dtype == torch.float32
     assert torch.isfinite(solution).all()
     expected = solved(views, [book.clamp(-1, 1) for book in books]).features
     torch.testing.assert_close(solution / size, expected, rtol=1e-5, atol=1e-6)
 
 
-@every_device
-def test_slices_of_channels_are_put_together(monkeypatch, device):
+def test_slices_of_channels_are_put_together(monkeypatch):
     views, books = scene(37)
-    expected = solved(views, books, device=device)
+    expected = solved(views, books)
     monkeypatch.setattr("liftcore.solve.codebook.TABLE_BYTES", 1)
     calls = []
-    cut = solved(views, books, device=device, progress=lambda *step: calls.append(step))
+    cut = solved(views, books, progress=lambda *step: calls.append(step))
     assert torch.equal(cut.features, expected.features)
     torch.testing.assert_close(cut.view_consistency, expected.view_consistency, rtol=0, atol=1e-6)
     assert calls[-1] == ("solve", 5, 5, "slices")
 
 
-def test_blocks_that_have_no_room_beside_others_are_solved_after_them(monkeypatch):
-    """One block holds the device until another has been refused."""
-    views, books = scene()
-    expected, sums = solved(views, books, device=DEVICES[1]), closed_form.bag_sums
-    lock, rejected = threading.Lock(), threading.Event()
-
-    def crowded(*arguments):
-        if not lock.acquire(blocking=False):
-            rejected.set()
-            raise torch.OutOfMemoryError
-        try:
-            rejected.wait(60)
-            return sums(*arguments)
-        finally:
-            lock.release()
-
-    monkeypatch.setattr(closed_form, "bag_sums", crowded)
-    monkeypatch.setattr(closed_form, "DEVICE_ROWS", SPLATS // 5)
-    monkeypatch.setattr(closed_form, "LEAST_ROWS", SPLATS)  # no block may be halved
-    solution = solved(views, books, device=DEVICES[1], threads=4)
-    assert rejected.is_set()
-    assert torch.equal(solution.features, expected.features)
-
-
-def test_a_device_without_room_is_given_less_at_a_time(monkeypatch):
-    views, books = scene()
-    expected, sums, sizes = solved(views, books, device=DEVICES[1]), closed_form.bag_sums, []
-
-    def crowded(index, table, starts, shares=None):
-        sizes.append(starts.shape[0] - 1)
-        if sizes[-1] > 256:
-            raise torch.OutOfMemoryError
-        return sums(index, table, starts, shares)
-
-    monkeypatch.setattr(closed_form, "bag_sums", crowded)
-    solution = solved(views, books, device=DEVICES[1])
-    assert sizes[0] > 256 >= sizes[-1]
-    assert torch.equal(solution.features, expected.features)
-    torch.testing.assert_close(solution.view_consistency, expected.view_consistency, rtol=0, atol=1e-6)
-    monkeypatch.setattr(closed_form, "LEAST_ROWS", SPLATS)
-    with pytest.raises(torch.OutOfMemoryError):
-        solved(views, books, device=DEVICES[1])
-
-
-@every_device
-def test_sums_of_a_million_entries_and_of_many_views_keep_their_digits(device):
+def test_sums_of_a_million_entries_and_of_many_views_keep_their_digits():
     books = [torch.full((1_000_000, 1), 0.7)]
     long = [of_dense(np.full((1, 1_000_000), 0.3))]
     views = [of_dense(np.full((1, 1), 0.3))] * 2_000
     for views_of_case, codebooks in ((long, books), (views, [torch.full((1, 1), 0.7)] * 2_000)):
-        solution = solve(stacked(views_of_case, 1), codebook_of(codebooks), torch.float32, device=device)
+        solution = solve(stacked(views_of_case, 1), codebook_of(codebooks), torch.float32)
         # One by one: the third digit.
         assert abs(float(solution.features[0, 0]) / float(torch.tensor(0.7)) - 1) < 5e-6
 
 
-@every_device
-def test_no_view_no_region_and_codebooks_of_zeros_are_zeros(device):
+def test_no_view_no_region_and_codebooks_of_zeros_are_zeros():
     no_weights = of_dense(np.zeros((SPLATS, 2)))
-    solution = solved([no_weights, no_weights], [torch.ones(2, 3)] * 2, torch.float16, device=device)
+    solution = solved([no_weights, no_weights], [torch.ones(2, 3)] * 2, torch.float16)
     assert not solution.features.any() and not solution.view_consistency.any()
-    zeros = solved([random_view(0, 4, SPLATS)], [torch.zeros(4, 3)], torch.float16, device=device)
+    zeros = solved([random_view(0, 4, SPLATS)], [torch.zeros(4, 3)], torch.float16)
     assert not zeros.features.any() and not zeros.view_consistency.any()
 
 
-@every_device
-def test_tiny_and_huge_weights_give_means(device):
+def test_tiny_and_huge_weights_give_means():
     views, books = scene(6)
-    expected = solved(views, books, device=device)
+    expected = solved(views, books)
     for factor in (2.0**-100, 2.0**100):
         scaled = [replace(view, weight=view.weight * factor) for view in views]
-        assert torch.equal(solved(scaled, books, device=device).features, expected.features)
+        assert torch.equal(solved(scaled, books).features, expected.features)
 
 
 @given(st.integers(0, 2**31), st.sampled_from([1, 7, 50]), st.sampled_from([1e-7, 1e-5, 1.0, 6e4]))

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.solve import consensus, consensus_on_card
+from liftcore.solve import consensus
 from liftcore.solve.consensus import MOST_SPLATS, MOST_WITNESSES, OBSERVES, PRIOR, mask_consensus
-from liftcore.solve.consensus_on_card import mask_consensus_on_card
 from liftcore.solve.membership import BELONGS, FAINT
 from liftcore.solve.reweight import SHARPNESS, reweighting_factors
 from liftcore.values.levels import region_levels
@@ -19,15 +18,10 @@ from liftcore.values.views import Regions
 from tests.unit.solve.sparse_views import codebook_of, dense, of_dense
 
 SPLATS = 60
-on_both = pytest.mark.parametrize("on_card", [False, True], ids=["processor", "card"])
 
 
-def consensus_of(
-    W: RegionWeights, levels: np.ndarray, on_card: bool, means: torch.Tensor | None = None
-) -> np.ndarray:
-    """c of every entry of W [nnz], by the processor or by the code of a card."""
-    if on_card:
-        return mask_consensus_on_card(W, levels, means=means).numpy()
+def consensus_of(W: RegionWeights, levels: np.ndarray, means: torch.Tensor | None = None) -> np.ndarray:
+    """c of every entry of W [nnz]."""
     return mask_consensus(W, levels, means=means)
 
 
@@ -100,23 +94,21 @@ def entries(W: RegionWeights, values: np.ndarray) -> np.ndarray:
     return dense(replace(W, weight=torch.from_numpy(values)), SPLATS)
 
 
-@on_both
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("levels", [1, 2])
-def test_consensus_equals_its_definition(seed: int, levels: int, on_card: bool) -> None:
+def test_consensus_equals_its_definition(seed: int, levels: int) -> None:
     W, levels_of_regions = random_scene(seed, levels=levels)
     means = torch.from_numpy(np.random.default_rng(seed).normal(size=(SPLATS, 3)))
     for order in (None, means):  # in which splats are read
-        got = entries(W, consensus_of(W, levels_of_regions, on_card, order))
+        got = entries(W, consensus_of(W, levels_of_regions, order))
         np.testing.assert_allclose(got, defined(W, levels_of_regions), rtol=2e-5, atol=1e-6)
 
 
-@on_both
-def test_cells_of_grids_take_no_part(on_card: bool) -> None:
+def test_cells_of_grids_take_no_part() -> None:
     W, levels = random_scene(5)
     levels[W.offsets[1] : W.offsets[2]] = -1
-    np.testing.assert_allclose(entries(W, consensus_of(W, levels, on_card)), defined(W, levels), rtol=2e-5, atol=1e-6)
-    assert (consensus_of(W, np.full_like(levels, -1), on_card) == 1.0).all()
+    np.testing.assert_allclose(entries(W, consensus_of(W, levels)), defined(W, levels), rtol=2e-5, atol=1e-6)
+    assert (consensus_of(W, np.full_like(levels, -1)) == 1.0).all()
 
 
 def test_a_mask_of_two_things_weighs_less() -> None:
@@ -127,8 +119,7 @@ def test_a_mask_of_two_things_weighs_less() -> None:
     assert (consensus[30:45, merged + 1] > 0.9).all()
 
 
-@on_both
-def test_a_whole_beside_its_parts_is_no_mistake(on_card: bool) -> None:
+def test_a_whole_beside_its_parts_is_no_mistake() -> None:
     parts, wholes = [0, 1, 2, 3], [0, 0, 1, 1]
     view = np.zeros((SPLATS, 6))
     for number in range(4):
@@ -136,7 +127,7 @@ def test_a_whole_beside_its_parts_is_no_mistake(on_card: bool) -> None:
         view[rows, parts[number]] = view[rows, 4 + wholes[number]] = 1.0
     W = stacked([of_dense(view)] * 3, SPLATS)
     levels = np.array([0, 0, 0, 0, 1, 1] * 3, np.int8)
-    np.testing.assert_allclose(consensus_of(W, levels, on_card), 1.0, rtol=1e-6)
+    np.testing.assert_allclose(consensus_of(W, levels), 1.0, rtol=1e-6)
 
 
 def test_threads_and_blocks_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -159,11 +150,10 @@ def test_more_tuples_than_the_first_table_holds_are_distinguished() -> None:
     np.testing.assert_allclose(entries(W, mask_consensus(W, levels)), defined(W, levels), rtol=2e-5, atol=1e-6)
 
 
-@on_both
 @pytest.mark.parametrize("splats", [0, SPLATS])
-def test_a_scene_without_entries_has_none(splats: int, on_card: bool) -> None:
+def test_a_scene_without_entries_has_none(splats: int) -> None:
     W = stacked([of_dense(np.zeros((splats, 3)))] * 2, splats)
-    assert consensus_of(W, np.zeros(6, np.int8), on_card).shape == (0,)
+    assert consensus_of(W, np.zeros(6, np.int8)).shape == (0,)
 
 
 def test_a_card_reads_the_samples_of_the_processor() -> None:
@@ -183,27 +173,7 @@ def test_a_card_reads_the_samples_of_the_processor() -> None:
     means = torch.from_numpy(rng.normal(size=(splats, 3)))
     for order in (None, means):
         expected = mask_consensus(W, levels, means=order)
-        np.testing.assert_allclose(consensus_of(W, levels, True, order), expected, rtol=0, atol=1e-6)
     assert abs(mask_consensus(W, levels) - expected).max() > 1e-4, "the samples depend on the order"
-
-
-def test_blocks_of_a_card_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    W, levels = random_scene(7, views=MOST_WITNESSES + 6)
-    levels[W.offsets[1] : W.offsets[2]] = -1
-    expected = consensus_of(W, levels, True)
-    np.testing.assert_allclose(expected, mask_consensus(W, levels), rtol=0, atol=1e-6)
-    for name, size in (("BLOCK_ENTRIES", 700), ("TABLE_CELLS", 2000), ("CHUNK", 300)):
-        monkeypatch.setattr(consensus_on_card, name, size)
-        assert consensus_of(W, levels, True).tobytes() == expected.tobytes(), name
-
-
-def test_integers_of_a_card_hold_weights_of_any_size() -> None:
-    W, levels = random_scene(3, views=8)
-    sizes = 10.0 ** np.random.default_rng(3).uniform(0, 6, SPLATS)
-    scales = torch.from_numpy(sizes).repeat_interleave(W.indptr.diff())
-    for unit in (1.0, 1e12):
-        large = replace(W, weight=(W.weight * scales * unit).float())
-        np.testing.assert_allclose(consensus_of(large, levels, True), mask_consensus(large, levels), atol=1e-6)
 
 
 def test_the_level_of_a_region_is_where_it_is_labelled() -> None:
@@ -259,15 +229,14 @@ def step_of(
     return after, cosine_sums / sums[:, 0], median
 
 
-@pytest.mark.parametrize("on_card", [False, True], ids=["processor", "card"])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_reliability_and_confidence_equal_their_definition(seed: int, on_card: bool) -> None:
+def test_reliability_and_confidence_equal_their_definition(seed: int) -> None:
     W, levels = random_scene(seed, views=5)
     masks = all_regions(W)
     masks[: int(W.offsets[seed % 3])] = False  # of some views, as those of grids
     books, q = books_of(W, seed), mask_consensus(W, levels)
     consensus = torch.from_numpy(q)
-    got = reweighting_factors(W, codebook_of(books), 1, reliability=masks, consensus=consensus, on_card=on_card)
+    got = reweighting_factors(W, codebook_of(books), 1, reliability=masks, consensus=consensus)
     after, (confidence, feature_consistency), median = step_of(W, books, entries(W, q), masks.numpy())
     assert got.reliability == pytest.approx(median, rel=1e-4)
     np.testing.assert_allclose(entries(W, (W.weight * got.factors).numpy()), after, rtol=2e-3, atol=1e-5)

@@ -6,21 +6,15 @@ import numpy as np
 import pytest
 
 from liftcore.solve import objects
-from liftcore.solve.membership import RegionGroups
-from liftcore.solve.membership_on_card import memberships_on_card
 from liftcore.solve.objects import CONTAINS, OBSERVES, RegionObjects, region_objects
 from liftcore.solve.region_tree import LEAST_VIEWS, MERGE_RATE
 from liftcore.values.region_weights import RegionWeights, stacked
 from tests.unit.solve.sparse_views import dense, of_dense
 from tests.unit.solve.test_consensus import SPLATS, belonging, of_things, random_scene
 
-on_both = pytest.mark.parametrize("on_card", [False, True], ids=["processor", "card"])
 
-
-def objects_of(W: RegionWeights, levels: np.ndarray, total_weight: np.ndarray, on_card: bool) -> RegionObjects:
-    """Objects by the code of the processor, or by that of a card on the CPU."""
-    members = memberships_on_card(W, RegionGroups.of(W.offsets.numpy(), levels)) if on_card else None
-    return region_objects(W, levels, total_weight, members=members)
+def objects_of(W: RegionWeights, levels: np.ndarray, total_weight: np.ndarray) -> RegionObjects:
+    return region_objects(W, levels, total_weight)
 
 
 def mistaken_scene(seed: int, views: int = 7) -> tuple[RegionWeights, np.ndarray]:
@@ -79,11 +73,10 @@ def defined(W: RegionWeights, levels: np.ndarray) -> np.ndarray:
     return objects
 
 
-@on_both
 @pytest.mark.parametrize("seed", range(3))
-def test_objects_are_those_of_the_definition(seed: int, on_card: bool) -> None:
+def test_objects_are_those_of_the_definition(seed: int) -> None:
     W, levels = mistaken_scene(seed)
-    objects, expected = objects_of(W, levels, np.ones(SPLATS), on_card), defined(W, levels)
+    objects, expected = objects_of(W, levels, np.ones(SPLATS)), defined(W, levels)
     sums = np.zeros((SPLATS, expected.max() + 2))
     for m, group in enumerate(expected):
         sums[:, group + 1] += dense(W, SPLATS)[:, m]
@@ -95,50 +88,45 @@ def test_objects_are_those_of_the_definition(seed: int, on_card: bool) -> None:
     np.testing.assert_array_equal(objects.labels < 0, labels < 0)
 
 
-@on_both
-def test_merged_and_split_masks_do_not_change_the_objects(on_card: bool) -> None:
+def test_merged_and_split_masks_do_not_change_the_objects() -> None:
     right = [0, 1, 2, 3]
     merged, split = [0, 0, 1, 2], [0, 1, 2, 2]
     W, levels = of_things([right, merged, right, split, right, right])
-    objects = objects_of(W, levels, np.arange(SPLATS) + 1.0, on_card)
+    objects = objects_of(W, levels, np.arange(SPLATS) + 1.0)
     np.testing.assert_array_equal(objects.labels, np.repeat([3, 2, 1, 0], SPLATS // 4))  # largest total weight first
     assert len(objects.views) == 4 and set(objects.views[0][objects.views[0] >= 0]) <= set(range(6))
 
 
-@on_both
-def test_parts_are_held_together_by_masks_of_the_whole(on_card: bool) -> None:
+def test_parts_are_held_together_by_masks_of_the_whole() -> None:
     rows = np.zeros((SPLATS, 4))  # level 0: two things; level 1: the first one in two parts
     rows[:30, 0], rows[30:, 1], rows[:15, 2], rows[15:30, 3] = 1, 1, 1, 1
     W = stacked([of_dense(rows)] * 4, SPLATS)
-    labels = objects_of(W, np.tile(np.array([0, 0, 1, 1], np.int8), 4), np.ones(SPLATS), on_card).labels
+    labels = objects_of(W, np.tile(np.array([0, 0, 1, 1], np.int8), 4), np.ones(SPLATS)).labels
     assert [len(np.unique(labels[part])) for part in (slice(0, 30), slice(30, 60))] == [1, 1]
     assert labels[0] != labels[-1]
 
 
-@on_both
 @pytest.mark.parametrize("swapped", [False, True])
-def test_a_splat_between_two_objects_has_the_one_of_its_first_region(swapped: bool, on_card: bool) -> None:
+def test_a_splat_between_two_objects_has_the_one_of_its_first_region(swapped: bool) -> None:
     rows = np.zeros((SPLATS, 2))
     rows[:40, 0] = rows[20:, 1] = 1.0  # twenty splats have both
     W = stacked([of_dense(rows[:, ::-1] if swapped else rows), *[of_dense(rows)] * 3], SPLATS)
-    labels = objects_of(W, np.zeros(8, np.int8), np.ones(SPLATS), on_card).labels
+    labels = objects_of(W, np.zeros(8, np.int8), np.ones(SPLATS)).labels
     assert labels[0] != labels[-1] and min(labels) >= 0
     np.testing.assert_array_equal(labels[20:40], labels[-1 if swapped else 0])
 
 
-@on_both
-def test_grids_have_no_objects(on_card: bool) -> None:
+def test_grids_have_no_objects() -> None:
     W, levels = random_scene(0)
-    objects = objects_of(W, np.full_like(levels, -1), np.ones(SPLATS), on_card)
+    objects = objects_of(W, np.full_like(levels, -1), np.ones(SPLATS))
     assert (objects.labels == -1).all() and objects.views.shape[0] == 0
 
 
-@on_both
-def test_views_beyond_the_bound_join_what_the_others_found(monkeypatch: pytest.MonkeyPatch, on_card: bool) -> None:
+def test_views_beyond_the_bound_join_what_the_others_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(objects, "MOST_REGIONS", 20)
     monkeypatch.setattr(objects, "FEWEST_VIEWS", 5)
     W, levels = of_things([[0, 1, 2, 3]] * 12)
-    scene_objects = objects_of(W, levels, np.ones(SPLATS), on_card)
+    scene_objects = objects_of(W, levels, np.ones(SPLATS))
     regions = scene_objects.tree.region
     assert len(scene_objects.views) == 4 and (regions >= 0).all()
     np.testing.assert_array_equal(regions.reshape(12, 4), regions[:4][None].repeat(12, axis=0))

@@ -10,7 +10,7 @@ from liftcore.solve.codebook import Codebook, ViewCodebook
 from liftcore.solve.objects import NodeVectors, RegionObjects, object_facts, region_objects
 from liftcore.values.region_weights import RegionWeights, stacked
 from tests.unit.solve.sparse_views import of_dense
-from tests.unit.solve.test_objects import objects_of, on_both
+from tests.unit.solve.test_objects import objects_of
 
 SPLATS, VIEWS = 240, 12
 PART = np.arange(SPLATS) // 20  # twelve parts of twenty splats
@@ -68,11 +68,10 @@ def mean_iou(nodes: list[np.ndarray], owners: np.ndarray) -> float:
     return float(np.mean(ious))
 
 
-@on_both
 @pytest.mark.parametrize("seed", range(4))
-def test_objects_and_their_parts_are_nodes_with_a_third_of_the_masks_wrong(seed: int, on_card: bool) -> None:
+def test_objects_and_their_parts_are_nodes_with_a_third_of_the_masks_wrong(seed: int) -> None:
     W, levels, _ = three_levels(seed)
-    objects = objects_of(W, levels, np.ones(SPLATS), on_card)
+    objects = objects_of(W, levels, np.ones(SPLATS))
     nodes, parents = members(objects), objects.tree.parents
     assert objects.count == 4 and (parents[:4] < 0).all()
     assert mean_iou(nodes, OBJECT) > 0.95
@@ -100,10 +99,9 @@ def test_masks_of_a_part_and_of_what_lies_behind_it_hold_it_together() -> None:
     assert any(np.array_equal(node, PART == 0) for node in members(objects))
 
 
-@on_both
-def test_what_holds_the_whole_scene_is_a_group_and_its_parts_are_the_objects(on_card: bool) -> None:
+def test_what_holds_the_whole_scene_is_a_group_and_its_parts_are_the_objects() -> None:
     W, levels, codebook = three_levels(1, wrong=0.0, backgrounds=True)
-    objects = objects_of(W, levels, np.arange(SPLATS) + 1.0, on_card)
+    objects = objects_of(W, levels, np.arange(SPLATS) + 1.0)
     assert objects.count == 4 and set(objects.tree.parents[:4]) == {4} and objects.tree.parents[4] < 0
     np.testing.assert_array_equal(objects.labels, 3 - OBJECT)  # the largest total weight first
     totals = np.bincount(W.region.numpy(), W.weight.numpy(), levels.size)

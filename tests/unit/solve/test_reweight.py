@@ -20,8 +20,6 @@ from liftcore.values.settings import LiftSettings
 from tests.scenes import write_scene
 from tests.unit.solve.sparse_views import codebook_of, dense, of_dense
 
-on_both = pytest.mark.parametrize("on_card", [False, True], ids=["processor", "card"])
-
 
 @dataclass
 class Scene:
@@ -101,11 +99,10 @@ def scenes(draw: st.DrawFn) -> Scene:
     return scene
 
 
-@on_both
 @settings(max_examples=30, deadline=None)
 @given(scene=scenes(), steps=st.integers(0, 3))
-def test_the_steps_equal_their_definition_and_keep_every_splats_sum(scene, steps, on_card):
-    got, expected, D = scene.after(steps, on_card=on_card), defined(scene, steps), scene.denominators
+def test_the_steps_equal_their_definition_and_keep_every_splats_sum(scene, steps):
+    got, expected, D = scene.after(steps), defined(scene, steps), scene.denominators
     for actual, real in zip(got, expected, strict=True):
         assert np.abs(over(actual - real, D[:, None])).max() < 2e-3
     sums = np.sum([view.sum(axis=1, dtype=np.float64) for view in got], axis=0)
@@ -124,12 +121,11 @@ def levels_apart(scene: Scene, levels: np.ndarray, steps: int) -> list[np.ndarra
     return [np.sum(views, axis=0) for views in zip(*parts, strict=True)]
 
 
-@on_both
 @pytest.mark.parametrize("steps", [1, 2])
-def test_levels_are_compared_separately(steps, on_card):
+def test_levels_are_compared_separately(steps):
     scene = random_scene(3, count=400, channels=20)
     levels = np.random.default_rng(4).integers(-1, 3, sum(len(book) for book in scene.books)).astype(np.int8)
-    got = scene.after(steps, levels=levels, on_card=on_card)
+    got = scene.after(steps, levels=levels)
     for actual, real in zip(got, levels_apart(scene, levels, steps), strict=True):
         assert np.abs(over(actual - real, scene.denominators[:, None])).max() < 2e-3
 
@@ -197,46 +193,40 @@ def test_consistency_of_a_cluster_is_its_mean_cosine_in_float64(monkeypatch, tab
     np.testing.assert_allclose(consistency.numpy(), expected, atol=1e-6)
 
 
-@on_both
 @pytest.mark.parametrize(("views", "steps"), [(2, 1), (4, 2), (7, 3)])
-def test_steps_that_change_much_equal_their_definition_to_the_last_digits(views, steps, on_card):
+def test_steps_that_change_much_equal_their_definition_to_the_last_digits(views, steps):
     scene = random_scene(views, count=20, views=views, channels=33)
     scene.books[0][0] = 0
     scene.books[1] = scene.books[1].half()
     scene.weights[1][3] = 0
     D, largest_change = scene.denominators[:, None], 0.0
-    for actual, real, first in zip(
-        scene.after(steps, on_card=on_card), defined(scene, steps), scene.weights, strict=True
-    ):
+    for actual, real, first in zip(scene.after(steps), defined(scene, steps), scene.weights, strict=True):
         np.testing.assert_allclose(over(actual, D), over(real, D), atol=1e-5)
         largest_change = max(largest_change, np.abs(over(real - first, D)).max())
     assert largest_change > 0.05
 
 
-@on_both
-def test_slices_of_channels_are_compared_as_one_vector(monkeypatch, on_card):
+def test_slices_of_channels_are_compared_as_one_vector(monkeypatch):
     scene = random_scene(3, count=500)
-    matrix = scene.after(2, on_card=on_card)
+    matrix = scene.after(2)
     for module in ("codebook", "directions"):
         monkeypatch.setattr(f"liftcore.solve.{module}.TABLE_BYTES", 1)
-    for sliced, expected in zip(scene.after(2, on_card=on_card), matrix, strict=True):
+    for sliced, expected in zip(scene.after(2), matrix, strict=True):
         np.testing.assert_allclose(sliced, expected, rtol=1e-4, atol=1e-5)
 
 
-@on_both
-def test_splats_of_few_and_of_many_views_in_one_group_equal_the_definition(on_card):
+def test_splats_of_few_and_of_many_views_in_one_group_equal_the_definition():
     scene = random_scene(6, count=9, views=MOST_COMPARED // 2, rows=3)
     for number, view in enumerate(scene.weights):
         view[::2] *= number % 8 == 0  # every other splat has an eighth of the views
     entry_counts = np.sum([(view > 0).sum(axis=1) for view in scene.weights], axis=0)
     assert entry_counts.min() < LONG < entry_counts.max() <= MOST_COMPARED
     D = np.maximum(scene.denominators[:, None], 1e-30)
-    for actual, real in zip(scene.after(1, on_card=on_card), defined(scene, 1), strict=True):
+    for actual, real in zip(scene.after(1), defined(scene, 1), strict=True):
         np.testing.assert_allclose(actual / D, real / D, atol=1e-6)
 
 
-@on_both
-def test_splats_of_many_views_and_of_many_regions_equal_the_definition(on_card):
+def test_splats_of_many_views_and_of_many_regions_equal_the_definition():
     scene = random_scene(4, count=3, views=2 * MOST_COMPARED, rows=3)
     view_counts = np.sum([view.any(axis=1) for view in scene.weights], axis=0)
     assert (view_counts > MOST_COMPARED).all()
@@ -244,19 +234,18 @@ def test_splats_of_many_views_and_of_many_regions_equal_the_definition(on_card):
     scene.weights.append(rng.random((3, 2 * MOST_COMPARED + 30)).astype(np.float32))
     scene.books.append(torch.tensor(rng.normal(0, 1, (2 * MOST_COMPARED + 30, 150)), dtype=torch.float32))
     D = scene.denominators[:, None]
-    for actual, real in zip(scene.after(1, on_card=on_card), defined(scene, 1), strict=True):
+    for actual, real in zip(scene.after(1), defined(scene, 1), strict=True):
         np.testing.assert_allclose(actual / D, real / D, atol=1e-6)
 
 
-@on_both
 @pytest.mark.parametrize(("rows", "channels"), [(20_000, 8), (8, 10_000)])
-def test_a_step_over_very_many_terms_keeps_its_digits(rows, channels, on_card):
+def test_a_step_over_very_many_terms_keeps_its_digits(rows, channels):
     rng = np.random.default_rng(2)
     direction = rng.normal(0, 1, channels)
     books = rng.uniform(-1, 2, (2, rows, 1)) * direction + rng.normal(0, 1, (2, rows, channels))
     weights = rng.uniform(0.001, 1, (2, 1, rows)).astype(np.float32)
     scene = Scene([*weights], [torch.tensor(book, dtype=torch.float32) for book in books])
-    got, exact = np.concatenate(scene.after(1, on_card=on_card)), np.concatenate(defined(scene, 1))
+    got, exact = np.concatenate(scene.after(1)), np.concatenate(defined(scene, 1))
     assert np.abs(got - exact).max() < 1e-6 * exact.max()
 
 
