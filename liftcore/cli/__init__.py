@@ -9,18 +9,16 @@ stdout has exactly one JSON object.
 import argparse
 import os
 import sys
-import warnings
 from collections.abc import Sequence
 from functools import partial
 from importlib import import_module
 from typing import Any
 
 from liftcore import __version__, load_plugin
-from liftcore.cli.options import BAD_INPUT, Parser, RemoteUrl, place, shared_options, whole_number, wrong_kind_error
+from liftcore.cli.options import BAD_INPUT, Parser, shared_options, whole_number, wrong_kind_error
 from liftcore.errors import SplatliftError
-from liftcore.files import local_path
 
-__all__ = ["Parser", "build_parser", "main", "place", "whole_number"]  # for commands of other packages
+__all__ = ["Parser", "build_parser", "main", "whole_number"]  # for commands of other packages
 COMMANDS = {
     "check": "check that splats, cameras, photos and features match",
     "lift": "lift features onto splats",
@@ -51,14 +49,6 @@ INTERNAL_ERROR = 1
 INTERRUPTED = 130
 
 
-def __getattr__(name: str) -> Any:
-    """Return ``whole_number`` by its old name, with a `DeprecationWarning`."""
-    if name != "whole":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    warnings.warn(f"{__name__}.whole is now whole_number", DeprecationWarning, stacklevel=2)
-    return whole_number
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command, and return the exit status."""
     try:
@@ -66,7 +56,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else 0
     try:
-        download_inputs(options)
         status = _module(options.command).run(options)
         sys.stdout.flush()
         return status
@@ -86,18 +75,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         message = " ".join(f"{type(error).__name__}: {error}".split())[:400]
         print(f"splatlift: internal error: {message} (--debug shows the traceback)", file=sys.stderr)
         return INTERNAL_ERROR
-
-
-def download_inputs(options: argparse.Namespace) -> None:
-    """Download remote inputs, and replace their URLs by local paths; ``remote_options`` are the options of URLs."""
-    options.remote_options = [name for name, value in vars(options).items() if isinstance(value, RemoteUrl)]
-    for name, value in vars(options).items():
-        if name == "output":
-            continue
-        if isinstance(value, RemoteUrl):
-            setattr(options, name, local_path(value))
-        elif isinstance(value, list):
-            setattr(options, name, [local_path(item) if isinstance(item, RemoteUrl) else item for item in value])
 
 
 def build_parser() -> argparse.ArgumentParser:

@@ -10,7 +10,7 @@ from statistics import median
 from typing import TYPE_CHECKING
 
 from liftcore.cli.lift import pairs_of
-from liftcore.cli.options import BAD_INPUT, Parser, add_verbose, place
+from liftcore.cli.options import BAD_INPUT, Parser, add_verbose
 from liftcore.cli.reply import reply
 
 if TYPE_CHECKING:
@@ -38,9 +38,9 @@ Photos without a camera and cameras without a photo are listed too.
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    parser.add_argument("splats", type=place, help="trained splats")
-    parser.add_argument("cameras", type=place, help="COLMAP folder or .zip, transforms.json or cameras.json")
-    parser.add_argument("others", type=place, nargs="*", help="folders of photos, and feature packs (.safetensors)")
+    parser.add_argument("splats", type=Path, help="trained splats")
+    parser.add_argument("cameras", type=Path, help="COLMAP folder or .zip, transforms.json or cameras.json")
+    parser.add_argument("others", type=Path, nargs="*", help="folders of photos, and feature packs (.safetensors)")
     parser.add_argument("--worst", type=Path, metavar="PNG", help="write the worst view: its photo and the render")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one setting of the lift")
     add_verbose(parser)

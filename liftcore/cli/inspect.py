@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
-from liftcore.cli.options import Parser, place
+from liftcore.cli.options import Parser
 from liftcore.cli.reply import reply
 
 CAMERAS = """\
@@ -32,7 +33,7 @@ how cameras are read
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
     parser.appendix = lambda: CAMERAS
-    parser.add_argument("file", type=place, help="splats, cameras, features, a lift, masks or a text table")
+    parser.add_argument("file", type=Path, help="splats, cameras, features, a lift, masks or a text table")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -8,7 +8,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import Parser, add_settings, add_sources, add_verbose, add_world, count, place, world_of
+from liftcore.cli.options import Parser, add_settings, add_sources, add_verbose, add_world, count, world_of
 from liftcore.cli.reply import reply, short_text, smoothing_line
 from liftcore.errors import InvalidInput, InvalidSettings
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
     add_sources(parser)
-    parser.add_argument("-o", "--output", type=place, required=True, metavar="LIFT", help="the lift to write")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="LIFT", help="the lift to write")
     add_settings(parser)
     add_world(parser)
     parser.add_argument("--explain", action="store_true", help="print the plan before the lift")

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import Parser, add_encoder, add_splats, add_world, place, sides_of, world_of
+from liftcore.cli.options import Parser, add_encoder, add_splats, add_world, sides_of, world_of
 from liftcore.cli.query import source_files
 from liftcore.cli.reply import check_outputs, place_of, reply, write_files
 from liftcore.cli.segment import encoder_and_words
@@ -43,7 +43,7 @@ Gaps are in metres if the length of a unit is known, otherwise in scene units.
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    parser.add_argument("lift", type=place, help="a lift (.safetensors)")
+    parser.add_argument("lift", type=Path, help="a lift (.safetensors)")
     vocabulary_help = "name each object by the nearest word of a file, one a line, or of a text table (.safetensors)"
     parser.add_argument("--vocabulary", type=Path, metavar="FILE", help=vocabulary_help)
     add_encoder(parser)

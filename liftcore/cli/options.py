@@ -15,7 +15,6 @@ from types import UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, Self, Union, get_args, get_origin
 
 from liftcore.errors import InvalidInput, InvalidQuery, SplatliftError
-from liftcore.files import is_remote
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -43,15 +42,6 @@ def option_errors(option_names: Mapping[str, str]) -> Iterator[None]:
             hint = hint.replace(name, option) if name.endswith("=") else hint
         argument = option_names.get(error.argument, error.argument)
         raise type(error)(argument, expected=error.expected, got=error.got, hint=hint) from None
-
-
-class RemoteUrl(str):
-    """The text of an argument with a protocol."""
-
-
-def place(text: str) -> Path | RemoteUrl:
-    """Parse an argument as a path or a URL."""
-    return RemoteUrl(text) if is_remote(text) else Path(text)
 
 
 class Parser(argparse.ArgumentParser):
@@ -144,9 +134,9 @@ def add_sources(parser: argparse.ArgumentParser, features: str = "+", without: s
     Args:
         features: their number, as ``nargs`` of argparse. without: help text about no features.
     """
-    parser.add_argument("splats", type=place, help="trained splats (.ply, .splat, .spz, .sog, or a checkpoint)")
-    parser.add_argument("cameras", type=place, help="COLMAP folder or .zip, transforms.json or cameras.json")
-    parser.add_argument("features", type=place, nargs=features, help=f"feature packs (.safetensors){without}")
+    parser.add_argument("splats", type=Path, help="trained splats (.ply, .splat, .spz, .sog, or a checkpoint)")
+    parser.add_argument("cameras", type=Path, help="COLMAP folder or .zip, transforms.json or cameras.json")
+    parser.add_argument("features", type=Path, nargs=features, help=f"feature packs (.safetensors){without}")
 
 
 def add_settings(parser: Parser) -> None:
@@ -221,15 +211,15 @@ def add_encoder(parser: argparse.ArgumentParser) -> None:
 
 def add_lift(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of a lift and the paths of its splats and cameras."""
-    parser.add_argument("lift", type=place, help="a lift (.safetensors)")
+    parser.add_argument("lift", type=Path, help="a lift (.safetensors)")
     add_splats(parser)
-    parser.add_argument("--cameras", type=place, metavar="PATH", help="its cameras; default: their recorded path")
+    parser.add_argument("--cameras", type=Path, metavar="PATH", help="its cameras; default: their recorded path")
 
 
 def add_splats(parser: argparse.ArgumentParser) -> None:
     """Add the option of the path of a lift's splats."""
     splats_help = "its splats; default: their recorded path, or the lift's folder"
-    parser.add_argument("--splats", type=place, metavar="FILE", help=splats_help)
+    parser.add_argument("--splats", type=Path, metavar="FILE", help=splats_help)
 
 
 def add_world(parser: argparse.ArgumentParser) -> None:

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any
 
-from liftcore.cli.options import Parser, add_splats, count, place
+from liftcore.cli.options import Parser, add_splats, count
 from liftcore.cli.reply import reply, smoothing_line
-from liftcore.errors import InvalidInput
 
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    parser.add_argument("lift", type=place, help="a lift (.safetensors or .shards)")
+    parser.add_argument("lift", type=Path, help="a lift (.safetensors or .shards)")
     smoothness_help = (
         "weight lambda of the smoothness term between splats near in position and colour, above 0; try 1"
     )
     parser.add_argument("--smoothness", type=float, required=True, metavar="L", help=smoothness_help)
     output_help = "the lift to write; default: LIFT with .smooth before its suffix"
-    parser.add_argument("-o", "--output", type=place, metavar="OUT", help=output_help)
+    parser.add_argument("-o", "--output", type=Path, metavar="OUT", help=output_help)
     add_splats(parser)
     parser.add_argument("--threads", type=count, metavar="N", help="default: the number of cores")
 
@@ -27,8 +27,6 @@ def run(options: argparse.Namespace) -> int:
     """Smooth the lift's features, write it completely or not at all, and print how much they changed."""
     out = options.output
     if out is None:
-        if "lift" in options.remote_options:
-            raise InvalidInput("output", expected="-o OUT", got="none, for a remote lift")
         out = options.lift.with_name(f"{options.lift.stem}.smooth{options.lift.suffix}")
     from liftcore import Scene, load_lift
     from liftcore.files import check_output, writing

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from liftcore.cli.options import Parser, add_splats, place
+from liftcore.cli.options import Parser, add_splats
 from liftcore.cli.reply import reply
 from liftcore.errors import InvalidInput
 
@@ -15,9 +15,9 @@ NUMBERS = (12, 16)  # of a matrix
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    parser.add_argument("lift", type=place, help="a lift (.safetensors or .shards)")
-    parser.add_argument("edited", type=place, help="other splats of its scene, of any format")
-    parser.add_argument("-o", "--output", type=place, required=True, metavar="NEW", help="the lift to write")
+    parser.add_argument("lift", type=Path, help="a lift (.safetensors or .shards)")
+    parser.add_argument("edited", type=Path, help="other splats of its scene, of any format")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="NEW", help="the lift to write")
     matrix_help = "transform of the scene, a text file of 3 or 4 rows of 4 numbers; default: estimated"
     parser.add_argument("--matrix", type=Path, metavar="FILE", help=matrix_help)
     add_splats(parser)

@@ -12,12 +12,11 @@ import torch
 from liftcore.errors import InvalidInput
 from liftcore.evaluate.hardware import hardware, machine_speed, peak_memory
 from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
-from liftcore.io.remote import local_path
 from liftcore.lifting.pipeline import lift
 from liftcore.lifting.warm_up import warm_up_lift
 from liftcore.raster import open_raster
 from liftcore.raster.base import Raster, ViewRequest
-from liftcore.runtime.arguments import check_count
+from liftcore.runtime.arguments import as_path, check_count
 from liftcore.runtime.device import Device, choose_device
 from liftcore.runtime.one_thread import one_thread
 from liftcore.scene.cameras import Camera
@@ -76,7 +75,7 @@ def run_bench(
         check_count(name, count)
     check_count("threads", threads, "all cores")
     if scene:
-        work = _scene_workload(local_path(scene, "scene"), channels, levels, views)
+        work = _scene_workload(as_path(scene, "scene"), channels, levels, views)
     else:
         work = _room_workload(splats, size, channels, levels, views)
     start = time.perf_counter()

@@ -25,7 +25,6 @@ from liftcore.features.encoders.encode import TURNS, find_images, read_image, re
 from liftcore.features.smoothness import smoothness, unlike_maps
 from liftcore.io.cameras import read_cameras
 from liftcore.io.photos import PhotoHeader, orientation_warnings, read_header
-from liftcore.io.remote import local_path
 from liftcore.io.splats import read_splats
 from liftcore.lifting.planning.contradictions import (
     FAR_SCALES,
@@ -41,7 +40,7 @@ from liftcore.lifting.planning.views import visibility
 from liftcore.query.splat_colours import view_colours
 from liftcore.raster import open_raster
 from liftcore.raster.base import Raster
-from liftcore.runtime.arguments import as_list
+from liftcore.runtime.arguments import as_list, as_path
 from liftcore.runtime.device import CPU
 from liftcore.runtime.progress import Progress, shown_progress
 from liftcore.scene.cameras import Camera, Cameras
@@ -117,7 +116,7 @@ def check_scene(
     settings = LiftSettings.or_default(settings)
     features = features if features is None or isinstance(features, Views) else read_features(*as_list(features))
     if isinstance(photos, Mapping):
-        images = {view: local_path(file, "photos") for view, file in photos.items()}
+        images = {view: as_path(file, "photos") for view, file in photos.items()}
     else:
         images = find_images(photos or ())
     splats = splats if isinstance(splats, Splats) else read_splats(splats, settings.kernel)

@@ -18,10 +18,9 @@ from liftcore.io.cameras import TRANSFORMS, camera_source, has_nerfstudio_beside
 from liftcore.io.kinds import EXPORT_PLY, SplatFormat, identify
 from liftcore.io.photo_zip import describe_photos
 from liftcore.io.ply import nearest_dialect
-from liftcore.io.remote import local_path
 from liftcore.io.splats import format_of, read_splats, splat_files
 from liftcore.io.transforms import FRAME_FILE
-from liftcore.runtime.arguments import check_choice
+from liftcore.runtime.arguments import as_path, check_choice
 from liftcore.runtime.plugins import Plugin
 from liftcore.scene.cameras import Cameras, distortion_warning
 from liftcore.scene.compositing import ALPHA_FLOOR
@@ -58,7 +57,7 @@ def inspect_file(path: Path | str, kind: str = "", *, trusted: bool = True) -> d
     """Describe a file of splats, cameras, features, masks, a lift or a table of text embeddings.
 
     Args:
-        path: of the file or folder; it may be remote (`io.remote`).
+        path: of the file or folder.
         kind: one of DESCRIPTIONS, or ``photos`` of a zip; empty: it is identified.
         trusted: False rejects splats in formats that may hold code, and formats of plugins.
 
@@ -68,7 +67,7 @@ def inspect_file(path: Path | str, kind: str = "", *, trusted: bool = True) -> d
     Raises:
         InvalidInput: the file is missing, malformed or of no kind, or the kind is unknown.
     """
-    path = local_path(path)
+    path = as_path(path)
     if kind:
         check_choice("kind", kind, DESCRIPTIONS)
     if not path.exists():

@@ -13,9 +13,8 @@ from liftcore.evaluate.labels import lerf_scenes, three_d_ovs_scenes
 from liftcore.evaluate.protocols import EvaluationProtocol
 from liftcore.evaluate.published import Published, published
 from liftcore.io.files import visible_files
-from liftcore.io.remote import check_path, local_path
 from liftcore.query.scene import Scene
-from liftcore.runtime.arguments import as_list, check_choice
+from liftcore.runtime.arguments import as_list, as_path, check_choice
 from liftcore.runtime.progress import Progress, shown_progress
 from liftcore.scene.views import view_names
 from liftcore.text import TextEncoder
@@ -108,9 +107,9 @@ def evaluate_lifts(
         InvalidQuery, InvalidLift, Unavailable: as in `evaluate_scene` and `Scene.encoder`.
     """
     check_choice("dataset", dataset, _DATASETS)
-    labels = _DATASETS[dataset](local_path(data, "data"))
+    labels = _DATASETS[dataset](as_path(data, "data"))
     files = find_lifts(as_list(lifts), labels)
-    names = _names(local_path(held_out, "held_out")) if held_out else None
+    names = _names(as_path(held_out, "held_out")) if held_out else None
     for name in as_list(protocols) or [None]:
         check_choice("protocols", name, EvaluationProtocol)
     ways = tuple(EvaluationProtocol(name) for name in dict.fromkeys(as_list(protocols)))
@@ -136,7 +135,7 @@ def find_lifts(lifts: Iterable[Path | str], scenes: Collection[str]) -> dict[str
     """
     by_scene: dict[str, Path] = {}
     for lift in lifts:
-        check_path(lift, "lifts")
+        as_path(lift, "lifts")
         text = str(lift)
         scene, equals, rest = text.partition("=")
         path = Path(rest if equals and scene in scenes else text)

@@ -27,7 +27,6 @@ from liftcore.evaluate.class_masks import read_masks
 from liftcore.evaluate.hardware import hardware, peak_memory
 from liftcore.evaluate.ranking import accuracy_of, choose
 from liftcore.io.cameras import read_cameras
-from liftcore.io.remote import local_path, local_paths
 from liftcore.lifting.files import open_files
 from liftcore.lifting.pipeline import lift
 from liftcore.lifting.planning.views import evenly_spaced
@@ -39,7 +38,7 @@ from liftcore.query.render import view_mask
 from liftcore.query.result import LiftResult
 from liftcore.query.scene import Scene
 from liftcore.raster import open_raster
-from liftcore.runtime.arguments import as_list
+from liftcore.runtime.arguments import as_list, as_path, as_paths
 from liftcore.runtime.device import CPU, choose_device
 from liftcore.runtime.folders import scratch_folder
 from liftcore.runtime.progress import Progress, one_step
@@ -133,8 +132,8 @@ class SceneFiles:
         for name in ("splats", "cameras", "labels", "table"):
             path = getattr(self, name)
             if path is not None or name in ("splats", "cameras"):
-                object.__setattr__(self, name, local_path(path, name))  # pyright: ignore[reportArgumentType]: None too
-        object.__setattr__(self, "features", tuple(local_paths(self.features, "features")))
+                object.__setattr__(self, name, as_path(path, name))  # pyright: ignore[reportArgumentType]: None too
+        object.__setattr__(self, "features", tuple(as_paths(self.features, "features")))
         object.__setattr__(self, "classes", tuple(as_list(self.classes)))
         if self.labels is not None and (self.table is None or not self.classes):
             raise InvalidInput("labels", expected="a table and the classes' words beside them", got="no words")

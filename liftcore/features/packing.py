@@ -14,9 +14,8 @@ from liftcore.features.prompts import Folders, Unannotated, prompt_views
 from liftcore.io.files import whole_file
 from liftcore.io.outputs import check_output, writing
 from liftcore.io.photos import orientation_warnings
-from liftcore.io.remote import local_path, open_output
 from liftcore.io.safetensors_file import with_metadata
-from liftcore.runtime.arguments import check_choice, check_text, one_of
+from liftcore.runtime.arguments import as_path, check_choice, check_text, one_of
 from liftcore.runtime.progress import Progress, shown_progress
 from liftcore.scene.views import IMAGE_SUFFIXES
 from liftcore.text import OWN_WORDS
@@ -87,7 +86,7 @@ def pack_folder(
     """
     names = {"encoder": encoder_name or None, "text_space": text_space or None, "normalised": normalised}
     _check_options(kind, options, names)
-    folder = local_path(folder, "folder")
+    folder = as_path(folder, "folder")
     table, warnings, is_encoded = None, list[str](), False
     with shown_progress(progress) as reporter:
         if kind == "langsplat":
@@ -110,7 +109,8 @@ def pack_folder(
         metadata = {"source": kind} | {name: text for name, text in texts.items() if names[name] is not None}
         if kind == "langsplat" and len(views[next(iter(views))].labels) == len(LANGSPLAT_LEVELS):
             metadata["levels"] = json.dumps(LANGSPLAT_LEVELS)
-        with writing(out), open_output(out) as file:
+        with writing(out):
+            file = as_path(out, "output")
             write_pack(file, views, metadata, reporter, table)
     keeps_names = kind in ("langsplat", "prompts") or is_encoded  # names of their files have no image suffix
     return {
@@ -147,7 +147,7 @@ def _prompt_views(folder: Path, options: PackOptions) -> tuple[ViewFolder[Any], 
     names = options.get("names")
     prompts = prompt_views(
         folder,
-        None if names is None else local_path(names, "names"),
+        None if names is None else as_path(names, "names"),
         options.get("folders", "phrases"),
         unlabelled=options.get("unlabelled"),
         unannotated=options.get("unannotated", "skip"),
@@ -201,8 +201,8 @@ def retag_pack(pack: Path | str, out: Path | str, names: Mapping[str, str]) -> N
     for name, value in names.items():
         check_choice("names", name, NAMES)
         check_text(name, value)
-    pack = local_path(pack, "pack")
+    pack = as_path(pack, "pack")
     check_output(out, [pack], "pack")
     read_features(pack)  # so that an invalid pack is an error before a file is created
-    with writing(out), open_output(out) as file, whole_file(file) as handle:
+    with writing(out), whole_file(as_path(out, "output")) as handle:
         handle.writelines(with_metadata(pack, names))

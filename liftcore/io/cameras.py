@@ -25,7 +25,6 @@ from liftcore.io.inria import parse_inria
 from liftcore.io.json_file import read_json
 from liftcore.io.kinds import wrong_kind
 from liftcore.io.photos import PhotosBeside
-from liftcore.io.remote import local_path
 from liftcore.io.transforms import (
     FISHEYE,
     FRAME_FILE,
@@ -35,6 +34,7 @@ from liftcore.io.transforms import (
     parse_transforms,
     read_frame,
 )
+from liftcore.runtime.arguments import as_path
 from liftcore.runtime.folders import scratch_folder
 from liftcore.scene.cameras import Cameras, cameras_from
 from liftcore.scene.distortion import Fisheye
@@ -138,11 +138,10 @@ def read_cameras(path: Path | str, *, choosing: bool = True, views: Collection[s
         views: names of views of features or a lift, which select one of several COLMAP models.
 
     Raises:
-        InvalidInput: it is a URL (`io.remote`) that cannot be read.
         InvalidCameras: no camera format is recognised, or the content is malformed.
         Unavailable: the temporary folder has no free space for the files of a zip.
     """
-    path = local_path(path)
+    path = as_path(path)
     try:
         return _read(path, choosing=choosing, views=views)
     except InvalidCameras as error:

@@ -26,13 +26,13 @@ from liftcore.io.colmap import MODEL_FILES
 from liftcore.io.files import BROKEN_ZIP, LFS_HINT, LFS_POINTER, is_system_file, open_regular, open_zip
 from liftcore.io.ply import MAX_HEADER_BYTES, cloud_without_splats
 from liftcore.io.ranks import rank_files
-from liftcore.io.remote import check_path
 from liftcore.io.shards import INDEX
 from liftcore.io.sog import META, is_sog_document, sog_folder
 from liftcore.io.splat import looks_like_splat
 from liftcore.io.spz import begins_like_spz
 from liftcore.io.streamed_sog import LOD_META, is_streamed_document, streamed_folder
 from liftcore.io.transforms import FRAME_FILE
+from liftcore.runtime.arguments import as_path
 from liftcore.scene.views import IMAGE_SUFFIXES
 
 LIFT_KEY = "splatlift"  # of the metadata of a lift
@@ -305,7 +305,7 @@ def identify(path: Path | str) -> FileKind:
     Raises:
         InvalidInput: it is no path.
     """
-    check_path(path)
+    as_path(path)
     path = Path(path)
     try:
         mode = path.stat().st_mode

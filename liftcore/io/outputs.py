@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from liftcore.errors import InvalidInput
-from liftcore.io.remote import check_path, is_remote, require_storage
-from liftcore.runtime.arguments import as_list, check_choice
+from liftcore.runtime.arguments import as_list, as_path, check_choice
 
 
 @dataclass(frozen=True)
@@ -40,8 +39,7 @@ CONVERTED = (".sog", ".html", ".csv", ".compressed.ply", ".splat", ".spz")  # wh
 def check_output(path: Path | str, inputs: Path | str | Iterable[Path | str], kind: str) -> Path | str:
     """Check that an output can be written, and is no folder, none of the inputs and no file of another kind.
 
-    A file of the kind that is written is replaced. Of a lift at a URL (`liftcore.io.remote`) the storage
-    is looked at; of one in shards the index is the file.
+    A file of the kind that is written is replaced. Of a lift in shards the index is the file.
 
     Args:
         path: as the user gave it. inputs: files, and folders of cameras, that are read for it. kind: what goes there,
@@ -51,17 +49,13 @@ def check_output(path: Path | str, inputs: Path | str | Iterable[Path | str], ki
         The file: the path itself, or the index of a folder of shards.
 
     Raises:
-        InvalidInput: it is one of these, its suffix is not written, no file can be made there, its storage does not
-            open, or there is no such kind.
+        InvalidInput: it is one of these, its suffix is not written, no file can be made there, or there is no such
+            kind.
     """
     from liftcore.io.shards import INDEX, SUFFIX
 
     check_choice("kind", kind, OUTPUT_TYPES)
-    check_path(path, "output")
-    if is_remote(path):
-        require_storage(str(path))
-        return path
-    path = Path(path)
+    path = as_path(path, "output")
     if kind == "lift" and path.suffix == SUFFIX:
         path, kind = path / INDEX, "json"
     output = OUTPUT_TYPES[kind]

@@ -26,12 +26,12 @@ from liftcore.io.kinds import CONVERT, SplatFormat, identify, wrong_kind
 from liftcore.io.labels import COLUMN, IDS, Labels, id_column, read_document
 from liftcore.io.quantised import Fields
 from liftcore.io.ranks import rank_files
-from liftcore.io.remote import local_path, open_output
 from liftcore.io.sog import is_bundled, read_sog, sog_files
 from liftcore.io.splat import ROW, read_splat, splat_blocks
 from liftcore.io.spz import read_spz, read_spz_document, spz_blocks
 from liftcore.io.streamed_sog import read_streamed_sog, streamed_files
 from liftcore.io.usd import read_usd, read_usd_document, usd_blocks
+from liftcore.runtime.arguments import as_path
 from liftcore.runtime.plugins import Plugin, find_plugin
 from liftcore.scene.harmonics import constant_terms
 from liftcore.scene.kernel import Kernel, kernel_named
@@ -81,15 +81,14 @@ def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool
     More of PLYs is in `liftcore.io.ply.read_ply`. Checkpoints are opened for tensors alone: no code of theirs runs.
 
     Args:
-        path: a file, a folder of a SOG or of a checkpoint's ranks, or a URL (`io.remote`).
+        path: a file, or a folder of a SOG or of a checkpoint's ranks.
         kernel: auto, 3dgs, 2dgs or dbs. colour: whether colours and further columns are read.
 
     Raises:
-        InvalidInput: it is a URL (`io.remote`) that cannot be read.
         InvalidSplats: the file is malformed or of no such format, lacks a property of the kernel, or holds no splat
             of finite numbers.
     """
-    path = local_path(path)
+    path = as_path(path)
     splat_format = format_of(path)
     with _naming(path):
         if splat_format is SplatFormat.PLY:
@@ -115,7 +114,7 @@ def write_splats(path: Path | str, splats: Splats, columns: Mapping[str, Any] | 
     A PLY keeps the layout and the further columns that the splats were read with.
 
     Args:
-        path: a file or a URL (`io.remote`). A name without a suffix is a PLY.
+        path: a file. A name without a suffix is a PLY.
         columns: of all but a ``.splat``, further numbers a splat: name -> [P] booleans or numbers of numpy or torch,
             such as ``{"object": result.object, "score": answer.scores}``; one that the splats have is replaced.
 
@@ -140,7 +139,7 @@ def write_splats(path: Path | str, splats: Splats, columns: Mapping[str, Any] | 
             (*splats.layout, *(name for name in new_columns if name not in splats.layout)) if splats.layout else ()
         )
         splats = replace(splats, extras={**splats.extras, **new_columns}, layout=layout)
-    with open_output(path) as place, whole_file(place) as handle:
+    with whole_file(as_path(path)) as handle:
         for block in write(splats, None):
             handle.write(block)
 
@@ -371,7 +370,7 @@ def read_labels(path: Path | str) -> Labels:
     Raises:
         InvalidSplats: the file is malformed, or has no such column.
     """
-    path = local_path(path)
+    path = as_path(path)
     splats = read_splats(path)
     columns = {name: column.cpu().numpy() for name, column in splats.extras.items()}
     if not set(IDS) & columns.keys():

@@ -27,9 +27,9 @@ import torch
 from llvmlite.binding import get_host_cpu_name
 
 from liftcore.errors import InvalidInput
-from liftcore.io.remote import check_path
 from liftcore.io.safetensors_file import tensor_bytes
 from liftcore.raster.base import RayRows, ViewWeights
+from liftcore.runtime.arguments import as_path
 from liftcore.runtime.version import __version__
 from liftcore.scene.origin import FILE_ORIGIN
 from liftcore.values.region_weights import FORMAT, MEMORY_LIMIT, RegionWeights
@@ -58,7 +58,7 @@ class Checkpoint:
     identity: str = ""  # digest of the splats, the code and the device of all answers (`of`)
 
     def __post_init__(self) -> None:
-        check_path(self.folder, "folder")
+        as_path(self.folder, "folder")
         object.__setattr__(self, "folder", Path(self.folder))
 
     def of(

@@ -8,13 +8,13 @@ from pathlib import Path
 
 from liftcore.errors import InvalidFeatures
 from liftcore.io.cameras import read_cameras
-from liftcore.io.remote import local_path
 from liftcore.io.splats import read_splats
 from liftcore.lifting.checkpoint import Checkpoint
 from liftcore.lifting.engines.base import Engine
 from liftcore.lifting.pipeline import lift, plan
 from liftcore.lifting.planning.plan import Plan
 from liftcore.query.result import LiftResult
+from liftcore.runtime.arguments import as_path
 from liftcore.runtime.device import choose_device
 from liftcore.runtime.progress import Progress, Timings, shown_progress
 from liftcore.scene.cameras import Cameras
@@ -40,7 +40,6 @@ def lift_files(
 
     Args:
         splats: of any format that `read_splats` reads. cameras: likewise of `read_cameras`. features: feature packs.
-            All may be remote (`io.remote`).
         settings: None: the defaults. The other arguments are those of `liftcore.lift`.
 
     Raises:
@@ -50,7 +49,7 @@ def lift_files(
     """
     settings = LiftSettings.or_default(settings)
     choose_device(settings.device)  # raises before gigabytes are read
-    paths = local_path(splats), local_path(cameras), _pack_paths(features)
+    paths = as_path(splats), as_path(cameras), _pack_paths(features)
     with shown_progress(progress) as reporter:
         timings = Timings(reporter)
         with timings.step("read"):
@@ -75,7 +74,7 @@ def plan_files(
 ) -> Plan:
     """Plan the lift of `lift_files` with the same arguments, as `liftcore.plan` does."""
     settings = LiftSettings.or_default(settings)
-    sources = open_files(local_path(splats), local_path(cameras), features, settings)
+    sources = open_files(as_path(splats), as_path(cameras), features, settings)
     return plan(*sources, settings, threads=threads, in_blocks=in_blocks)
 
 
@@ -101,4 +100,4 @@ def open_files(
 def _pack_paths(features: Sequence[Path | str]) -> list[Path]:
     if isinstance(features, str | Path):  # a str is a sequence too
         raise InvalidFeatures("features", expected="a list of feature packs", got=f"{str(features)!r} alone")
-    return [local_path(pack) for pack in features]
+    return [as_path(pack) for pack in features]

@@ -205,11 +205,10 @@ class LiftResult(Lift):
         """Write a lift file (`liftcore.values.lift_file`), whole or not at all.
 
         Args:
-            path: a file; with ``.shards`` at its end, a folder of shards. Either may be remote (`io.remote`).
+            path: a file; with ``.shards`` at its end, a folder of shards.
             progress: as `liftcore.lift` has it; there is one step.
 
         Raises:
-            InvalidInput: it is remote and the upload fails.
         """
         from liftcore.runtime.progress import one_step, shown_progress
 

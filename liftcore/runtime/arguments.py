@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from numbers import Integral
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 from liftcore.errors import InvalidInput, InvalidSettings, SplatliftError
@@ -26,6 +27,28 @@ def check_choice(
     names = tuple(names)
     if not isinstance(value, str) or value not in names:
         raise error(argument, expected=one_of(names), got=repr(value)[:80])
+
+
+def as_path(path: object, argument: str = "path") -> Path:
+    """Return an argument as a path.
+
+    Raises:
+        InvalidInput: it is neither a path nor a text, or an empty text.
+    """
+    if not isinstance(path, str | PathLike) or not str(path):
+        got = f"{type(path).__name__} {path!r}"[:80]
+        hint = "give several paths one by one" if isinstance(path, list | tuple) else ""
+        raise InvalidInput(argument, expected="the path of a file or folder", got=got, hint=hint)
+    return Path(path)
+
+
+def as_paths(paths: Any, argument: str = "path") -> list[Path]:
+    """Return several paths as a list; a single one as a list of one.
+
+    Raises:
+        InvalidInput: as for `as_path`.
+    """
+    return [as_path(path, argument) for path in as_list(paths)]
 
 
 def check_text(argument: str, value: object) -> None:

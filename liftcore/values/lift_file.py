@@ -26,9 +26,9 @@ import numpy as np
 from liftcore.errors import InvalidInput, InvalidLift
 from liftcore.io.files import open_regular, visible_files
 from liftcore.io.kinds import wrong_kind
-from liftcore.io.remote import local_path, open_output
 from liftcore.io.safetensors_file import map_tensors
 from liftcore.io.shards import INDEX, SUFFIX, map_shards, write_shards
+from liftcore.runtime.arguments import as_path
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -56,7 +56,7 @@ def save_lift(lift: Lift, path: Path | str) -> None:
     """Write the lift whole or not at all (temporary file, fsync, rename), with no copy of X in memory.
 
     Args:
-        path: a file; with ``.shards`` at its end, a folder of shards. Either may lie elsewhere (`io.remote`).
+        path: a file; with ``.shards`` at its end, a folder of shards.
 
     Raises:
         InvalidInput: it lies elsewhere and cannot be sent there.
@@ -73,11 +73,11 @@ def save_lift(lift: Lift, path: Path | str) -> None:
 
     metadata = lift.metadata.model_dump_json()
     tensors = tensors_of(lift)
-    with open_output(path) as place:
-        if place.suffix == SUFFIX:
-            write_shards(place, tensors, metadata)
-        else:
-            write_tensors(place, tensors, {"splatlift": metadata})
+    path = as_path(path)
+    if path.suffix == SUFFIX:
+        write_shards(path, tensors, metadata)
+    else:
+        write_tensors(path, tensors, {"splatlift": metadata})
 
 
 def tensors_of(lift: Lift) -> dict[str, Tensor]:
@@ -106,7 +106,7 @@ def read_lift(path: Path | str) -> tuple[dict[str, np.ndarray], str]:
     Raises:
         InvalidLift: as `open_lift` has it.
     """
-    source = local_path(path)
+    source = as_path(path)
     try:
         return _read_arrays(source, path)
     except InvalidLift as error:

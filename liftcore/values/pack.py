@@ -21,8 +21,8 @@ from torch import Tensor
 from liftcore.errors import InvalidFeatures, InvalidTable, Unavailable
 from liftcore.io.files import whole_file
 from liftcore.io.kinds import wrong_kind
-from liftcore.io.remote import local_path
 from liftcore.io.safetensors_file import MAX_HEADER_BYTES, TYPES, check_header, safetensors_header, tensor_bytes
+from liftcore.runtime.arguments import as_path
 from liftcore.runtime.folders import scratch_folder
 from liftcore.runtime.progress import Progress, silent
 from liftcore.runtime.torch_modes import callers_modes
@@ -180,11 +180,10 @@ def read_features(*paths: str | Path) -> Views:
     """Open feature packs as one set of views; only headers are read.
 
     Raises:
-        InvalidInput: one is a URL (`io.remote`) that cannot be read.
         InvalidFeatures: a file is no feature pack, a view is malformed or in two packs, or the packs do not
             share their channels and their encoder.
     """
-    packs = [_open(local_path(path)) for path in paths]
+    packs = [_open(as_path(path)) for path in paths]
     sources: dict[str, _Stored] = {}
     channels: dict[int, str] = {}
     for pack in packs:

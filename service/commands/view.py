@@ -23,7 +23,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli import Parser, place
+from liftcore.cli import Parser
 from liftcore.errors import InvalidInput, InvalidLift, Unavailable
 from liftcore.text import BUILT_IN, NO_WORDS, OWN_WORDS
 from service.app import assemble
@@ -52,9 +52,7 @@ FOLDER_VARIABLE = "SPLATLIFT_SHOW_FOLDER"  # from `show` to the process that rem
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    parser.add_argument(
-        "lift", type=place, help="a lift (.safetensors), whose splats and cameras are where they were"
-    )
+    parser.add_argument("lift", type=Path, help="a lift (.safetensors), whose splats and cameras are where they were")
     parser.add_argument("--port", type=int, default=0, help="the port of this machine; 0 picks a free one")
     parser.add_argument("--no-browser", action="store_true", help="print the address, and open nothing")
 

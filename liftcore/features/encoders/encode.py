@@ -20,7 +20,7 @@ from liftcore.features.folders import files_below, folders_of, grids_of
 from liftcore.io.cameras import read_cameras
 from liftcore.io.outputs import check_output, writing
 from liftcore.io.photos import ORIENTATION, UNREAD, UPRIGHT, PhotoHeader, Reading, header_of, orientation_warnings
-from liftcore.io.remote import local_paths, open_output
+from liftcore.runtime.arguments import as_path, as_paths
 from liftcore.runtime.folders import scratch_folder
 from liftcore.runtime.progress import Progress, shown_progress, silent
 from liftcore.scene.cameras import Cameras, photo_sizes
@@ -183,7 +183,8 @@ def encode_images(
     if isinstance(cameras, Path | str):
         cameras = read_cameras(cameras, views=list(photos))
     sizes = {} if cameras is None else photo_sizes(photos, cameras)
-    with shown_progress(progress) as reporter, writing(out), open_output(out) as file:
+    file = as_path(out, "output")
+    with shown_progress(progress) as reporter, writing(file):
         pack = write_encoded(photos, model, file, EncodeSettings(size, batch, normalised), reporter, sizes)
         size_bytes = file.stat().st_size
     warnings = orientation_warnings(pack.readings, "their cameras")
@@ -213,7 +214,7 @@ def find_images(paths: Path | str | Sequence[Path | str]) -> dict[str, Path]:
         InvalidInput: a path that does not exist, a folder without images, or two images of one view.
     """
     images: dict[str, Path] = {}
-    for path in local_paths(paths, "images"):
+    for path in as_paths(paths, "images"):
         for file in _images_of(path):
             name = without_image_suffix(file.relative_to(path).as_posix() if path.is_dir() else file.name)
             require_name(name, "images", InvalidInput)
