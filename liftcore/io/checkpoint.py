@@ -1,12 +1,13 @@
 """Checkpoints of trainers: gsplat's ``.pt`` and nerfstudio's ``.ckpt``, of which the splats are plain tensors.
 
-gsplat on several GPUs writes one file of each rank, ``ckpt_29999_rank0.pt`` and so on, each with other splats. Their
-folder is the complete scene: the files of the last step, in the order of ranks (`liftcore.io.ranks`).
+gsplat on several GPUs writes a file of each rank, ``ckpt_29999_rank0.pt`` and so on, each with other splats: one of
+them is a part of the scene, and is refused.
 
 They are pickles. Torch's reader for weights alone opens them, which builds tensors and runs no code of the file; what
 it refuses is refused. HTTP does not accept them all the same.
 """
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,6 @@ import numpy as np
 from liftcore.errors import InvalidSplats
 from liftcore.io.kinds import EXPORT_PLY, TRAINED
 from liftcore.io.quantised import Fields
-from liftcore.io.ranks import missing_ranks, rank_files
 from liftcore.runtime.one_line import join_names
 from liftcore.scene.render_mode import mode_beside
 
@@ -23,48 +23,42 @@ from liftcore.scene.render_mode import mode_beside
 GSPLAT = {"means": "means", "quats": "quats", "log_scales": "scales", "opacity_logits": "opacities"}
 GSPLAT_COLOUR = ("sh0", "shN")
 NERFSTUDIO_COLOUR = ("features_dc", "features_rest")
+_RANK = re.compile(r"(?P<step>.*)_rank(?P<rank>[0-9]{1,6})\.pt")  # of gsplat's checkpoints
 NERFSTUDIO = ("_model.gauss_params.", "_model.")  # before the names, in newer and older versions
 
 
-def _rank_warnings(path: Path) -> tuple[str, ...]:
-    """Warn of splats of the same step that were not read."""
-    files = rank_files(path)
-    siblings = [file.name for file in files if file.name != path.name]
-    if not path.is_dir() and siblings:
-        names = join_names(siblings, 3)
-        return (f"{names} beside {path.name} holds further splats of the same step: give their folder to take all",)
-    missing = missing_ranks(files) if path.is_dir() else []
-    return (f"the checkpoint of rank {missing[0]} is missing, and its splats with it",) if missing else ()
+def _require_whole(path: Path) -> None:
+    """Refuse the checkpoint of one of several ranks, by its name and those beside it.
+
+    Raises:
+        InvalidSplats: other ranks of its step hold further splats.
+    """
+    match = _RANK.fullmatch(path.name)
+    if match is None:
+        return
+    others = [
+        file.name
+        for file in sorted(path.parent.glob("*_rank*"))
+        if (other := _RANK.fullmatch(file.name)) and other["step"] == match["step"] and file.name != path.name
+    ]
+    if int(match["rank"]) or others:
+        got = f"{path.name}, the splats of one of several GPUs" + (
+            f" beside {join_names(others, 3)}" if others else ""
+        )
+        hint = "join the tensors of all ranks in one checkpoint, or export the scene as .ply"
+        raise InvalidSplats(str(path), expected="a checkpoint of the complete scene", got=got, hint=hint)
 
 
 def read_checkpoint(path: Path, *, colour: bool = True) -> Fields:
-    """Read the fields of a checkpoint's splats, or of all ranks in a folder, in the frame of their training.
+    """Read the fields of a checkpoint's splats, in the frame of their training.
 
     Raises:
-        InvalidSplats: a file holds more than tensors and plain values, or no splats of either trainer.
-    """
-    files = rank_files(path) if path.is_dir() else [path]
-    parts = [_read_one(file, colour=colour) for file in files]
-    fields: Fields = parts[0]
-    if len(parts) > 1:
-        shapes = [{name: values.shape[1:] for name, values in part.items()} for part in parts]
-        if any(shape != shapes[0] for shape in shapes):
-            got = f"tensors in {files[0].name} that other ranks do not have, or with other shapes"
-            raise InvalidSplats(
-                str(path), expected="ranks of one training", got=got, hint="keep one run in the folder"
-            )
-        fields = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return fields | {"render_mode": mode_beside(files[0]), "warnings": _rank_warnings(path)}
-
-
-def _read_one(path: Path, *, colour: bool) -> dict[str, np.ndarray]:
-    """Read the fields of one checkpoint.
-
-    Raises:
-        InvalidSplats: the file holds more than tensors and plain values, or no splats of either trainer.
+        InvalidSplats: the file holds more than tensors and plain values, no splats of either trainer, or a part of a
+            scene.
     """
     import torch
 
+    _require_whole(path)
     # nerfstudio's schedulers store their rates as NumPy scalars: a type and some bytes.
     scalar: Any = np.float64(0).__reduce__()[0]
     numbers = [np.dtype, *(type(np.dtype(kind)) for kind in (np.float64, np.float32, np.int64))]
@@ -76,14 +70,14 @@ def _read_one(path: Path, *, colour: bool) -> dict[str, np.ndarray]:
         got = f"one that holds more than tensors, or is damaged ({str(error).splitlines()[0][:100]})"
         raise InvalidSplats(str(path), expected="a checkpoint of tensors", got=got, hint=EXPORT_PLY) from None
     tensors, names = _splats(stored, path)
-    fields = {field: _array(tensors, name, path) for field, name in GSPLAT.items()}
+    fields: Fields = {field: _array(tensors, name, path) for field, name in GSPLAT.items()}
     fields["opacity_logits"] = fields["opacity_logits"].reshape(len(fields["opacity_logits"]), -1)[:, 0]
     if colour and names[0] in tensors:
         from liftcore.scene.splats import joined_harmonics
 
         first, rest = (torch.from_numpy(_array(tensors, name, path)) for name in names)
         fields["sh"] = joined_harmonics(first, rest, (f"{path} {names[0]}", names[1])).numpy()
-    return fields
+    return fields | {"render_mode": mode_beside(path)}
 
 
 def _splats(stored: Any, path: Path) -> tuple[dict[str, Any], tuple[str, str]]:

@@ -25,12 +25,10 @@ from liftcore.errors import InvalidInput
 from liftcore.io.colmap import MODEL_FILES
 from liftcore.io.files import BROKEN_ZIP, LFS_HINT, LFS_POINTER, is_system_file, open_regular, open_zip
 from liftcore.io.ply import MAX_HEADER_BYTES, cloud_without_splats
-from liftcore.io.ranks import rank_files
 from liftcore.io.shards import INDEX
 from liftcore.io.sog import META, is_sog_document, sog_folder
 from liftcore.io.splat import looks_like_splat
 from liftcore.io.spz import begins_like_spz
-from liftcore.io.streamed_sog import LOD_META, is_streamed_document, streamed_folder
 from liftcore.io.transforms import FRAME_FILE
 from liftcore.runtime.arguments import as_path
 from liftcore.scene.views import IMAGE_SUFFIXES
@@ -72,7 +70,6 @@ class SplatFormat(StrEnum):
     SPLAT = ".splat"
     SPZ = ".spz"
     SOG = ".sog"
-    STREAMED_SOG = "streamed SOG"  # lod-meta.json and what it names, or a zip of them
     GLTF = ".glb"  # or .gltf, with KHR_gaussian_splatting
     USD = "USD"  # .usdc, .usda or .usdz with particle fields, which may lead to other files
     CHECKPOINT = "checkpoint"  # of gsplat or nerfstudio: a pickle, if only of tensors
@@ -84,12 +81,12 @@ SUFFIX = {
     SplatFormat.SPLAT: ".splat",
     SplatFormat.SPZ: ".spz",
     SplatFormat.SOG: ".sog",
-    SplatFormat.STREAMED_SOG: ".zip",
     SplatFormat.GLTF: ".glb",
     SplatFormat.USD: ".usdc",
     SplatFormat.CHECKPOINT: ".pt",
 }
 PICKLED = (".pt", ".pth", ".ckpt", ".pkl")
+LOD_META = "lod-meta.json"  # of a streamed SOG
 SPLATS_SENT = (".ply", ".splat", ".spz", ".sog", ".glb", ".gltf")  # over HTTP, where no pickle is opened
 
 
@@ -101,7 +98,7 @@ class FileKind:
     name: str  # as errors have it behind "got"
     hint: str = ""  # remedy
     format: SplatFormat | None = None  # of splats
-    splats: tuple[str, ...] = ()  # splat files in a folder or zip, the one (or the folder of all ranks) to give first
+    splats: tuple[str, ...] = ()  # splat files in a folder or zip, the one to give first
     recognised: bool = True  # False: only its first bytes are known
 
     @property
@@ -126,6 +123,9 @@ _USD = FileKind(
     None,
     "a USD scene",
     "if it holds splats, 'splatlift export' and read_splats open it here: send them as .glb or .ply",
+)
+_STREAMED = FileKind(
+    None, "a streamed SOG, whose levels of detail lie in many files", "give the .ply or .sog that it was made of"
 )
 _PICTURE = FileKind(None, "a picture")
 _VIDEO = FileKind(
@@ -521,7 +521,7 @@ def _list_rules(document: list[Any]) -> Iterator[FileKind | None]:
 def _object_rules(document: dict[str, Any], path: Path) -> Iterator[FileKind | None]:
     keys = document.keys()
     yield _splats_as(SplatFormat.SOG) if is_sog_document(document) else None
-    yield _splats_as(SplatFormat.STREAMED_SOG) if is_streamed_document(document) else None
+    yield _STREAMED if keys >= {"tree", "filenames"} else None
     frames = document.get("frames")
     first = frames[0] if isinstance(frames, list) and frames and isinstance(frames[0], dict) else {}
     yield _cameras_of("sdfstudio") if {"rgb_path", "camtoworld"} <= first.keys() else None
@@ -580,7 +580,7 @@ def _of_names_in_zip(names: list[str], head_of: Callable[[str], bytes]) -> Itera
     lasts = {name.rpartition("/")[2] for name in names}
     suffixes = {PurePosixPath(last).suffix.lower() for last in lasts}
     yield FileKind(None, "a zip without a file", "zip or export it again") if not names else None
-    yield _splats_as(SplatFormat.STREAMED_SOG) if streamed_folder(names) is not None else None
+    yield _STREAMED if LOD_META in lasts else None
     yield _splats_as(SplatFormat.SOG) if sog_folder(names) is not None else None
     yield _splats_as(SplatFormat.CHECKPOINT) if any(name.endswith("/data.pkl") for name in names) else None
     yield _splats_as(SplatFormat.USD) if names[0].lower().endswith((".usd", ".usda", ".usdc")) else None
@@ -638,13 +638,10 @@ def _folder(path: Path) -> FileKind:
 def _folder_rules(path: Path) -> Iterator[FileKind | None]:
     yield _splats_as(SplatFormat.SOG) if (path / META).is_file() and _is_sog(path / META) else None
     yield FileKind("lift", "lift") if (path / INDEX).is_file() else None
-    yield _splats_as(SplatFormat.CHECKPOINT) if len(rank_files(path)) > 1 else None
-    yield _splats_as(SplatFormat.STREAMED_SOG) if (path / LOD_META).is_file() else None
+    yield _STREAMED if (path / LOD_META).is_file() else None
     names = _names_below(path)
     splats = _splat_files(names, lambda name: _has_splats(path / name))
     folder_name = _folder_name(names, splats)
-    if splats and len(rank_files(path / splats[0])) > 1:  # their folder is the whole scene
-        splats = (str(PurePosixPath(splats[0]).parent), *splats)
     yield FileKind("cameras", folder_name or "a folder of cameras", splats=splats) if _has_cameras(path) else None
     yield FileKind(None, folder_name or "a folder", f"give {path / splats[0]}", splats=splats) if splats else None
     suffixes = {PurePosixPath(name).suffix.lower() for name in names}

@@ -25,11 +25,9 @@ from liftcore.io.gltf_writer import gltf_blocks
 from liftcore.io.kinds import CONVERT, SplatFormat, identify, wrong_kind
 from liftcore.io.labels import COLUMN, IDS, Labels, id_column, read_document
 from liftcore.io.quantised import Fields
-from liftcore.io.ranks import rank_files
 from liftcore.io.sog import is_bundled, read_sog, sog_files
 from liftcore.io.splat import ROW, read_splat, splat_blocks
 from liftcore.io.spz import read_spz, read_spz_document, spz_blocks
-from liftcore.io.streamed_sog import read_streamed_sog, streamed_files
 from liftcore.io.usd import read_usd, read_usd_document, usd_blocks
 from liftcore.runtime.arguments import as_path
 from liftcore.runtime.plugins import Plugin, find_plugin
@@ -54,7 +52,6 @@ _READERS: dict[SplatFormat, Callable[..., Fields]] = {
     SplatFormat.SPLAT: read_splat,
     SplatFormat.SPZ: read_spz,
     SplatFormat.SOG: read_sog,
-    SplatFormat.STREAMED_SOG: read_streamed_sog,
     SplatFormat.CHECKPOINT: read_checkpoint,
     SplatFormat.GLTF: read_gltf,
     SplatFormat.USD: read_usd,
@@ -81,7 +78,7 @@ def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool
     More of PLYs is in `liftcore.io.ply.read_ply`. Checkpoints are opened for tensors alone: no code of theirs runs.
 
     Args:
-        path: a file, or a folder of a SOG or of a checkpoint's ranks.
+        path: a file, or a folder of a SOG.
         kernel: auto, 3dgs, 2dgs or dbs. colour: whether colours and further columns are read.
 
     Raises:
@@ -268,15 +265,7 @@ def splat_files(path: Path) -> list[Path]:
     Raises:
         OSError: there is none.
     """
-    if path.is_dir() and format_of(path) is SplatFormat.CHECKPOINT:
-        return rank_files(path)
-    match format_of(path):
-        case SplatFormat.SOG if not is_bundled(path):
-            return sog_files(path)
-        case SplatFormat.STREAMED_SOG if not is_bundled(path):
-            return streamed_files(path)
-        case _:
-            return [path]
+    return sog_files(path) if format_of(path) is SplatFormat.SOG and not is_bundled(path) else [path]
 
 
 def require_kernel(path: Path, kernel: Kernel, source: str) -> None:

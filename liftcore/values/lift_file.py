@@ -239,17 +239,11 @@ def input_file(path: Path) -> InputFile:
     Raises:
         OSError: it does not open, or is no regular file.
     """
-    from liftcore.io.ranks import rank_files
     from liftcore.io.sog import META, sog_files
-    from liftcore.io.streamed_sog import LOD_META, streamed_files
     from liftcore.values.lift import InputFile
 
     resolved = path.resolve()
     folder = resolved if resolved.is_dir() else resolved.parent
-    if resolved == folder and (ranks := rank_files(folder)):
-        return InputFile(path=str(resolved), sha256=_digest_of_several(ranks, folder))
-    if resolved == folder / LOD_META or (resolved == folder and (folder / LOD_META).is_file()):
-        return InputFile(path=str(resolved), sha256=_digest_of_several(streamed_files(resolved), folder))
     if resolved in (folder, folder / META):
         return InputFile(path=str(resolved), sha256=_digest_of_several(sog_files(resolved), folder))
     return InputFile(path=str(resolved), sha256=sha256_of(resolved))

@@ -45,9 +45,7 @@ def betas() -> bytes:
     return ply(np.concatenate([splat_rows(), columns], axis=1), [*names, *extra_properties])
 
 
-@pytest.mark.parametrize(
-    "name", ["degree3.compressed.ply", "degree3.v4.spz", "degree3.sog", "degree3.streamed.zip", "degree3.glb"]
-)
+@pytest.mark.parametrize("name", ["degree3.compressed.ply", "degree3.v4.spz", "degree3.sog", "degree3.glb"])
 def test_formats_that_hold_no_code_are_assets(client: TestClient, name: str) -> None:
     content = (FILES / name).read_bytes()
     asset = client.put("/assets/splats", content=content).json()

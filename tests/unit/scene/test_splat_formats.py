@@ -8,11 +8,8 @@ that splat-transform makes of it.
 from __future__ import annotations
 
 import gzip
-import json
 import struct
-import zipfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -42,60 +39,9 @@ FORMATS = {
     "degree3.compressed.ply": SplatFormat.COMPRESSED_PLY,
     "degree3.sog": SplatFormat.SOG,
     "degree3.splat": SplatFormat.SPLAT,
-    "degree3.streamed.zip": SplatFormat.STREAMED_SOG,
     **{f"degree3.v{version}.spz": SplatFormat.SPZ for version in (1, 2, 3, 4)},
 }
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
-
-
-def test_the_finest_level_of_each_leaf_of_a_streamed_sog_is_one_scene(tmp_path: Path) -> None:
-    for name in ("degree1.sog", "degree3.sog"):
-        with zipfile.ZipFile(FILES / name) as archive:
-            archive.extractall(tmp_path / name.removesuffix(".sog"))
-    fine, coarse = read_splats(FILES / "degree1.sog"), read_splats(FILES / "degree3.sog")
-
-    def leaf(**levels: tuple[int, int, int]) -> dict[str, Any]:
-        rows = {
-            level[1:]: dict(zip(("file", "offset", "count"), numbers, strict=True))
-            for level, numbers in levels.items()
-        }
-        return {"lods": rows}
-
-    def read(
-        *leaves: dict[str, Any], names: Any = ("degree3/meta.json", "degree1/meta.json"), **fields: Any
-    ) -> Splats:
-        document = {"filenames": names, "tree": {"children": [{"children": leaves[:1]}, *leaves[1:]]}, **fields}
-        (tmp_path / "lod-meta.json").write_text(json.dumps(document))
-        return read_splats(tmp_path / "lod-meta.json")
-
-    splats = read(leaf(_1=(0, 9, 5), _0=(1, 200, 100)), leaf(_2=(0, 30, 10)), leaf(_0=(1, 0, 40)), environment="env")
-    assert torch.equal(splats.means, torch.cat([coarse.means[30:], fine.means[:40], fine.means[200:]]))
-    assert splats.sh is not None and splats.sh_degree == 3 and not splats.sh[10:, 4:].any()
-    assert any("environment" in warning for warning in splats.warnings)
-    wrong: dict[str, tuple[tuple[Any, ...], dict[str, Any]]] = {
-        "rows of their own": ((leaf(_0=(1, 0, 40)), leaf(_0=(1, 39, 2))), {}),
-        "rows within the 300": ((leaf(_0=(1, 0, 301)),), {}),
-        "one of 2 files": ((leaf(_0=(2, 0, 1)),), {}),
-        "levels of detail": ((leaf(_x=(0, 0, 1)),), {}),
-        "none that a leaf has": ((leaf(),), {}),
-        "nodes that are objects": (([],), {}),
-        "each once": ((leaf(_0=(0, 0, 1)), leaf(_0=(1, 0, 1))), {"names": ["degree1/meta.json"] * 2}),
-        "beside it": ((leaf(_0=(0, 0, 1)),), {"names": ["none/meta.json"]}),
-    }
-    outside = (
-        "../degree1/meta.json",
-        "/etc/meta.json",
-        "https://a/meta.json",
-        "degree1/./meta.json",
-        "a\\meta.json",
-        7,
-    )
-    wrong |= {
-        f"in the folder.*{number}": ((leaf(_0=(0, 0, 1)),), {"names": [path]}) for number, path in enumerate(outside)
-    }
-    for match, (leaves, fields) in wrong.items():
-        with pytest.raises(InvalidSplats, match=match.split(".*")[0]):
-            read(*leaves, **fields)
 
 
 @pytest.mark.parametrize("name", FORMATS)
