@@ -136,7 +136,7 @@ class ServiceSettings(BaseSettings):
     encoder: str = Field(
         "lvis",
         description="text encoder for lifts of its own text space and, if you set it, for those whose text space has "
-        "no entry in SPLATLIFT_TEXT_SPACES (never for the text space 'none'): lvis, minilm, table:FILE, "
+        "no entry in SPLATLIFT_TEXT_SPACES (never for the text space 'none'): lvis, table:FILE, "
         "open_clip:MODEL...",
     )
     text_spaces: dict[str, str] = Field(

@@ -17,7 +17,7 @@ from typing import Any
 
 EXTRAS = (
     *("fastapi", "fastapi_offline", "starlette", "uvicorn", "cachetools", "pydantic_settings", "httpx"),
-    *("prometheus_client", "open_clip", "timm", "torchvision", "matplotlib", "ray", "pxr", "sentence_transformers"),
+    *("prometheus_client", "open_clip", "timm", "torchvision", "matplotlib", "ray", "pxr"),
     *("hdbscan", "sklearn"),
 )
 

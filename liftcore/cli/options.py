@@ -205,7 +205,7 @@ def add_encoder(parser: argparse.ArgumentParser) -> None:
     """Add the options of the text encoder."""
     words = parser.add_mutually_exclusive_group()
     words.add_argument("--table", type=Path, metavar="FILE", help="precomputed text embeddings")
-    specs = "lvis, minilm, open_clip:MODEL/TAG, open_clip:MODEL@FILE or table:FILE"
+    specs = "lvis, open_clip:MODEL/TAG, open_clip:MODEL@FILE or table:FILE"
     words.add_argument("--encoder", metavar="NAME", help=f"{specs}; default: the lift's text space")
 
 

@@ -21,7 +21,6 @@ from liftcore.io.ply import nearest_dialect
 from liftcore.io.splats import format_of, read_splats, splat_files
 from liftcore.io.transforms import FRAME_FILE
 from liftcore.runtime.arguments import as_path, check_choice
-from liftcore.runtime.plugins import Plugin
 from liftcore.scene.cameras import Cameras, distortion_warning
 from liftcore.scene.compositing import ALPHA_FLOOR
 from liftcore.scene.splats import Kernel, Splats
@@ -59,7 +58,7 @@ def inspect_file(path: Path | str, kind: str = "", *, trusted: bool = True) -> d
     Args:
         path: of the file or folder.
         kind: one of DESCRIPTIONS, or ``photos`` of a zip; empty: it is identified.
-        trusted: False rejects splats in formats that may hold code, and formats of plugins.
+        trusted: False rejects splats in formats that may hold code.
 
     Returns:
         ``kind``, ``bytes``, counts and ranges of the kind, and ``warnings``: what looks wrong.
@@ -112,8 +111,6 @@ def _reject_code(path: Path) -> None:
     if file_format is SplatFormat.USD:
         got, hint = "a USD scene, which may lead to other files", "send the splats as .glb, .ply, .spz or .sog"
         raise InvalidSplats("splats", expected="a format that holds all in itself", got=got, hint=hint)
-    if isinstance(file_format, Plugin):
-        raise InvalidSplats("splats", expected="a format of splatlift's own", got=file_format.value, hint=EXPORT_PLY)
 
 
 def describe_splat_file(path: Path) -> dict[str, Any]:

@@ -30,7 +30,6 @@ from liftcore.io.splat import ROW, read_splat, splat_blocks
 from liftcore.io.spz import read_spz, read_spz_document, spz_blocks
 from liftcore.io.usd import read_usd, read_usd_document, usd_blocks
 from liftcore.runtime.arguments import as_path
-from liftcore.runtime.plugins import Plugin, find_plugin
 from liftcore.scene.harmonics import constant_terms
 from liftcore.scene.kernel import Kernel, kernel_named
 from liftcore.scene.origin import lies_apart
@@ -44,8 +43,6 @@ if TYPE_CHECKING:
     from liftcore.scene.world import WorldFrame
 
 
-PLUGINS = "splatlift.splat_formats"  # the entry points of other packages' readers, by suffix
-OWN_SUFFIXES = ("ply", "splat", "spz", "sog", "glb", "gltf", "usdc", "usdz", "usda", "usd", "ckpt", "pt")
 EXPECTED = "splats as PLY, compressed PLY, .splat, .spz, .sog, .glb, .usdz or a checkpoint"
 _READERS: dict[SplatFormat, Callable[..., Fields]] = {
     SplatFormat.COMPRESSED_PLY: read_compressed_ply,
@@ -72,10 +69,8 @@ def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool
     """Read trained splats from a file of any `SplatFormat`, recognised by content.
 
     With the kernel ``auto`` it is recognised from the columns of a PLY, or from the file's render mode
-    (`liftcore.scene.render_mode`); without either it is 3D Gaussians. A file of no such format is read by the
-    plugin of its suffix, if there is one (`liftcore.runtime.plugins`). Without ``colour``
-    neither colours nor other fields that a lift does not need are read, and the splats cannot be written back.
-    More of PLYs is in `liftcore.io.ply.read_ply`. Checkpoints are opened for tensors alone: no code of theirs runs.
+    (`liftcore.scene.render_mode`); without either it is 3D Gaussians. Without ``colour`` neither
+    colours nor other fields that a lift does not need are read, and the splats cannot be written back. More of PLYs is in `liftcore.io.ply.read_ply`. Checkpoints are opened for tensors alone: no code of theirs runs.
 
     Args:
         path: a file, or a folder of a SOG.
@@ -90,10 +85,6 @@ def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool
     with _naming(path):
         if splat_format is SplatFormat.PLY:
             return ply.read_ply(path, kernel, colour=colour)
-        if isinstance(splat_format, Plugin):
-            return splat_format.call(
-                path, needs=("means", "quats", "log_scales", "opacity_logits", "kernel", "count")
-            )
         if kernel != "auto":
             require_kernel(path, kernel_named(kernel), str(path))
         from liftcore.scene.splats import Splats
@@ -207,8 +198,6 @@ def read_places(path: Path, kernel: Kernel | str = "auto") -> np.ndarray:
         InvalidSplats: the file is of no format of splats.
     """
     splat_format = format_of(path)
-    if isinstance(splat_format, Plugin):
-        return read_splats(path, kernel, colour=False).positions()
     places = (
         ply.read_places(path)
         if splat_format is SplatFormat.PLY
@@ -224,19 +213,15 @@ def read_places(path: Path, kernel: Kernel | str = "auto") -> np.ndarray:
     return places
 
 
-def format_of(path: Path) -> SplatFormat | Plugin:
-    """Return the format of a file, by its content; else the plugin that reads files of its suffix.
+def format_of(path: Path) -> SplatFormat:
+    """Return the format of a file, by its content.
 
     Raises:
         InvalidSplats: it is of none; the error names its kind if it is recognised.
-        Unavailable: two plugins read it.
     """
     identified = identify(path)
     if identified.format is not None:
         return identified.format
-    suffix = path.suffix.lower().removeprefix(".")
-    if suffix and path.exists() and (plugin := find_plugin(PLUGINS, suffix, OWN_SUFFIXES)):
-        return plugin
     if error := wrong_kind(path, "splats", InvalidSplats, expected=EXPECTED):
         raise error
     hint = identified.hint or (f"{ply.EXPORT}; or {CONVERT}" if path.is_file() else "")

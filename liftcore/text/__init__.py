@@ -9,21 +9,18 @@ from typing import Protocol
 import numpy as np
 
 from liftcore.errors import InvalidInput, InvalidQuery, Unavailable
-from liftcore.runtime.plugins import find_plugin, plugin_names
 
 __all__ = ["BUILT_IN", "NO_WORDS", "OWN_WORDS", "TextEncoder", "check_encoder", "encoder_file", "open_encoder"]
 ENCODER_SPECS = (
     "table:FILE.safetensors",
     "lvis",
-    "minilm",
     "open_clip:MODEL/PRETRAINED_TAG",
     "open_clip:MODEL@WEIGHTS_FILE",
     "open_clip:...#7 or #80, templates",
 )
 # Encoders that need no file from the user, and the text space of each: the defaults where no encoder was chosen.
-BUILT_IN = {"lvis": "open_clip:ViT-B-32/openai", "minilm": "minilm"}
+BUILT_IN = {"lvis": "open_clip:ViT-B-32/openai"}
 LVIS_TABLE = Path(__file__).with_name("lvis_clip_vit_b_32.safetensors")  # its licences: service/commands/tabletop
-PLUGINS = "splatlift.text_encoders"  # the entry points of other packages' encoders
 TEMPLATES = (1, 7, 80)  # numbers of sentences that a word is put into: 1 is the word alone, 7 and 80 are CLIP's
 NO_WORDS = "none"  # the text space of features that no text encoder shares
 OWN_WORDS = "prompts"  # the text space of features whose packs contain their words
@@ -99,15 +96,14 @@ def open_encoder(spec: str | Path, *, remembers: bool = False) -> TextEncoder:
 
     Args:
         spec: ``table:FILE`` or a path ending in ``.safetensors`` (precomputed embeddings); ``lvis`` (a table of the
-            1,203 words of LVIS by CLIP ViT-B/32, shipped); ``minilm`` (a small sentence encoder, offline);
-            ``open_clip:MODEL/TAG`` or ``open_clip:MODEL@FILE``, with the suffix ``#7`` or ``#80`` for the mean over
-            that many of CLIP's sentences for ImageNet ("a photo of the small mug."); or ``NAME`` or ``NAME:REST`` of
-            a plugin (`liftcore.runtime.plugins`), which is called with ``REST``.
+            1,203 words of LVIS by CLIP ViT-B/32, shipped); ``open_clip:MODEL/TAG`` or ``open_clip:MODEL@FILE``, with
+            the suffix ``#7`` or ``#80`` for the mean over that many of CLIP's sentences for ImageNet ("a photo of
+            the small mug.").
         remembers: cache the vectors of the last texts.
 
     Raises:
         InvalidQuery: the specification is not one of these, or a table is malformed.
-        Unavailable: the encoder's weights are not on this machine, or a plugin fails.
+        Unavailable: the encoder's weights are not on this machine.
     """
     if remembers:
         return CachingEncoder(open_encoder(spec))
@@ -120,18 +116,11 @@ def open_encoder(spec: str | Path, *, remembers: bool = False) -> TextEncoder:
         from liftcore.text.table import TableEncoder
 
         return TableEncoder.open(Path(rest) if rest else LVIS_TABLE)
-    if spec == "minilm":
-        from liftcore.text.minilm import MiniLmEncoder
-
-        return MiniLmEncoder()
     if kind == "open_clip" and rest and ("@" in rest or "#" not in rest):
         from liftcore.text.open_clip import OpenClipEncoder
 
         return OpenClipEncoder.open(rest, templates)
-    if plugin := find_plugin(PLUGINS, kind, ("table", "open_clip", *BUILT_IN)):
-        return plugin.call(rest, needs=("name", "channels", "encode"))
-    specs = [*ENCODER_SPECS, *(f"{name}:..." for name in plugin_names(PLUGINS) if name not in BUILT_IN)]
-    raise InvalidQuery("encoder", expected=f"one of {', '.join(specs)}", got=repr(spec))
+    raise InvalidQuery("encoder", expected=f"one of {', '.join(ENCODER_SPECS)}", got=repr(spec))
 
 
 def encoder_of_space(text_space: str, hint: str = "", *, stand_in: bool = False) -> TextEncoder:

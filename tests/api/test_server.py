@@ -91,9 +91,9 @@ def test_settings_come_from_the_environment_and_the_command_line_wins(
 
     monkeypatch.setenv("SPLATLIFT_PORT", "1234")
     monkeypatch.setenv("SPLATLIFT_QUERY_SECONDS", "7")
-    monkeypatch.setenv("SPLATLIFT_TEXT_SPACES", '{"a": "minilm"}')
+    monkeypatch.setenv("SPLATLIFT_TEXT_SPACES", '{"a": "lvis"}')
     assert (serve().port, serve().query_seconds) == (1234, 7)
-    assert serve().text_spaces == {"a": "minilm"}
+    assert serve().text_spaces == {"a": "lvis"}
     assert serve("--port", "1", "--text-space", "a=table:x=y").text_spaces == {"a": "table:x=y"}
     for name in ("COMMIT", "PORT", "ALLOWED_HOSTS", "TEXT_SPACES"):  # empty, it is as if it were not set
         monkeypatch.setenv(f"SPLATLIFT_{name}", "")
@@ -103,7 +103,7 @@ def test_settings_come_from_the_environment_and_the_command_line_wins(
 def test_encoder_is_chosen_by_text_space_and_never_by_the_client(tmp_path: Path) -> None:
     settings = ServiceSettings.model_validate({"data": tmp_path, "text_spaces": {"clip": "open_clip:X@w.pt"}})
     assert encoder_spec(settings, "clip", None) == "open_clip:X@w.pt"
-    for space, encoder in (("open_clip:ViT-B-32/openai", "lvis"), ("minilm", "minilm")):  # they need no file
+    for space, encoder in (("open_clip:ViT-B-32/openai", "lvis"),):  # they need no file
         assert encoder_spec(settings, space, None) == encoder_spec(settings, space, space) == encoder
     assert encoder_spec(settings, "clip", "default") == "lvis"
     assert encoder_spec(settings, "none", "clip") == "open_clip:X@w.pt"
@@ -118,8 +118,8 @@ def test_default_encoder_stands_in_for_other_spaces_only_where_the_operator_chos
         with pytest.raises(InvalidRequest, match="SPLATLIFT_TEXT_SPACES"):
             encoder_spec(untouched, space, None)
         assert encoder_spec(untouched, space, "default") == "lvis"
-    server_settings = ServiceSettings.model_validate({"data": tmp_path, "encoder": "minilm"})
-    assert encoder_spec(server_settings, "dino", None) == encoder_spec(server_settings, "", None) == "minilm"
+    server_settings = ServiceSettings.model_validate({"data": tmp_path, "encoder": "lvis"})
+    assert encoder_spec(server_settings, "dino", None) == encoder_spec(server_settings, "", None) == "lvis"
     with pytest.raises(InvalidRequest, match="none"):
         encoder_spec(server_settings, "none", None)
 

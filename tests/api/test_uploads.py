@@ -29,10 +29,10 @@ from .test_problems import assert_problem
 def test_packs_are_named_anew_as_assets_of_their_own(client: TestClient, scene_assets: SceneAssets) -> None:
     at = f"/assets/{scene_assets.features}"
     before = client.get(at).json()["counts"]
-    renamed_pack = client.patch(at, json={"text_space": "minilm", "encoder": "a CNN"})
+    renamed_pack = client.patch(at, json={"text_space": "words", "encoder": "a CNN"})
     assert renamed_pack.status_code == 201 and renamed_pack.headers["location"] != at
-    assert renamed_pack.json()["counts"] == before | {"text_space": "minilm", "encoder": "a CNN"}
-    assert client.patch(at, json={"text_space": "minilm", "encoder": "a CNN"}).status_code == 200
+    assert renamed_pack.json()["counts"] == before | {"text_space": "words", "encoder": "a CNN"}
+    assert client.patch(at, json={"text_space": "words", "encoder": "a CNN"}).status_code == 200
     assert client.patch(at, json={}).json()["id"] == scene_assets.features
     assert client.get(at).json()["counts"] == before
     assert_problem(client.patch(f"/assets/{scene_assets.splats}", json={"encoder": "x"}))

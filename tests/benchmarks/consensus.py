@@ -4,7 +4,7 @@
         [--seeds N ...] [--settings NAME ...] [--json]
 
 ``DIR`` is `tabletop`, with its packs of 52, 26 and 13 views. ``--mistakes`` are made on its exact masks (13 views),
-and on the tests' still life and small things (their words need the extra ``minilm``), with each seed. A row is a
+and on the tests' still life and small things, with each seed. A row is a
 scene: splat accuracy / mIoU of held-out views as `tests.benchmarks.tabletop` has them / the least IoU of a class, and
 how well confidence and view consistency of ``default`` rank splats by being right (AUROC). ``seconds`` are of the
 lift, over those of ``row-sum``.
@@ -81,8 +81,8 @@ def in_cone(regions: lc.Regions, share: float) -> lc.Regions:
 def still_life_scene(
     kind: str, seed: int, pieces: Sequence[Piece] | None = None, encoder: TextEncoder | None = None
 ) -> tuple[Truth, dict[str, ViewFeatures]]:
-    """The still life, or other pieces in its place, with mistakes, and its truth; minilm if no encoder is named."""
-    encoder = encoder or open_encoder("minilm")
+    """The still life, or other pieces in its place, with mistakes, and its truth; lvis if no encoder is named."""
+    encoder = encoder or open_encoder("lvis")
     scene, (mistakes, cone) = still_life(seed, pieces=pieces), MISTAKES[kind]
     raster = CpuRaster(scene.splats)
     views: dict[str, ViewFeatures] = {

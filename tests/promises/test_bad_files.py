@@ -136,7 +136,7 @@ def samples() -> list[tuple[str, str, bytes, dict[str, bytes]]]:
         ("table", "table", scene.table, {}),
         ("masks", "masks", tiny_scene.masks({"left": np.zeros((4, 6), int)}), {}),
     ]
-    names = [path.name for path in SPLATS.iterdir() if not path.name.endswith((".decoded.ply", ".streamed.zip"))]
+    names = [path.name for path in SPLATS.iterdir() if not path.name.endswith(".decoded.ply")]
     rows += [("splats", name, (SPLATS / name).read_bytes(), {}) for name in sorted(names)]
     for model in (BINARY, MODEL):
         for name, content in model.items():

@@ -27,9 +27,7 @@ from tests import tiny_scene
 from tests.promises.scenes import CHANNELS, KERNELS, random_grid, random_scene, random_splats, regions_of, write_pack
 
 SPLATS = Path(__file__).parents[1] / "data" / "splats"
-FOREIGN = sorted(
-    path for path in SPLATS.iterdir() if ".streamed" not in path.name and not path.name.endswith(".decoded.ply")
-)
+FOREIGN = sorted(path for path in SPLATS.iterdir() if not path.name.endswith(".decoded.ply"))
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "beta", "sh")
 BYTE, BASE = 0.5 / 255, 0.28209479177387814  # half a step of a byte; the harmonic of degree 0
 QUANTA = {  # largest difference of what a format rounds; scales in logarithms, turns as entries of rotations

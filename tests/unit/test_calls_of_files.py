@@ -44,7 +44,7 @@ def list_of(value: Any) -> list[Any]:
 
 
 def retag(path: Any) -> Any:
-    lc.retag_pack(path("pack.safetensors"), path("named.safetensors"), {"text_space": "minilm"})
+    lc.retag_pack(path("pack.safetensors"), path("named.safetensors"), {"text_space": "words"})
     return lc.read_features("named.safetensors").text_space
 
 
@@ -143,7 +143,7 @@ def test_wrong_choice_is_named_with_what_is_possible(message: str, call: Call, f
 
 @pytest.mark.parametrize(
     "names",
-    [{}, "minilm", {"foo": "x"}, {"text_space": 3}, {"encoder": " "}, {"normalised": "maybe"}, {"words": "["}],
+    [{}, "words", {"foo": "x"}, {"text_space": 3}, {"encoder": " "}, {"normalised": "maybe"}, {"words": "["}],
 )
 def test_names_that_no_reader_takes_make_no_pack(names: Any, folder: Path) -> None:
     with pytest.raises(lc.InvalidInput, match=r"names|text_space|encoder"):

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from liftcore.errors import InvalidInput, Unavailable
-from liftcore.runtime.plugins import find_plugin, plugin_names
 
 IMAGE_ENCODERS = (
     "maskclip:MODEL/TAG",
@@ -18,7 +17,6 @@ IMAGE_ENCODERS = (
     "timm:NAME@FILE",
 )
 KINDS = ("maskclip", "clip", "timm")
-PLUGINS = "splatlift.image_encoders"  # the entry points of other packages' encoders
 
 
 @dataclass(frozen=True)
@@ -71,23 +69,17 @@ def open_image_encoder(spec: str, device: str = "cpu") -> ImageEncoder:
     | ``timm:...`` | the normalized token of the last block, or the last feature map of a convolutional network |
 
     Args:
-        spec: one of ``IMAGE_ENCODERS``; weights by name are downloaded by the library, or read from its cache. Or
-            ``NAME`` or ``NAME:REST`` of a plugin (`liftcore.runtime.plugins`), which is called with ``REST`` and the
-            device.
+        spec: one of ``IMAGE_ENCODERS``; weights by name are downloaded by the library, or read from its cache.
         device: as torch names it.
 
     Raises:
         InvalidInput: the specification is not one of these, or a file does not contain weights of the model.
-        Unavailable: the weights, or the device, are not on this machine, or a plugin fails.
+        Unavailable: the weights, or the device, are not on this machine.
     """
     kind, _, rest = spec.partition(":")
-    if kind not in KINDS and (plugin := find_plugin(PLUGINS, kind, KINDS)):
-        needs = ("name", "text_space", "pixels", "channels", "encode")
-        return plugin.call(rest, device_named(device), needs=needs)
     if not rest or kind not in KINDS:
-        specs = [*IMAGE_ENCODERS, *(f"{name}:..." for name in plugin_names(PLUGINS) if name not in KINDS)]
         hint = "SigLIP, MobileCLIP and similar models are maskclip:MODEL/TAG; maps of FeatUp and others: pack npy"
-        raise InvalidInput("encoder", expected=f"one of {', '.join(specs)}", got=repr(spec), hint=hint)
+        raise InvalidInput("encoder", expected=f"one of {', '.join(IMAGE_ENCODERS)}", got=repr(spec), hint=hint)
     torch_device = device_named(device)
     if kind == "timm":
         from liftcore.features.encoders.timm_backbone import TimmEncoder

@@ -89,7 +89,7 @@ export class ExportPanel {
 }
 
 // True if the encoder opens on any machine by its name; `prompts` are the words of the lift.
-const runsLocally = ({ text, like, unlike, answer }) => text.length && !like.length && !unlike.length && ["lvis", "minilm", "prompts"].includes(answer.encoder);
+const runsLocally = ({ text, like, unlike, answer }) => text.length && !like.length && !unlike.length && ["lvis", "prompts"].includes(answer.encoder);
 const address = kind => new URL(kind ? `query/${kind}` : "query", document.baseURI); // also behind a proxy's prefix
 
 // Python code for a question to a lift file.

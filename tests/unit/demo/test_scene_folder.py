@@ -30,7 +30,7 @@ def folder(tmp_path: Path) -> Path:
     for name in ("cameras.bin", "images.bin"):
         (scene / "sparse" / "0" / name).write_bytes(b"model")
     save_file({"words": torch.ones(1)}, str(scene / "a.safetensors"))
-    save_file({"v/grid": torch.ones(1, 1, 2)}, str(scene / "grids.safetensors"), metadata={"text_space": "minilm"})
+    save_file({"v/grid": torch.ones(1, 1, 2)}, str(scene / "grids.safetensors"), metadata={"text_space": "other"})
     objects = [{"class": name} for name in ("cat", "boat", "cow", "fish")]
     (scene / "truth.json").write_text(json.dumps({"objects": objects}))
     save_arrays({"v/mask": np.array([[0, -1, 3]], np.int16)}, str(scene / "truth.safetensors"))
@@ -41,7 +41,7 @@ def test_a_scene_is_found_by_what_its_files_are(folder: Path, tmp_path: Path) ->
     scene = find_scene(folder, (), tmp_path / "scratch")
     assert scene.splats.name == "point_cloud.ply"
     assert scene.features.name == "grids.safetensors"
-    assert scene.encoder == "minilm"
+    assert scene.encoder == "lvis"
     assert zipfile.ZipFile(scene.cameras).namelist() == ["cameras.bin", "images.bin"]
     assert scene.phrases == ("the cat", "the fish")  # what the view shows
     assert scene.views == ("v",)
@@ -90,7 +90,7 @@ def test_a_scene_without_its_truth_has_no_phrases(folder: Path, tmp_path: Path) 
     (folder / "truth.json").unlink()
     (folder / "cameras.json").write_text(json.dumps([INRIA_CAMERA]))
     scene = find_scene(folder, (), tmp_path)
-    assert (scene.phrases, scene.text_space, scene.views) == ((), "minilm", ("v",))
+    assert (scene.phrases, scene.text_space, scene.views) == ((), "other", ("v",))
 
 
 @pytest.mark.parametrize("space", ["none", "animals"])
