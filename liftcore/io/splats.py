@@ -69,8 +69,9 @@ def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool
     """Read trained splats from a file of any `SplatFormat`, recognised by content.
 
     With the kernel ``auto`` it is recognised from the columns of a PLY, or from the file's render mode
-    (`liftcore.scene.render_mode`); without either it is 3D Gaussians. Without ``colour`` neither
-    colours nor other fields that a lift does not need are read, and the splats cannot be written back. More of PLYs is in `liftcore.io.ply.read_ply`. Checkpoints are opened for tensors alone: no code of theirs runs.
+    (`liftcore.scene.render_mode`); without either it is 3D Gaussians. Without ``colour`` neither colours nor other
+    fields that a lift does not need are read, and the splats cannot be written back. More of PLYs is in
+    `liftcore.io.ply.read_ply`. Checkpoints are opened for tensors alone: no code of theirs runs.
 
     Args:
         path: a file, or a folder of a SOG.

@@ -156,8 +156,9 @@ def splatlift_features(splats: lc.Splats, views: Views, device: Device) -> tuple
     """X [P, F] f32 as ``splatlift lift --preset row-sum --set dtype=float32`` has it, and total weights [P] f64."""
     looking = (lc.CompositingParams(), Weighting())
     W, codebook = weigh_regions(open_raster(splats, device), views, looking, splats.count)
-    solution = solve(W, codebook, torch.float32, means=splats.means, device=device)
-    return solution.features, W.row_sums().cpu()
+    W = W.cpu()
+    solution = solve(W, codebook, torch.float32, means=splats.means)
+    return solution.features, W.row_sums()
 
 
 def gsplat_features(rasterization: Any, place: torch.device, splats: lc.Splats, views: Views) -> Tensor:
