@@ -114,7 +114,9 @@ def table_of_routes() -> str:
         )
         for router in routers.values()
         for route in router.routes
-        if isinstance(route, APIRoute) and route.description and not route.path.startswith(("/openapi", "/docs"))
+        if isinstance(route, APIRoute)
+        and route.description
+        and not route.path.startswith(("/openapi", "/docs", "/web"))
         for method in route.methods or ()
     }
     return table(("route", "answer"), *(rows[key] for key in sorted(rows)))

@@ -1,72 +1,49 @@
-"""Errors of the HTTP service, in the project's one tree of errors.
-
-SplatliftError
-└── ServiceError
-    ├── Unauthorized, MissingScope, ForeignOrigin, Misdirected                  authorization
-    ├── InvalidRequest, UnreadableBody, DigestMismatch, UnsupportedEncoding,
-    │   UnsupportedMedia, TooLarge, RangeNotSatisfiable, KeyReused              the form of the request
-    ├── InUse, Conflict, VersionMismatch                                        the state of the resource
-    ├── OverQuota, OverLimit, NoSpace                                           limits of size and time
-    ├── RetryLater: KeyLimitReached, ServiceUnavailable (NotReady)              failures that may pass
-    ├── TimedOut, ClientDisconnected, ProcessDied                               requests that ended without an answer
-    └── Misconfigured (StaleDatabase)                                           raised at the start only
-
-Those of liftcore have their statuses and titles in `service.problems`.
-"""
+"""Errors of the service in the project's one tree of errors, and every error as an RFC 9457 problem."""
 
 from __future__ import annotations
 
+import errno
+import logging
+import re
+import sqlite3
 from collections.abc import Mapping
+from contextvars import ContextVar
+from http import HTTPStatus
+from typing import Any, ClassVar
 
-from liftcore.errors import SplatliftError
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, Field
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
+from starlette.routing import Match
+
+from liftcore.errors import NotFound, SplatliftError
+
+MEDIA_TYPE = "application/problem+json"
+FULL = (errno.ENOSPC, errno.EDQUOT)
+VALUE_CHARACTERS = 120  # of a value of a request, in an answer
+METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE")
+FIELDS = ("argument", "expected", "got", "hint", "nearest")
+# Words of pydantic around the expected value
+PYDANTIC = re.compile(r"^\w+ should (be|have) |, unable to parse .*| after validation, not \d+$")
+REQUEST_ID: ContextVar[str | None] = ContextVar("request_id", default=None)  # of this task, or the thread it awaits
+
+log = logging.getLogger(__name__)
 
 
 class ServiceError(SplatliftError):
-    """An error of the service; ``headers`` go into the answer beside the problem."""
+    """An error of the service: its status, the title of its problem, and headers of the answer."""
 
     kind, status, title = "service", 422, "The input is not usable"
-
-    def __init__(
-        self, argument: str, *, expected: str, got: str, hint: str = "", headers: Mapping[str, str] | None = None
-    ) -> None:
-        super().__init__(argument, expected=expected, got=got, hint=hint)
-        self.headers = dict(headers or {})
-
-
-class Unauthorized(ServiceError):
-    """No key, or a key that is not valid."""
-
-    kind, status, title = "unauthorized", 401, "A key is needed"
-
-
-class MissingScope(ServiceError):
-    """A key without the scope that is needed."""
-
-    kind, status, title = "missing-scope", 403, "The key may not do that"
-
-
-class ForeignOrigin(ServiceError):
-    """A web page of another site sends the request."""
-
-    kind, status, title = "foreign-origin", 403, "Pages of other sites may not do that"
-
-
-class Misdirected(ServiceError):
-    """A Host header with a name that is not this service's."""
-
-    kind, status, title = "misdirected", 421, "This is another host"
-
-
-class OverQuota(ServiceError):
-    """More bytes than a key may store."""
-
-    kind, status, title = "over-quota", 403, "The key's quota is used up"
+    headers: ClassVar[Mapping[str, str]] = {}
 
 
 class InvalidRequest(ServiceError):
     """A parameter or a body that the route does not accept."""
 
-    kind, status, title = "invalid-request", 422, "The request is malformed"
+    kind, title = "invalid-request", "The request is malformed"
 
 
 class UnreadableBody(ServiceError):
@@ -75,40 +52,23 @@ class UnreadableBody(ServiceError):
     kind, status, title = "malformed-request", 400, "The request is malformed"
 
 
-class DigestMismatch(ServiceError):
-    """The sha256 of the body differs from the declared one."""
+class KeyReused(ServiceError):
+    """An Idempotency-Key that was used with another order."""
 
-    kind, status, title = "digest-mismatch", 422, "The body is not what its digest promised"
-
-
-class UnsupportedEncoding(ServiceError):
-    """A compressed body."""
-
-    kind, status, title = "unsupported-encoding", 415, "The content encoding is not supported"
+    kind, title = "key-reused", "The key belongs to another order"
 
 
-class UnsupportedMedia(ServiceError):
-    """A body of a media type that the route does not accept."""
+class Unauthorized(ServiceError):
+    """No key, or a key that is not valid."""
 
-    kind, status, title = "unsupported-media-type", 415, "The media type is not supported"
-
-
-class TooLarge(ServiceError):
-    """More bytes than the operator allows."""
-
-    kind, status, title = "too-large", 413, "The body is too large"
+    kind, status, title = "unauthorized", 401, "A key is needed"
+    headers: ClassVar = {"WWW-Authenticate": 'Bearer realm="splatlift"'}
 
 
-class RangeNotSatisfiable(ServiceError):
-    """A Range header that begins beyond the end."""
+class Forbidden(ServiceError):
+    """A key without the scope that is needed, or a page of another site."""
 
-    kind, status, title = "range-not-satisfiable", 416, "The range is beyond the end"
-
-
-class InUse(ServiceError):
-    """An asset that a job or a lift still needs."""
-
-    kind, status, title = "in-use", 409, "The asset is in use"
+    kind, status, title = "forbidden", 403, "The request is not allowed"
 
 
 class Conflict(ServiceError):
@@ -123,60 +83,23 @@ class VersionMismatch(ServiceError):
     kind, status, title = "changed", 412, "It was changed meanwhile"
 
 
-class KeyReused(ServiceError):
-    """An Idempotency-Key that was used with another order."""
+class TooLarge(ServiceError):
+    """More bytes than the operator allows; the rest of the body must not be taken for the next request."""
 
-    kind, status, title = "key-reused", 422, "The key belongs to another order"
-
-
-class OverLimit(ServiceError):
-    """A job that needs more time or memory than the operator allows."""
-
-    kind, status, title = "over-limit", 422, "The job needs more than the server allows"
+    kind, status, title = "too-large", 413, "The body is too large"
+    headers: ClassVar = {"Connection": "close"}
 
 
-class NoSpace(ServiceError):
-    """Less free disk than the operator reserves."""
+class UnsupportedMedia(ServiceError):
+    """A body in an encoding or of a media type that the route does not accept."""
 
-    kind, status, title = "no-space", 507, "There is no space left"
-
-
-class RetryLater(ServiceError):
-    """A failure that may pass: the client may retry."""
-
-    def __init__(self, argument: str, *, expected: str, got: str, hint: str = "", retry_after: int = 2) -> None:
-        headers = {"Retry-After": str(retry_after)}  # seconds
-        super().__init__(argument, expected=expected, got=got, hint=hint, headers=headers)
+    kind, status, title = "unsupported-media-type", 415, "The media type is not supported"
 
 
-class KeyLimitReached(RetryLater):
-    """A key has as many jobs, uploads, queries or streams as it may have at a time."""
+class Misdirected(ServiceError):
+    """A Host header with a name that is not this service's."""
 
-    kind, status, title = "too-many", 429, "The key asks for too much at a time"
-
-
-class ServiceUnavailable(RetryLater):
-    """The service accepts no more work at the moment."""
-
-    kind, status, title = "busy", 503, "The server is busy"
-
-
-class NotReady(ServiceUnavailable):
-    """The service is not ready: it stops, or a check failed."""
-
-    kind, status, title = "not-ready", 503, "The server is not ready"
-
-
-class TimedOut(ServiceError):
-    """A query that took longer than the operator allows."""
-
-    kind, status, title = "timed-out", 504, "The query took too long"
-
-
-class ClientDisconnected(ServiceError):
-    """The client disconnected before its answer was computed."""
-
-    kind, status, title = "client-left", 400, "The client left"
+    kind, status, title = "misdirected", 421, "This is another host"
 
 
 class ProcessDied(ServiceError):
@@ -185,31 +108,190 @@ class ProcessDied(ServiceError):
     kind, status, title = "crashed", 500, "A process of the server died"
 
 
+class Busy(ServiceError):
+    """A failure that may pass: the client may send the request again."""
+
+    kind, status, title = "busy", 503, "The server is busy"
+    headers: ClassVar = {"Retry-After": "2"}
+
+
+class TimedOut(ServiceError):
+    """A query that took longer than the operator allows."""
+
+    kind, status, title = "timed-out", 504, "The query took too long"
+
+
+class NoSpace(ServiceError):
+    """Less free disk than the operator reserves."""
+
+    kind, status, title = "no-space", 507, "There is no space left"
+
+
 class Misconfigured(ServiceError):
     """Settings or a data directory with which the service cannot start."""
 
     kind = "misconfigured"
 
 
-class StaleDatabase(Misconfigured):
-    """A data directory whose database is missing or older than its files: a new one would treat them as garbage."""
+class Problem(BaseModel):
+    """An RFC 9457 problem; the fields after ``detail`` are there when the error names them."""
 
-    def __init__(self, data: object, got: str) -> None:
-        super().__init__(
-            "data", expected="the database that the files beside it were stored with", got=f"{got} in {data}",
-            hint="put its newest backup there, with the -wal file if it has one; or make one of the files with"
-            f" splatlift store rebuild --data {data}; or begin anew with splatlift serve --new, which moves the files"
-            " to quarantine",
-        )  # fmt: skip
+    type: str = Field(description="a stable URI reference, /problems/ and a slug")
+    title: str
+    status: int
+    detail: str
+    argument: str | None = None
+    expected: str | None = None
+    got: str | None = None
+    hint: str | None = None
+    nearest: list[str] | None = Field(None, description="for an unknown word: known words near to it")
+    request_id: str | None = Field(None, description="as in X-Request-ID; the log has it too")
 
 
-def require_share(argument: str, count: int, limit: int | None) -> None:
-    """Require that a key is below its limit of such requests at a time; None means no limit.
+PROBLEM: dict[str, Any] = {
+    "description": "A problem (RFC 9457)",
+    "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
+}
 
-    Raises:
-        KeyLimitReached: it has as many as it may.
+
+class Fault(Exception):
+    """The error of another process, as `fault_of` made it there."""
+
+    def __init__(self, fault: dict[str, Any]) -> None:
+        super().__init__(fault["detail"])
+        self.fault = fault
+
+
+def fault_of(error: SplatliftError, names: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """Return the error as the JSON of a problem, for an answer, another process or the database.
+
+    Args:
+        error: the error.
+        names: path of the server -> the name that the client knows: paths of the server are private.
     """
-    if limit is not None and count >= limit:
-        raise KeyLimitReached(
-            argument, expected=f"at most {limit} of this key at a time", got="more", hint="wait for the end of one"
+    if isinstance(error, ServiceError):
+        status, title = error.status, error.title
+    else:
+        status, title = (
+            (404, "There is no such resource") if isinstance(error, NotFound) else (422, ServiceError.title)
         )
+    fields = {name: value for name in FIELDS if (value := getattr(error, name, None))}
+    document = {"type": f"/problems/{error.kind}", "title": title, "status": status, "detail": str(error), **fields}
+    return {name: replace_names(value, names or {}) for name, value in document.items()}
+
+
+def replace_names(value: Any, names: Mapping[str, str]) -> Any:
+    """Return a text with paths of the server replaced by the names that the client knows."""
+    if isinstance(value, str):
+        for path, name in names.items():
+            value = value.replace(path, name)
+    return value
+
+
+def answer(fault: dict[str, Any], headers: Mapping[str, str] | None = None) -> JSONResponse:
+    """Return a fault as the response to the current request."""
+    fields = fault | {"request_id": REQUEST_ID.get()}
+    document = {name: _one_line(value) for name, value in fields.items() if value is not None}
+    return JSONResponse(document, fault["status"], headers, MEDIA_TYPE)
+
+
+def _one_line(value: Any) -> Any:
+    """Return text as one line that UTF-8 can carry: a client may send half a surrogate pair, or line ends."""
+    return " ".join(value.encode("utf-8", "backslashreplace").decode().split()) if isinstance(value, str) else value
+
+
+def answer_to(error: Exception, request_line: str = "") -> JSONResponse:
+    """Return any error as a response."""
+    match error:
+        case Fault():
+            reply = answer(error.fault, Busy.headers if error.fault["status"] == Busy.status else None)
+        case SplatliftError():
+            reply = answer(fault_of(error), getattr(error, "headers", None))
+        case RequestValidationError():
+            reply = answer_to(_refusal(error))
+        case HTTPException():
+            reply = _of_framework(error, request_line)
+        case ClientDisconnect():
+            reply = answer_to(UnreadableBody("body", expected="all of it", got="a client that left"))
+        case _:
+            reply = _of_system(error, request_line)
+    return reply
+
+
+def _of_system(error: Exception, request_line: str) -> JSONResponse:
+    """Answer an error of the server. Its details go to the log: they may name private things."""
+    code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+    if getattr(error, "errno", None) in FULL or code == sqlite3.SQLITE_FULL:
+        log.error("%s: the disk is full", request_line)
+        hint = "delete assets or lifts, or ask the operator for room"
+        return answer_to(NoSpace("data", expected="room on the server's disk", got="a full disk", hint=hint))
+    if isinstance(error, OSError | sqlite3.Error):
+        log.warning("%s: the data directory cannot be used", request_line, exc_info=error)
+        hint = "send it again; the server's log says why"
+        return answer_to(Busy("data", expected="a disk and a database that can be used", got="an error", hint=hint))
+    log.error("%s failed", request_line, exc_info=error)
+    detail = "Something went wrong on our side; the server's log has the details."
+    return answer({"type": "/problems/internal", "title": "An error of the server", "status": 500, "detail": detail})
+
+
+def _of_framework(error: HTTPException, request_line: str) -> JSONResponse:
+    phrase = HTTPStatus(error.status_code).phrase
+    slug = {404: "no-such-route", 400: "malformed-request"}.get(error.status_code, phrase.lower().replace(" ", "-"))
+    detail = f"{request_line}: {error.detail}"
+    fault = {"type": f"/problems/{slug}", "title": phrase, "status": error.status_code, "detail": detail}
+    if error.status_code == HTTPStatus.NOT_FOUND:
+        fault |= {"argument": "path", "expected": "a route of this service", "hint": "GET /docs shows them all"}
+    return answer(fault, error.headers)
+
+
+def _refusal(error: RequestValidationError) -> SplatliftError:
+    """Return the first error in the form of a request: its place, the expected value, the value."""
+    first = error.errors()[0]
+    place, kind, context = [str(part) for part in first["loc"]], first["type"], first.get("ctx", {})
+    hint = f"in the {place[0]} of the request"
+    if kind == "json_invalid":
+        got = f"an error at character {place[1]}: {context['error']}"
+        return UnreadableBody("body", expected="JSON", got=got, hint=hint)
+    if place == ["body"] and isinstance(first.get("input"), bytes):  # curl declares a form by default
+        hint = "send the header Content-Type: application/json with the body"
+        return UnsupportedMedia("Content-Type", expected="application/json", got="another, or none", hint=hint)
+    got = "nothing" if kind == "missing" else _short(first.get("input"))
+    if kind == "unknown_field":  # reported for the object that holds it
+        place.append(context["field"])
+        got = repr(context["field"])
+    expected = context.get("expected") or PYDANTIC.sub("", first["msg"])
+    if kind in ("missing", "extra_forbidden"):
+        expected = "a value" if kind == "missing" else "a field that the route takes"
+    if place == ["body"]:
+        expected = "a JSON object"
+    if place[0] == "path":
+        return NotFound(place[-1], expected=expected[:1].lower() + expected[1:], got=got)
+    return InvalidRequest(
+        ".".join(place[1:]) or place[0], expected=expected[:1].lower() + expected[1:], got=got, hint=hint
+    )
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= VALUE_CHARACTERS else f"{text[:VALUE_CHARACTERS]}..."
+
+
+def install(app: FastAPI) -> None:
+    """Convert every error of the routes to a problem."""
+
+    async def handle(request: Request, error: Exception) -> JSONResponse:
+        if isinstance(error, HTTPException) and error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
+            scopes = {
+                method: {**request.scope, "method": method} for method in METHODS
+            }  # the framework names one route's
+            allowed_methods = [
+                method
+                for method, scope in scopes.items()
+                if any(route.matches(scope)[0] is Match.FULL for route in app.routes)
+            ]
+            error.headers = {"Allow": ", ".join(allowed_methods)}
+        return answer_to(error, f"{request.method[:20]} {request.url.path[:200]}")
+
+    errors = (SplatliftError, Fault, RequestValidationError, HTTPException, ClientDisconnect, OSError, sqlite3.Error)
+    for kind in errors:
+        app.add_exception_handler(kind, handle)

@@ -16,7 +16,7 @@ from runpy import run_path
 from typing import Any
 
 EXTRAS = (
-    *("fastapi", "fastapi_offline", "starlette", "uvicorn", "cachetools", "pydantic_settings", "httpx"),
+    *("fastapi", "fastapi_offline", "starlette", "uvicorn", "pydantic_settings", "httpx"),
     *("prometheus_client", "open_clip", "timm", "torchvision", "matplotlib", "ray", "pxr"),
     *("hdbscan", "sklearn"),
 )

@@ -26,9 +26,9 @@ from fastapi.testclient import TestClient
 from safetensors.numpy import load
 
 from liftcore.cli import main
-from service.app import assemble
+from service.app import create_app
 from service.settings import ServiceSettings
-from service.store.store import Store
+from service.store import Store
 
 Result = TypeVar("Result")
 ADDRESS = "http://127.0.0.1"
@@ -36,15 +36,10 @@ ROOT = Path(__file__).parents[1]
 PATIENCE_SECONDS = 900.0  # of a machine that has other things to do, kernels to compile among them
 FINAL_STATES = ("succeeded", "failed", "canceled")
 MARK = "SERVER_UNDER_TEST"  # in the environment of a server and of all that it starts
-KINDS = ("splats", "cameras", "features", "masks", "table", "photos", "lift")
 # Setting -> the fields that it stands for, where the service has other names.
 FIELDS = {
-    "parallel_jobs": ("parallel_lifts",),
-    "threads": ("lift_threads",),
-    "job_seconds": ("lift_seconds",),
     "memory_bytes": ("check_memory_bytes",),
     "floor_bytes": ("disk_floor_bytes",),
-    "upload_bytes": tuple(f"max_{kind}_bytes" for kind in KINDS),
 }
 
 
@@ -65,9 +60,9 @@ def fields_of(settings: dict[str, Any]) -> dict[str, Any]:
 def serving(data: Path, **settings: Any) -> Iterator[TestClient]:
     """Yield a client of the application over a data directory; settings are those of `splatlift serve`."""
     options = ServiceSettings.model_validate({"data": data, **fields_of(settings)})
-    store = Store.open(options.data, floor_bytes=options.disk_floor_bytes)
+    store = Store(options.data, options.disk_floor_bytes)
     try:
-        with TestClient(assemble(options, store), ADDRESS, raise_server_exceptions=False) as client:
+        with TestClient(create_app(options, store), ADDRESS, raise_server_exceptions=False) as client:
             yield client
     finally:
         store.close()

@@ -1,4 +1,4 @@
-"""``splatlift keys``: create, list, rotate and revoke keys, with or without a running server."""
+"""``splatlift keys``: create, list and revoke keys, with or without a running server."""
 
 from __future__ import annotations
 
@@ -7,30 +7,20 @@ import json
 import re
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
-from liftcore.cli import Parser, whole_number
+from liftcore.cli import Parser
 from liftcore.errors import NotFound
+from service.auth import SCOPES
 from service.commands.serve import data_directory_errors
 from service.errors import InvalidRequest
-from service.models import LAST_MOMENT, within_calendar
+from service.models import NAME_CHARACTERS, Key
 from service.settings import read_settings
-from service.store.database import DATABASE, Database
-from service.store.keys import KeyRecord, KeyStore, Quota
-from service.store.owners import Scope, parse_scopes
+from service.store import create_key, list_keys, open_keys, revoke_key
 
-MAX_NAME = 100
-QUOTAS = {
-    "max_bytes": "most bytes stored, of its assets and lifts",
-    "max_queued": "most jobs in line",
-    "max_uploads": "most uploads at once",
-}
 UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
+LAST_MOMENT = datetime(9999, 12, 31, tzinfo=UTC).timestamp()
 
 
 def add_arguments(parser: Parser, shared: Parser) -> None:
@@ -38,161 +28,88 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=Parser)
     create = actions.add_parser("create", parents=[shared], help="make a key and show it, once")
     create.add_argument("--name", required=True, metavar="NAME", help="its owner or purpose")
-    create.add_argument("--scopes", metavar="SCOPES", help="its rights: read,write,metrics,admin")
+    create.add_argument("--scopes", metavar="SCOPES", help="its rights: read,write; or admin, for all owners' data")
     create.add_argument("--lifts", metavar="IDS", help="in place of scopes: lifts that it may read and query")
     create.add_argument("--expires", metavar="WHEN", help="after 30d, 12h or 90m, or at a date (UTC); else never")
-    for name, limit in QUOTAS.items():
-        option = f"--{name.replace('_', '-')}"
-        create.add_argument(option, type=whole_number, metavar="N", help=f"{limit}; else as the server is set")
     listing = actions.add_parser("list", parents=[shared], help="all keys, without their secrets")
-    rotate = actions.add_parser("rotate", parents=[shared], help="give a key another secret and show it, once")
-    rotate.add_argument("key", metavar="NAME", help="its name, or its id as keys list shows it")
-    rotate.add_argument(
-        "--grace", metavar="TIME", help="how long the secret before counts, such as 24h; else not at all"
-    )
-    rotate.add_argument(
-        "--keep-shares",
-        action="store_true",
-        help="keep the keys that it shared lifts with; else they end with the secret before",
-    )
-    revoke = actions.add_parser("revoke", parents=[shared], help="end a key and keys that it made; its results stay")
+    revoke = actions.add_parser("revoke", parents=[shared], help="end a key and its shares; its results stay")
     revoke.add_argument("key", metavar="ID", help="as keys list shows it")
-    for action in (create, listing, rotate, revoke):
+    for action in (create, listing, revoke):
         action.add_argument("--data", type=Path, metavar="DIR", help="the service's directory")
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the command."""
-    action = {"create": _create, "list": _list, "rotate": _rotate, "revoke": _revoke}[options.action]
-    with data_directory_errors(), open_keys(read_settings(data=options.data).data, make=action is _create) as keys:
-        action(keys, options)
+    data, creates = read_settings(data=options.data).data, options.action == "create"
+    with data_directory_errors(), open_keys(data, make=creates) as connection:
+        if options.action == "list":
+            keys = list_keys(connection)
+            _print(options, {"keys": [key.model_dump() for key in keys]}, "\n".join(map(_line, keys)))
+            if not keys:
+                print("no keys: the service is open to this machine, and to no other", file=sys.stderr)
+        elif options.action == "revoke":
+            key = revoke_key(connection, options.key)
+            _print(options, key.model_dump(), f"key {key.id} of {key.name} is revoked, and its shares")
+        else:
+            lifts = [lift.strip() for lift in (options.lifts or "").split(",") if lift.strip()]
+            known_lifts = {lift for (lift,) in connection.execute("SELECT id FROM lifts")}
+            if unknown := set(lifts) - known_lifts:
+                hint = "GET /lifts lists them"
+                raise NotFound("--lifts", expected="ids of lifts", got=sorted(unknown)[0][:80], hint=hint)
+            expires = None if options.expires is None else _moment(options.expires)
+            scopes = "shared" if lifts else _scopes(options.scopes or "")
+            key, secret = create_key(connection, _name(options.name), scopes, expires, lifts)
+            _print(options, {**key.model_dump(), "key": secret}, secret)
+            print(f"{_line(key)}. The secret is shown this once.", file=sys.stderr)
     return 0
 
 
-@contextmanager
-def open_keys(data: Path, *, make: bool) -> Iterator[KeyStore]:
-    """Open the keys of a data directory, also while a server holds it.
-
-    Raises:
-        NotFound: there is no database, and none is to be made.
-        StaleDatabase: it is gone, or older than the files.
-        Misconfigured: a release with another schema wrote it.
-    """
-    path = data / DATABASE
-    if make:
-        data.mkdir(parents=True, exist_ok=True)
-    elif not path.exists():
-        raise NotFound("data", expected="the data directory of a service", got=str(data), hint="name it with --data")
-    database = Database(path)
-    try:
-        yield KeyStore(database, data)
-    finally:
-        database.close()
+def _print(options: argparse.Namespace, document: dict[str, object], text: str) -> None:
+    if options.json or text:
+        print(json.dumps(document) if options.json else text)
 
 
-def _create(keys: KeyStore, options: argparse.Namespace) -> None:
-    name = options.name.strip()
-    if not name or len(name) > MAX_NAME or not name.isprintable():
-        raise InvalidRequest("name", expected=f"1 to {MAX_NAME} printable characters", got=repr(options.name)[:120])
-    quota = Quota(options.max_bytes, options.max_queued, options.max_uploads)
-    expires = None if options.expires is None else _moment(options.expires)
-    lifts = [lift.strip() for lift in (options.lifts or "").split(",") if lift.strip()]
-    scopes = parse_scopes((options.scopes or (Scope.SHARED if lifts else "")).split(","))
-    key, secret = keys.create(name, scopes, quota, expires=expires, lifts=lifts)
-    _show(key, secret, options)
+def _name(text: str) -> str:
+    name = text.strip()
+    if not name or len(name) > NAME_CHARACTERS or not name.isprintable():
+        expected = f"1 to {NAME_CHARACTERS} printable characters"
+        raise InvalidRequest("--name", expected=expected, got=repr(text)[:120])
+    return name
 
 
-def _rotate(keys: KeyStore, options: argparse.Namespace) -> None:
-    grace = 0.0 if options.grace is None else _seconds("grace", options.grace)
-    key, secret, shares = keys.rotate(options.key, grace=grace, keep_shares=options.keep_shares)
-    _show(key, secret, options, ended_shares=[share.id for share in shares])
-    if shares and not options.json:
-        print(f"The secret before ends{_with(shares)}. With --keep-shares they would stay.", file=sys.stderr)
-
-
-def _show(key: KeyRecord, secret: str, options: argparse.Namespace, **fields: Any) -> None:
-    if options.json:
-        print(json.dumps({**_document(key), **fields, "key": secret}))
-        return
-    print(secret)
-    until = "" if key.expires is None else f", until {_format_time(key.expires)}"
-    print(
-        f"key {key.id} of {key.name}: {', '.join(sorted(key.scopes))}{until}. It is shown this once.", file=sys.stderr
-    )
-
-
-def _seconds(argument: str, text: str, alternative: str = "") -> float:
-    """Parse a duration such as 30d; return seconds."""
-    match = re.fullmatch(r"(\d{1,6})([smhd])", text.strip(), re.ASCII)
-    if match is None:
-        expected = f"a number of at most 6 digits with d, h, m or s, such as 30d or 12h{alternative}"
-        raise InvalidRequest(argument, expected=expected, got=repr(text)[:80])
-    return int(match[1]) * UNITS[match[2]]
+def _scopes(text: str) -> str:
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    if not names or set(names) - set(SCOPES):
+        raise InvalidRequest("--scopes", expected=f"one or more of {', '.join(SCOPES)}", got=text[:80] or "none")
+    return " ".join(sorted(set(names)))
 
 
 def _moment(text: str) -> float:
-    """Parse a duration from now, or a date; return seconds since 1970."""
-    now = time.time()
+    """Parse a duration from now, such as 30d, or a date; return seconds since 1970."""
+    now, match = time.time(), re.fullmatch(r"(\d{1,6})([smhd])", text.strip(), re.ASCII)
     try:
-        date = datetime.fromisoformat(text.strip())
-        moment = (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
+        if match is not None:
+            moment = now + int(match[1]) * UNITS[match[2]]
+        else:
+            date = datetime.fromisoformat(text.strip())
+            moment = (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
     except ValueError:
-        moment = now + _seconds("expires", text, ", or a date (UTC) such as 2030-12-31")
+        moment = 0.0
     if not now < moment <= LAST_MOMENT:
-        raise InvalidRequest("expires", expected="a moment after now and at most 9999-12-31 (UTC)", got=text)
+        expected = "a duration such as 30d, 12h or 90m, or a date (UTC) to come such as 2030-12-31"
+        raise InvalidRequest("--expires", expected=expected, got=repr(text)[:80])
     return moment
 
 
-def _list(keys: KeyStore, options: argparse.Namespace) -> None:
-    records = keys.all()
-    if options.json:
-        print(json.dumps({"keys": [_document(key) for key in records]}))
-        return
-    for key in records:
-        scopes = ",".join(sorted(key.scopes)) + ("" if key.maker is None else f" by {key.maker}")
-        print("  ".join([key.id, _format_time(key.created), _state(key), scopes, _limits(key), key.name]))
-    if not records:
-        closed = "no keys, but there were some: nobody is let in until one is made"
-        none = "no keys: the service is open to this machine, and to no other"
-        print(closed if keys.required() else none, file=sys.stderr)
-
-
-def _revoke(keys: KeyStore, options: argparse.Namespace) -> None:
-    key, shares = keys.revoke(options.key)
-    if options.json:
-        print(json.dumps({**_document(key), "ended_shares": [share.id for share in shares]}))
-    else:
-        print(f"key {key.id} of {key.name} is revoked{_with(shares)}")
-
-
-def _with(shares: Sequence[KeyRecord]) -> str:
-    """Revoke the keys shared by a key; print nothing if there are none."""
-    if not shares:
-        return ""
-    return f", and with it {len(shares)} that it made: " + ", ".join(
-        f"{share.id} of {share.name}" for share in shares
-    )
-
-
-def _document(key: KeyRecord) -> dict[str, Any]:
-    fields = asdict(key)
-    quota = fields.pop("quota")
-    return {**fields, **quota, "scopes": sorted(key.scopes)}
-
-
-def _state(key: KeyRecord) -> str:
+def _line(key: Key) -> str:
+    state = "valid"
     if key.revoked is not None:
-        return f"revoked {_format_time(key.revoked)}"
-    if key.expires is None:
-        return "valid"
-    return f"{'expired' if key.expires <= time.time() else 'valid until'} {_format_time(key.expires)}"
-
-
-def _limits(key: KeyRecord) -> str:
-    limits = {"bytes": key.quota.max_bytes, "queued": key.quota.max_queued, "uploads": key.quota.max_uploads}
-    return ",".join(f"{name}={value}" for name, value in limits.items() if value is not None) or "-"
+        state = f"revoked {_format_time(key.revoked)}"
+    elif key.expires is not None:
+        state = f"{'expired' if key.expires <= time.time() else 'valid until'} {_format_time(key.expires)}"
+    scopes = key.scopes.replace(" ", ",") + (f" by {key.maker}" if key.maker else "")
+    return "  ".join([key.id, _format_time(key.created), state, scopes, key.name])
 
 
 def _format_time(seconds: float) -> str:
-    moment = datetime.fromtimestamp(within_calendar(seconds), UTC)
-    return moment.replace(tzinfo=None).isoformat(" ", "minutes") + "Z"
+    return datetime.fromtimestamp(seconds, UTC).replace(tzinfo=None).isoformat(" ", "minutes") + "Z"

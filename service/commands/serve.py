@@ -3,100 +3,124 @@
 from __future__ import annotations
 
 import argparse
-import gc
 import json
-import logging
-import math
-import os
 import resource
 import signal
 import socket
 import sqlite3
 import sys
-import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from textwrap import fill
 from types import FrameType
-from typing import Any
 
+import anyio
 import uvicorn
 from fastapi import FastAPI
 
 from liftcore.cli import Parser
-from service.app import assemble
+from service.app import create_app, logging_to_stderr
 from service.auth import is_loopback
 from service.errors import Misconfigured
-from service.observe import logging_to_stderr
-from service.settings import REMOVED_VARIABLES, ServiceSettings, read_settings, require_encoder_files, variables
-from service.state import Stopping
-from service.store.database import DATABASE, keys_were_made, require_database
-from service.store.keys import any_key
-from service.store.store import Store
+from service.settings import ServiceSettings, read_settings, require_encoder_files, variables
+from service.store import DATABASE, Store, connect, list_keys
 
-FILES_A_CONNECTION = 2  # its socket, and a file that is sent over it
-SWITCH_SECONDS = 0.0005  # of computation by a thread while the event loop waits; a tenth of Python's default
-MARGIN = " " * 6  # before the description of a variable in --help
-# Seconds that a connection is kept after an answer: more than in the pools of clients and proxies (httpx 5 s, aiohttp
-# 15 s, nginx 60 s). With an equal number a client may send its next request while the server closes the connection.
+CONNECTIONS = 400  # that may be open; requests over more get 503
+STOP_SECONDS = 10  # that open requests have to end in a stop
+# Seconds that a connection is kept after an answer: more than in the pools of clients and proxies (nginx 60 s). With
+# an equal number a client may send its next request while the server closes the connection.
 KEEP_ALIVE_SECONDS = 75
-IDLE_SECONDS = 1.0  # without a request in progress; then the connection may be closed for a new one
-FILES_BESIDE = 128  # of the database, checks, jobs and the query worker
-
-log = logging.getLogger(__name__)
+SWITCH_SECONDS = 0.0005  # of computation by a thread while the event loop waits; a tenth of Python's default
 
 
 class AnnouncingServer(uvicorn.Server):
-    """Announce the address after the start, and stop in order: a stop by a signal is no failure.
+    """Announce the address after the start, and stop in order: a stop by a signal is no failure."""
 
-    Connections without a request in progress make room for others: uvicorn's own limit looks at requests alone, and
-    waits for ever for who sends nothing.
-    """
-
-    def __init__(
-        self, config: uvicorn.Config, stopping: Stopping, max_connections: int, announce: Callable[[str], None]
-    ) -> None:
+    def __init__(self, config: uvicorn.Config, app: FastAPI, announce: Callable[[str], None]) -> None:
         super().__init__(config)
-        self._max_connections = max_connections
-        self._stopping = stopping
-        self._announce = announce
-        # Connection and its last completed request -> seconds of the monotonic clock
-        self._idle_since: dict[tuple[Any, Any], float] = {}
-
-    async def on_tick(self, counter: int) -> bool:
-        """Close the longest idle connections if there is no room for a new one; called ten times a second."""
-        now, connections = time.monotonic(), self.server_state.connections
-        requests = ((each, getattr(each, "cycle", None)) for each in connections)
-        self._idle_since = {
-            last: self._idle_since.get(last, now)  # a new request since the last tick resets the time
-            for last in requests
-            if last[1] is None or last[1].response_complete
-        }
-        surplus = len(connections) - self._max_connections + 1  # including the next one
-        for last in sorted(self._idle_since, key=self._idle_since.__getitem__)[: max(0, surplus)]:
-            if now - self._idle_since[last] >= IDLE_SECONDS and not last[0].transport.is_closing():
-                last[0].shutdown()
-        return await super().on_tick(counter)
+        self._app, self._announce = app, announce
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Stop at the first signal, at once at a second SIGINT. uvicorn would raise the signal after the stop."""
         self.force_exit = self.force_exit or (self.should_exit and sig == signal.SIGINT)
         self.should_exit = True
 
-    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Refuse work and requeue running jobs while the port still answers, then close the port."""
-        await self._stopping.begin(lambda: self.force_exit)
-        await super().shutdown(sockets)
-
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start, then announce the address."""
         await super().startup(sockets)
         if self.started and sockets:
             host, port = sockets[0].getsockname()[:2]
-            name = f"[{host}]" if ":" in host else host
-            self._announce(f"http://{name}:{port}")
+            self._announce(f"http://{f'[{host}]' if ':' in host else host}:{port}")
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Put running jobs back in line and end streams of events while the port still answers, then close it."""
+        await anyio.to_thread.run_sync(self._app.state.parts.runner.stop)
+        await super().shutdown(sockets)
+
+
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command; the end of its help lists all settings."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    rows = (
+        f"  {name}, default {default}\n{fill(meaning, 78, initial_indent=' ' * 6, subsequent_indent=' ' * 6)}"
+        for name, default, meaning in variables()
+    )
+    parser.epilog = "\n".join(("environment variables; options win, and an empty variable is not set:", *rows))
+    parser.add_argument("--host", help="the address to bind; beyond loopback only with keys")
+    parser.add_argument("--port", type=int, help="the port to bind; 0 picks a free one")
+    parser.add_argument("--data", type=Path, metavar="DIR", help="the directory for the database and all files")
+    parser.add_argument("--encoder", metavar="SPEC", help="the default text encoder: lvis, table:FILE, ...")
+    of_space = "the text encoder of a text space; may be given several times"
+    parser.add_argument("--text-space", action="append", dest="text_spaces", metavar="NAME=SPEC", help=of_space)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the service until it is stopped."""
+    settings = settings_of(options)
+    require_keys(settings)
+    require_encoder_files(settings)
+    announce = print_address
+    if options.json:
+        announce = partial(print_json, data=settings.data)
+    serve(settings, announce)
+    return 0
+
+
+def serve(
+    settings: ServiceSettings, announce: Callable[[str], None], prepare: Callable[[Store], None] = lambda _: None
+) -> None:
+    """Run a server until it is stopped.
+
+    Args:
+        announce: called with the address. prepare: called with the store before the start.
+
+    Raises:
+        Misconfigured: the address or the data directory cannot be used.
+    """
+    with closing(bind(settings.host, settings.port)) as listener, logging_to_stderr():
+        with data_directory_errors():
+            store = Store(settings.data, settings.disk_floor_bytes)
+        with closing(store):
+            prepare(store)
+            hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+            with suppress(ValueError, OSError):  # some kernels have a lower limit than they report
+                resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+            sys.setswitchinterval(SWITCH_SECONDS)
+            app = create_app(settings, store)
+            server_of(app, settings, announce).run(sockets=[listener])
+
+
+def server_of(app: FastAPI, settings: ServiceSettings, announce: Callable[[str], None]) -> AnnouncingServer:
+    """Return the server of an application, which announces its address."""
+    config = uvicorn.Config(
+        app, http="h11", ws="none", log_config=None, log_level="warning", access_log=False, server_header=False,
+        limit_concurrency=CONNECTIONS + 1,  # including the current one
+        timeout_keep_alive=KEEP_ALIVE_SECONDS, timeout_graceful_shutdown=STOP_SECONDS,
+        proxy_headers=bool(settings.forwarded_allow), forwarded_allow_ips=settings.forwarded_allow,
+    )  # fmt: skip
+    return AnnouncingServer(config, app, announce)
 
 
 def print_address(address: str) -> None:
@@ -109,57 +133,8 @@ def print_json(address: str, data: Path) -> None:
     print(json.dumps({"address": address, "data": str(data.absolute())}), flush=True)
 
 
-def add_arguments(parser: Parser) -> None:
-    """Add the options of the command; the end of its help lists all settings."""
-    parser.formatter_class, parser.epilog = argparse.RawDescriptionHelpFormatter, list_variables()
-    parser.add_argument("--host", help="the address to bind; beyond loopback only with keys")
-    parser.add_argument("--port", type=int, help="the port to bind; 0 picks a free one")
-    parser.add_argument("--data", type=Path, metavar="DIR", help="the directory for the database and all files")
-    parser.add_argument("--encoder", metavar="SPEC", help="the default text encoder: lvis, table:FILE, ...")
-    of_space = "the text encoder of a text space; may be given several times"
-    parser.add_argument("--text-space", action="append", dest="text_spaces", metavar="NAME=SPEC", help=of_space)
-    new_help = "where the database is gone or older than the files, begin an empty one; the files go to quarantine"
-    parser.add_argument("--new", action="store_true", help=new_help)
-
-
-def run(options: argparse.Namespace) -> int:
-    """Run the service until it is stopped."""
-    settings = settings_of(options)
-    with data_directory_errors():
-        if not options.new:
-            require_database(settings.data / DATABASE)
-        require_keys(settings)
-        require_encoder_files(settings)
-        require_files(settings)
-        listener = bind(settings.host, settings.port)
-        try:
-            store = Store.open(settings.data, floor_bytes=settings.disk_floor_bytes, new=options.new)
-        except BaseException:
-            listener.close()
-            raise
-    with logging_to_stderr(settings.log_format):
-        for name in sorted(REMOVED_VARIABLES & os.environ.keys()):
-            log.warning("%s is no setting any more and does nothing: a proxy bounds slow clients", name)
-        if settings.keys == "none" and keys_were_made(settings.data):
-            log.warning("SPLATLIFT_KEYS is none: nobody needs a key, though keys were made for %s", settings.data)
-        try:
-            app = assemble(settings, store)
-            app.state.documents.get(keys=False)  # made before the first requests, which may come at once
-            keep_pauses_short()
-            announce = partial(print_json, data=settings.data) if options.json else print_address
-            server_of(app, settings, announce).run(sockets=[listener])
-        finally:
-            store.close()
-            listener.close()
-    return 0
-
-
 def settings_of(options: argparse.Namespace) -> ServiceSettings:
-    """Return the settings: of the command line, else of the environment, else the defaults.
-
-    Raises:
-        Misconfigured: a value that a setting does not take.
-    """
+    """Return the settings: of the command line, else of the environment, else the defaults."""
     pairs = [text.partition("=") for text in options.text_spaces or ()]
     for name, _, spec in pairs:
         if not (name and spec):
@@ -170,24 +145,11 @@ def settings_of(options: argparse.Namespace) -> ServiceSettings:
 
 @contextmanager
 def data_directory_errors() -> Iterator[None]:
-    """Convert errors of the disk and the database to one line: full, read-only or failing.
-
-    Raises:
-        Misconfigured: in place of OSError and sqlite3.Error.
-    """
+    """Convert errors of the disk and the database to one line: full, read-only or failing."""
     try:
         yield
     except (OSError, sqlite3.Error) as error:
         raise Misconfigured("data", expected="a directory to read and write", got=str(error)) from error
-
-
-def list_variables() -> str:
-    """Return the list of all settings for ``--help``."""
-    rows = (
-        f"  {name}, default {default}\n{fill(meaning, 78, initial_indent=MARGIN, subsequent_indent=MARGIN)}"
-        for name, default, meaning in variables()
-    )
-    return "\n".join(("environment variables; options win, and an empty variable is not set:", *rows))
 
 
 def require_keys(settings: ServiceSettings) -> None:
@@ -196,36 +158,18 @@ def require_keys(settings: ServiceSettings) -> None:
     Raises:
         Misconfigured: the address is not loopback, and there is no key.
     """
-    if is_loopback(settings.host) or settings.keys == "required":
+    if is_loopback(settings.host):
         return
-    if settings.keys == "none":
-        raise Misconfigured(
-            "host", expected="a loopback address such as 127.0.0.1, as SPLATLIFT_KEYS is none", got=settings.host
-        )
-    if not any_key(settings.data / DATABASE):
-        raise Misconfigured(
-            "host", expected="a loopback address such as 127.0.0.1, as there are no keys", got=settings.host,
-            hint=f"make one first: splatlift keys create --name NAME --scopes read,write --data {settings.data}",
-        )  # fmt: skip
-
-
-def require_files(settings: ServiceSettings) -> None:
-    """Raise the limit of open files as far as allowed, and require enough for every connection.
-
-    Raises:
-        Misconfigured: there would be too few of them.
-    """
-    required = FILES_A_CONNECTION * settings.max_connections + FILES_BESIDE
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if 0 <= hard < required:
-        raise Misconfigured(
-            "max_connections", expected=f"at most {max(0, (hard - FILES_BESIDE) // FILES_A_CONNECTION)}, as a"
-            f" process may open {hard} files here", got=f"{settings.max_connections}", hint="or raise ulimit -n",
-        )  # fmt: skip
-    try:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-    except (ValueError, OSError):  # some kernels have a lower limit than they report
-        resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, required) if soft >= 0 else soft, hard))
+    with data_directory_errors():
+        path = settings.data / DATABASE
+        if path.exists():
+            with closing(connect(path, "ro")) as connection:
+                if list_keys(connection):
+                    return
+    raise Misconfigured(
+        "host", expected="a loopback address such as 127.0.0.1, as there are no keys", got=settings.host,
+        hint=f"make one first: splatlift keys create --name NAME --scopes read,write --data {settings.data}",
+    )  # fmt: skip
 
 
 def bind(host: str, port: int) -> socket.socket:
@@ -245,26 +189,3 @@ def bind(host: str, port: int) -> socket.socket:
         got = f"{host} port {port}: {error.strerror}"
         raise Misconfigured("host", expected="an address of this machine, with a free port", got=got) from None
     return listener
-
-
-def server_of(
-    app: FastAPI, settings: ServiceSettings, announce: Callable[[str], None] = print_address
-) -> AnnouncingServer:
-    """Return the server of an application, which announces its address."""
-    proxies = settings.forwarded_allow
-    config = uvicorn.Config(
-        app, http="h11", ws="none", log_config=None, log_level="warning", access_log=False, server_header=False,
-        limit_concurrency=settings.max_connections + 1,  # including the current one
-        timeout_keep_alive=KEEP_ALIVE_SECONDS,
-        timeout_graceful_shutdown=math.ceil(settings.stop_seconds),
-        proxy_headers=bool(proxies), forwarded_allow_ips=proxies,
-    )  # fmt: skip
-    return AnnouncingServer(config, app.state.stopping, settings.max_connections, announce)
-
-
-def keep_pauses_short() -> None:
-    """Keep threads and the collector of cycles from blocking the event loop for long."""
-    sys.setswitchinterval(SWITCH_SECONDS)
-    gc.set_threshold(700, 10, 10)  # Python's default: other commands collect less often
-    gc.collect()
-    gc.freeze()  # skip modules and routes in later collections: they took 20 to 40 ms

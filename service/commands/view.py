@@ -9,35 +9,26 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import secrets
-import shutil
-import signal
 import subprocess
 import sys
 import tempfile
 import threading
 import webbrowser
 from contextlib import suppress
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli import Parser
+from safetensors import SafetensorError, safe_open
+
+from liftcore.cli import Parser, place
 from liftcore.errors import InvalidInput, InvalidLift, Unavailable
 from liftcore.text import BUILT_IN, NO_WORDS, OWN_WORDS
-from service.app import assemble
-from service.commands.serve import bind, server_of
-from service.errors import Misconfigured
-from service.models import AssetKind
-from service.observe import logging_to_stderr
+from service.commands.serve import serve
+from service.errors import Fault, Misconfigured
+from service.process import Children, end_with_parent
+from service.results import add_lift
 from service.settings import ServiceSettings, read_settings, require_encoder_files
-from service.store.assets import CheckedUpload
-from service.store.files import sha256_of
-from service.store.lifts import FinishedLift, order_of
-from service.store.owners import SERVICE
-from service.store.recovery import check_file, header_of
-from service.store.store import Store
+from service.store import SERVICE, Store
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -46,119 +37,130 @@ if TYPE_CHECKING:
 
 LAST_PORT = 65_535
 ENDING_SECONDS = 10.0  # for a server that was interrupted to end
-FOLDER_PREFIX = "splatlift-show-"
-FOLDER_VARIABLE = "SPLATLIFT_SHOW_FOLDER"  # from `show` to the process that removes the folder; not an option
 
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    parser.add_argument("lift", type=Path, help="a lift (.safetensors), whose splats and cameras are where they were")
+    parser.add_argument(
+        "lift", type=place, help="a lift (.safetensors), whose splats and cameras are where they were"
+    )
     parser.add_argument("--port", type=int, default=0, help="the port of this machine; 0 picks a free one")
     parser.add_argument("--no-browser", action="store_true", help="print the address, and open nothing")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Show the lift until Ctrl-C; a folder of `show` is removed when the other end of stdin closes.
-
-    Raises:
-        InvalidInput: the environment names a folder that `show` did not make for this lift.
-    """
-    folder = os.environ.pop(FOLDER_VARIABLE, "")
-    if not folder:
-        _serve(options.lift, options.port, browser=not options.no_browser)
-        return 0
-    if not (options.lift.parent == Path(folder) and options.lift.parent.name.startswith(FOLDER_PREFIX)):
-        expected = f"the folder {FOLDER_PREFIX}... of the lift"
-        raise InvalidInput(FOLDER_VARIABLE, expected=expected, got=repr(folder)[:80], hint="unset it")
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # exit in order until the server handles signals itself
-    threading.Thread(target=stop_when_stdin_closes, daemon=True).start()
-    try:
-        _serve(options.lift, options.port, browser=not options.no_browser)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+    """Show the lift until Ctrl-C."""
+    show_file(options.lift, options.port, browser=not options.no_browser)
     return 0
 
 
 def show(
     lift: LiftResult, splats: Splats | None, cameras: Mapping[str, Camera] | None, *, port: int, browser: bool
 ) -> None:
-    """Serve a lift until Ctrl-C: `LiftResult.show`."""
+    """Serve a lift until Ctrl-C: `LiftResult.show`. The server ends with this process."""
     if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port <= LAST_PORT:
         expected = f"a whole number in 0..{LAST_PORT}, 0 for a free one"
         raise InvalidInput("port", expected=expected, got=repr(port)[:80])
-    with tempfile.TemporaryDirectory(prefix=FOLDER_PREFIX, ignore_cleanup_errors=True) as folder:
+    lifeline, server_end = os.pipe()
+    with tempfile.TemporaryDirectory(prefix="splatlift-show-", ignore_cleanup_errors=True) as folder:
         path = lift.save_scene(Path(folder), splats, cameras)
-        command = [sys.executable, "-m", "liftcore.cli", "view", str(path), "--port", str(port)]
-        command += ["--no-browser"] * (not browser)
-        environment = os.environ | {FOLDER_VARIABLE: folder}  # the server removes it: a kernel may be killed
+        command = [
+            sys.executable,
+            "-m",
+            "service.commands.view",
+            str(path),
+            str(port),
+            str(int(browser)),
+            str(lifeline),
+        ]
         with subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+            command, stdout=subprocess.PIPE, text=True, pass_fds=[lifeline], start_new_session=True
         ) as server:
+            os.close(lifeline)
             assert server.stdout is not None
             try:
                 for line in server.stdout:
                     print(line, end="", flush=True)  # flushed for the cell of a notebook
-            except KeyboardInterrupt:  # the server received it too
+            except KeyboardInterrupt:
                 server.terminate()
                 with suppress(subprocess.TimeoutExpired):
                     server.wait(ENDING_SECONDS)
                 server.kill()
                 return
-        if server.returncode:
-            got = f"one that ended with status {server.returncode}; what it said stands above"
-            raise Unavailable("the page", expected="a server that starts", got=got)
+            finally:
+                os.close(server_end)
+    if server.returncode:
+        got = f"one that ended with status {server.returncode}; what it said stands above"
+        raise Unavailable("the page", expected="a server that starts", got=got)
 
 
-def adopt(store: Store, settings: ServiceSettings, path: Path) -> str:
+def show_file(path: Path, port: int, *, browser: bool) -> None:
+    """Show the lift on a port, over a data directory that is removed with the server."""
+    metadata, lift_ids = metadata_of(path), list[str]()
+    with tempfile.TemporaryDirectory(prefix="splatlift-view-") as folder:
+
+        def announce(address: str) -> None:
+            page = f"{address}/?lift={lift_ids[0]}"
+            print(f"{page} (Ctrl-C ends it)", flush=True)
+            if browser:
+                threading.Thread(target=webbrowser.open, args=(page,), daemon=True).start()
+
+        settings = settings_of(Path(folder), port, metadata.get("text_space", ""))
+        serve(settings, announce, lambda store: lift_ids.append(adopt(store, settings, path, metadata)))
+
+
+def metadata_of(path: Path) -> dict[str, Any]:
+    """Return the metadata of a lift file.
+
+    Raises:
+        InvalidLift: it is none.
+    """
+    try:
+        handle: Any
+        with safe_open(str(path), framework="np") as handle:
+            return json.loads(handle.metadata()["splatlift"])
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+        got = f"another: {error!r}"[:120]
+        raise InvalidLift(str(path), expected="a lift file (.safetensors)", got=got) from None
+
+
+def adopt(store: Store, settings: ServiceSettings, path: Path, metadata: dict[str, Any]) -> str:
     """Add a lift and the files that it was made of to a store, by links; return the lift's id.
 
     Packs that moved are left out: only examples of regions need them.
 
     Raises:
-        InvalidLift: it is no lift, or its splats or cameras are not where it remembers them.
+        InvalidLift: its splats or cameras are not where it remembers them.
         InvalidInput: one of its files is malformed, or of a format that may hold code.
     """
-    metadata, shape = metadata_of(path)
-    order = order_of(metadata)
-    packs = list(zip(metadata["features"], order.features, strict=True))
-    present = [(pack, asset) for pack, asset in packs if Path(pack["path"]).is_file()]
-    _link(store, settings, AssetKind.SPLATS, metadata["splats"], path)
-    _link(store, settings, AssetKind.CAMERAS, metadata["cameras"], path)
-    for pack, _ in present:
-        _link(store, settings, AssetKind.FEATURES, pack, path)
-    lift = secrets.token_hex(16)
-    store.files.lift(lift).symlink_to(path.resolve())
-    record = FinishedLift(store.files.lift(lift), sha256_of(path), shape[0], shape[1], metadata)
-    store.lifts.adopt(SERVICE, lift, replace(order, features=tuple(asset for _, asset in present)), record)
-    return lift
+    packs = [("features", file) for file in metadata["features"] if Path(file["path"]).is_file()]
+    children = Children()
+    try:
+        with store.scratch() as scratch:
 
+            def link(kind: str, source: Path) -> tuple[Path, dict[str, Any]]:
+                draft = scratch / kind
+                draft.symlink_to(source.resolve())
+                order = {"task": "check", "kind": kind, "file": str(source), "scratch": str(scratch), "names": {}}
+                return draft, children.check(order, settings.check_seconds, kind)
 
-def metadata_of(path: Path) -> tuple[dict[str, Any], list[int]]:
-    """Return the metadata of a lift file and the shape of its features.
-
-    Raises:
-        InvalidLift: it is none.
-    """
-    if path.is_dir():
-        raise InvalidLift(str(path), expected="a lift file (.safetensors)", got="a folder")
-    _, metadata, shape = header_of(path)
-    if "splatlift" not in metadata or len(shape) != 2:
-        raise InvalidLift(str(path), expected="a lift file", got="a file without a lift's metadata")
-    return json.loads(metadata["splatlift"]), shape
-
-
-def _link(store: Store, settings: ServiceSettings, kind: AssetKind, file: dict[str, str], lift: Path) -> None:
-    source = Path(file["path"])
-    if not file["path"] or not source.exists():
-        got = "nothing there" if file["path"] else "a lift of values in memory"
-        raise InvalidLift(str(lift), expected=f"its {kind} at {file['path'] or 'a path'}", got=got)
-    report = check_file(store, settings, kind, source)
-    path = store.files.blob(file["sha256"], report.suffix)
-    path.parent.mkdir(exist_ok=True)
-    path.symlink_to(source.resolve() if source.is_file() else source)
-    store.assets.add(
-        SERVICE, CheckedUpload(path, kind, file["sha256"], report.suffix, report.counts, report.warnings)
-    )
+            for kind, file in (("splats", metadata["splats"]), ("cameras", metadata["cameras"]), *packs):
+                source = Path(file["path"])
+                if not file["path"] or not source.exists():
+                    got = "nothing there" if file["path"] else "a lift of values in memory"
+                    raise InvalidLift(str(path), expected=f"its {kind} at {file['path'] or 'a path'}", got=got)
+                draft, content = link(kind, source)
+                store.add_asset(SERVICE, kind, draft, file["sha256"], content)
+            draft, content = link("lift", path)
+            return add_lift(store, SERVICE, draft, content).id
+    except Fault as error:
+        fault = error.fault
+        raise InvalidInput(
+            fault.get("argument", "lift"), expected=fault.get("expected", "a file that can be read"),
+            got=fault.get("got", fault["detail"]), hint=fault.get("hint", ""),
+        ) from None  # fmt: skip
+    finally:
+        children.stop()
 
 
 def settings_of(folder: Path, port: int, text_space: str) -> ServiceSettings:
@@ -166,8 +168,7 @@ def settings_of(folder: Path, port: int, text_space: str) -> ServiceSettings:
 
     Spaces of encoders that ship, and those that the environment names, are answered as by any server.
     """
-    values: dict[str, Any] = {"data": folder, "host": "127.0.0.1", "port": port}
-    settings = read_settings(**values)
+    settings = read_settings(data=folder, host="127.0.0.1", port=port, disk_floor_bytes=0)
     if text_space in ("", NO_WORDS, OWN_WORDS, *BUILT_IN.values(), *settings.text_spaces):
         return settings
     extended = settings.model_copy(update={"text_spaces": {**settings.text_spaces, text_space: text_space}})
@@ -178,31 +179,6 @@ def settings_of(folder: Path, port: int, text_space: str) -> ServiceSettings:
     return extended
 
 
-def _serve(path: Path, port: int, *, browser: bool) -> None:
-    """Show the lift on a port, over a data directory that is removed with the server."""
-    with tempfile.TemporaryDirectory(prefix="splatlift-view-") as folder:
-        settings = settings_of(Path(folder), port, metadata_of(path)[0].get("text_space", ""))
-        listener = bind(settings.host, settings.port)
-        store = Store.open(settings.data, floor_bytes=0)
-        try:
-            announce_lift = partial(announce, lift=adopt(store, settings, path), browser=browser)
-            with logging_to_stderr(settings.log_format):
-                server_of(assemble(settings, store), settings, announce_lift).run(sockets=[listener])
-        finally:
-            store.close()
-            listener.close()
-
-
-def stop_when_stdin_closes() -> None:
-    """Stop this process in order once the other end of the pipe is closed."""
-    while os.read(0, 1 << 16):  # not sys.stdin: the thread would hold its lock at the exit
-        pass
-    os.kill(os.getpid(), signal.SIGTERM)
-
-
-def announce(address: str, *, lift: str, browser: bool) -> None:
-    """Print the address of the page, and open it."""
-    page = f"{address}/?lift={lift}"
-    print(f"{page} (Ctrl-C ends it)", flush=True)
-    if browser:
-        threading.Thread(target=webbrowser.open, args=(page,), daemon=True).start()
+if __name__ == "__main__":
+    end_with_parent(int(sys.argv[4]))
+    show_file(Path(sys.argv[1]), int(sys.argv[2]), browser=sys.argv[3] == "1")

@@ -2,183 +2,185 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-from itertools import accumulate
+import hashlib
+import re
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import anyio
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Query, Request, Response
+from fastapi import Path as PathParameter
 
 from service import models
-from service.child import error_of
-from service.content import FILE, Cursor, Limit, file_answer, page_response
-from service.errors import ProcessDied
-from service.requests import JsonRoute, require_file
-from service.sandbox import run_sandboxed
-from service.state import AppState, Deps
-from service.store.assets import SHOWN_CHARACTERS, AssetRecord
-from service.store.files import require_whole
-from service.uploads import AssetIntake, Intake, Record, require_size, too_slow
+from service.errors import InvalidRequest, TooLarge, UnsupportedMedia
+from service.models import Asset, AssetKind, Assets
+from service.routes import BINARY, Caller, Cursor, Deps, Limit, Parts, content_of, file_answer
 
-T = TypeVar("T")
+Value = TypeVar("Value")
 BATCH = 1 << 20  # bytes that are collected before a thread writes them
-HEADER_LENGTH_BYTES = 8  # length field at the begin of a safetensors file
-MAX_DIGITS = 20  # of a Content-Length: h11 accepts no more
-
-router = APIRouter(prefix="/assets", tags=["assets"], route_class=JsonRoute)
-# OpenAPI takes two templates of the same paths as one path given twice, so the parameter has one name.
-AssetKind = Annotated[models.AssetKind, Path(alias="asset", description="its kind")]
-KindParameter = Annotated[models.AssetKind, Query(description="its kind")]
-AssetId = Annotated[str, Path(description="sha256: and the digest of the bytes, in hex")]
-Sha256 = Annotated[str | None, Query(pattern="^[0-9a-fA-F]{64}$", description="of the content; checked if given")]
-NamesCursor = Annotated[int, Query(ge=0, le=10**9, description="the `next` of the page before")]
-KNOWN_ALREADY: dict[int | str, dict[str, Any]] = {200: {"model": models.Asset, "description": "It was here already"}}
-RAW_BODY: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "description": "the file itself",
-        "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
-    }
+CHECK_BASE_BYTES, CHECK_FACTOR = 1 << 30, 16  # memory of a check: a reader holds several copies of a file
+UPLOAD: dict[str, Any] = {
+    "max_body_size": 1 << 62,  # the limit is a setting
+    "openapi_extra": {
+        "requestBody": {
+            "required": True,
+            "description": "the file itself",
+            "content": {BINARY: {"schema": {"type": "string", "format": "binary"}}},
+        }
+    },
 }
+# OpenAPI takes two templates of the same paths as one path given twice, so the parameter has one name.
+Kind = Annotated[AssetKind, PathParameter(alias="asset", description="its kind")]
+Sha256 = Annotated[str | None, Query(pattern="^[0-9a-fA-F]{64}$", description="of the content; checked if given")]
+KNOWN: dict[int | str, dict[str, Any]] = {200: {"model": Asset, "description": "It was here already"}}
+
+router = APIRouter(prefix="/assets", tags=["assets"])
 
 
-@router.put("/{asset}", response_model=models.Asset, status_code=201, responses=KNOWN_ALREADY, openapi_extra=RAW_BODY)
-async def put_asset(kind: AssetKind, request: Request, deps: Deps, sha256: Sha256 = None) -> Response:
+@router.put("/{asset}", status_code=201, responses=KNOWN, **UPLOAD)
+async def put_asset(
+    kind: Kind, request: Request, response: Response, deps: Deps, owner: Caller, sha256: Sha256 = None
+) -> Asset:
     """Upload a file. The service checks it whole.
 
     It is splats (any format but checkpoints), cameras (JSON, or a zip of a COLMAP model or of several files), a
     feature pack, masks, a text table, or photos (a zip of JPEG and PNG files that are named like the views).
     """
-    asset, new = await receive_upload(AssetIntake, kind, request, deps, sha256)
-    return _reply(asset, 201 if new else 200)
+    async with receive_upload(request, deps, sha256) as (draft, digest):
+        asset = await in_thread(deps, deps.store.find_asset, owner, f"sha256:{digest}")
+        if asset is not None and asset.kind == kind and asset.file.exists():
+            response.status_code = 200
+        else:
+            content = await check_upload(deps, kind, draft, draft.parent)
+            asset = await in_thread(deps, deps.store.add_asset, owner, kind, draft, digest, content)
+    response.headers["Location"] = f"/assets/{asset.id}"
+    return asset
 
 
-@router.post("", response_model=models.Asset, status_code=201, responses=KNOWN_ALREADY, openapi_extra=RAW_BODY)
-async def create_asset(kind: KindParameter, request: Request, deps: Deps, sha256: Sha256 = None) -> Response:
-    """Upload a file, as PUT does."""
-    return await put_asset(kind, request, deps, sha256)
+async def in_thread(deps: Parts, call: Any, *arguments: Any) -> Any:
+    """Return the result of a call that reads or writes files, in a thread for uploads."""
+    return await anyio.to_thread.run_sync(call, *arguments, limiter=deps.writing)
 
 
-async def receive_upload(
-    into: Callable[..., Intake[Record]], kind: models.UploadKind, request: Request, deps: AppState, sha256: str | None
-) -> tuple[Record, bool]:
-    """Receive, check and store an upload; return True if its owner did not have it before."""
-    require_file(request.headers)
-    limit = deps.settings.max_upload_bytes(kind)
-    require_size(kind, _declared_size(request), limit)  # before 100 Continue invites the body
-    intake = into(deps.store, deps.owner, kind, limit)
-
-    async def write(step: Callable[..., T], *arguments: Any) -> T:
-        return await anyio.to_thread.run_sync(step, *arguments, limiter=deps.writing)
-
+@asynccontextmanager
+async def open_scratch(deps: Parts) -> AsyncIterator[Path]:
+    """Yield a folder for drafts, which is removed at the end of the block."""
+    scratch = deps.store.scratch()
+    folder = await in_thread(deps, scratch.__enter__)
     try:
-        await write(intake.open)
-        await _receive(request, partial(write, intake.feed))
-        existing = await write(intake.finish, sha256)
-        if existing is not None:
-            return existing, False
-        upload = await anyio.to_thread.run_sync(intake.check, deps.check_limits, limiter=deps.checks)
-        return await write(intake.keep, upload)
+        yield folder
     finally:
         with anyio.CancelScope(shield=True):  # removing gigabytes takes long
-            await write(intake.close)
+            await in_thread(deps, scratch.__exit__, None, None, None)
 
 
-def _declared_size(request: Request) -> int:
-    """Return the declared length of a body in bytes; 0 if there is none."""
+@asynccontextmanager
+async def receive_upload(request: Request, deps: Parts, sha256: str | None) -> AsyncIterator[tuple[Path, str]]:
+    """Receive a body into a draft; yield that and its sha256 in hex. The draft is removed at the end of the block.
+
+    Raises:
+        TooLarge: there are more bytes than may come.
+        NoSpace: there is no room for them.
+        UnsupportedMedia: it is compressed, or a part of a form.
+        InvalidRequest: its digest is another than was declared.
+    """
+    require_file(request)
+    limit, digest, count, batch = deps.settings.upload_bytes, hashlib.sha256(), 0, bytearray()
     length = request.headers.get("content-length", "")
-    return int(length[:MAX_DIGITS]) if length.isascii() and length.isdigit() else 0
+    require_size(int(length[:20]) if length.isascii() and length.isdigit() else 0, limit)  # before 100 Continue
+    async with open_scratch(deps) as folder:
+        draft = folder / "upload"
+
+        def write(content: bytes) -> None:
+            deps.store.require_room(len(content))
+            digest.update(content)
+            with draft.open("ab") as file:
+                file.write(content)
+
+        async for chunk in request.stream():
+            batch += chunk
+            count += len(chunk)
+            require_size(count, limit)
+            if len(batch) >= BATCH:
+                await in_thread(deps, write, bytes(batch))
+                batch.clear()
+        await in_thread(deps, write, bytes(batch))
+        if sha256 is not None and digest.hexdigest() != sha256.lower():
+            hint = "upload the file again"
+            raise InvalidRequest("sha256", expected=sha256, got=digest.hexdigest(), hint=hint)
+        yield draft, digest.hexdigest()
 
 
-async def _receive(request: Request, feed: Callable[[bytes], Any]) -> None:
-    batch = bytearray()
-    async for chunk in request.stream():
-        batch += chunk
-        if len(batch) >= BATCH:
-            await feed(bytes(batch))
-            batch.clear()
-    await feed(bytes(batch))
+def require_size(count: int, limit: int) -> None:
+    """Require that an upload is not too large."""
+    if count > limit:
+        hint = "several feature packs may make one lift, so features can be cut"
+        raise TooLarge("body", expected=f"at most {limit} bytes", got="more", hint=hint)
 
 
-@router.get("", response_model=models.Assets)
-def list_assets(deps: Deps, limit: Limit = models.PAGE, cursor: Cursor = None) -> Response:
-    """List the assets, newest first, in pages. Lists of names and words are given with each single asset."""
-    return page_response("assets", partial(deps.store.assets.page, deps.owner), shape, limit=limit, cursor=cursor)
+def require_file(request: Request) -> None:
+    """Require that a body is a plain file: neither compressed nor a part of a form."""
+    encodings = ", ".join(request.headers.getlist("content-encoding")).strip()
+    media = request.headers.get("content-type", "")
+    if encodings.lower() not in ("", "identity"):
+        expected, hint = "a body that is not compressed", "send it as it is; .spz and .sog are compressed already"
+        raise UnsupportedMedia("Content-Encoding", expected=expected, got=encodings[:40], hint=hint)
+    if re.match(r"\s*multipart/", media, re.IGNORECASE):
+        hint = "send it with curl -T FILE or --data-binary @FILE, as application/octet-stream"
+        raise UnsupportedMedia("Content-Type", expected="the file itself as the body", got=media[:80], hint=hint)
 
 
-@router.get("/{asset}", response_model=models.Asset)
-def get_asset(asset: AssetId, deps: Deps) -> Response:
-    """Get one asset. Long lists of names or words are at ``links.names`` alone."""
-    return _reply(deps.store.assets.get(deps.owner, asset, limit=SHOWN_CHARACTERS), 200)
+async def check_upload(deps: Parts, kind: str, file: Path, scratch: Path, **more: Any) -> dict[str, Any]:
+    """Check a file in a child; return what its task returns.
+
+    Args:
+        more: other fields of the order.
+    """
+    size = sum(Path(path).stat().st_size for path in (file, *([more["cameras"]] if "cameras" in more else [])))
+    names = {str(file): kind, f"text table {file.name}": kind} | more.pop("names", {})
+    memory = min(deps.settings.check_memory_bytes, CHECK_BASE_BYTES + CHECK_FACTOR * size)
+    order = {"task": "check", "kind": kind, "file": str(file), "scratch": str(scratch), "memory": memory}
+    order |= {"names": names, **more}
+    seconds = deps.settings.check_seconds
+    return await anyio.to_thread.run_sync(deps.children.check, order, seconds, kind, limiter=deps.checks)
 
 
-@router.get("/{asset}/names", response_model=models.Names)
-def get_asset_names(asset: AssetId, deps: Deps, limit: Limit = models.PAGE, cursor: NamesCursor = 0) -> models.Names:
-    """List the names of views, or the words, that an asset holds, in pages: pages of long names may have fewer."""
-    names = deps.store.assets.names(deps.owner, asset, cursor, limit + 1)
-    count = max(1, sum(total <= models.PAGE_CHARACTERS for total in accumulate(map(len, names[:limit]))))
-    return models.Names(names=names[:count], next=cursor + count if len(names) > count else None)
+@router.get("")
+def list_assets(deps: Deps, owner: Caller, limit: Limit = models.PAGE, cursor: Cursor = None) -> Assets:
+    """List the assets, newest first, in pages. Names of views and words are given with each single asset."""
+    rows, following = deps.store.page("assets", owner, limit, cursor)
+    return Assets(assets=[Asset(**row) for row in rows], next=following)
 
 
-@router.get("/{asset}/content", response_class=Response, responses=FILE)
-def get_asset_content(asset: AssetId, request: Request, deps: Deps) -> Response:
+@router.get("/{asset}")
+def get_asset(asset: str, deps: Deps, owner: Caller) -> Asset:
+    """Get one asset, with the names of its views or its words if they are not very many."""
+    return deps.store.asset(owner, asset)
+
+
+@router.get("/{asset}/content", response_class=Response, responses=content_of(BINARY))
+def get_asset_content(asset: str, request: Request, deps: Deps, owner: Caller) -> Response:
     """Download an asset, or a range of its bytes."""
-    record = deps.store.assets.get(deps.owner, asset)
+    record = deps.store.asset(owner, asset)
     digest = record.id.removeprefix("sha256:")
-    return file_answer(request, record.path, record.bytes, digest, record.file_name)
+    return file_answer(request, record.file, record.bytes, digest, record.download_name)
 
 
-@router.patch("/{asset}", response_model=models.Asset, status_code=201, responses=KNOWN_ALREADY)
-async def change_pack(asset: AssetId, change: models.PackChange, deps: Deps) -> Response:
+@router.patch("/{asset}", status_code=201)
+async def change_pack(asset: str, change: models.PackChange, deps: Deps, owner: Caller) -> Asset:
     """Set the encoder or the text space of a feature pack: returns a new asset with the same features."""
-    record, new = await anyio.to_thread.run_sync(_retagged, asset, change, deps, limiter=deps.checks)
-    return _reply(record, 201 if new else 200)
-
-
-def _retagged(asset: str, change: models.PackChange, deps: AppState) -> tuple[AssetRecord, bool]:
-    source = deps.store.assets.get(deps.owner, asset, models.AssetKind.FEATURES)
-    require_whole(source.path, source.bytes)
-    limit = deps.settings.max_upload_bytes(models.AssetKind.FEATURES)
-    intake = AssetIntake(deps.store, deps.owner, models.AssetKind.FEATURES, limit)
-    try:
-        intake.open()
-        with deps.store.files.scratch() as scratch, source.path.open("rb") as pack:
-            header = scratch / "header"
-            arguments = [str(source.path), change.model_dump_json(exclude_none=True), str(header)]
-            result = run_sandboxed("service.tasks.rename", arguments, scratch, deps.check_limits)
-            if result is None:
-                raise too_slow(models.AssetKind.FEATURES, deps.check_limits)
-            if result.last["event"] == "invalid":
-                raise error_of(result.last["fault"])
-            if result.last["event"] != "valid":
-                raise ProcessDied(
-                    "asset", expected="a pack whose header is read", got="one that is not", hint="try again"
-                )
-            intake.feed(header.read_bytes())
-            pack.seek(HEADER_LENGTH_BYTES + int.from_bytes(pack.read(HEADER_LENGTH_BYTES), "little"))
-            while block := pack.read(BATCH):
-                intake.feed(block)
-        existing = intake.finish(None)
-        return (existing, False) if existing is not None else intake.keep(intake.check(deps.check_limits))
-    finally:
-        intake.close()
+    source = await in_thread(deps, deps.store.asset, owner, asset, "features")
+    async with open_scratch(deps) as folder:
+        draft, changes = folder / "pack", change.model_dump(exclude_none=True)
+        names = {str(source.file): source.client_name}
+        more = {"task": "retag", "changes": changes, "output": str(draft), "names": names}
+        content = await check_upload(deps, "features", source.file, folder, **more)
+        return await in_thread(deps, deps.store.add_asset, owner, "features", draft, content["sha256"], content)
 
 
 @router.delete("/{asset}", status_code=204)
-def delete_asset(asset: AssetId, deps: Deps) -> None:
+def delete_asset(asset: str, deps: Deps, owner: Caller) -> None:
     """Delete an asset. Refused (409) while a job or a lift refers to it."""
-    deps.store.assets.delete(deps.owner, asset)
-
-
-def shape(asset: AssetRecord) -> models.Asset:
-    """Return an asset as clients get it."""
-    path = f"/assets/{asset.id}"
-    links = {"self": path, "content": f"{path}/content"}
-    links |= {} if asset.kind is models.AssetKind.SPLATS else {"names": f"{path}/names"}
-    return models.Asset.model_validate({**vars(asset), "links": links})
-
-
-def _reply(asset: AssetRecord, status: int) -> Response:
-    location = {"Location": f"/assets/{asset.id}"}
-    return Response(shape(asset).model_dump_json(), status, media_type="application/json", headers=location)
+    deps.store.delete_asset(owner, asset)

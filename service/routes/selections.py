@@ -2,135 +2,130 @@
 
 from __future__ import annotations
 
-import base64
 import re
 import zlib
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Header, Path, Query, Response
-from fastapi.responses import JSONResponse
+from fastapi import APIRouter, Header, Query, Response
+from fastapi import Path as PathParameter
 
 from liftcore.errors import NotFound
-from service import models
-from service.content import cache_headers
+from service import models, selections
 from service.errors import Conflict, InvalidRequest, VersionMismatch
-from service.requests import JsonRoute
-from service.routes.lifts import ObjectId
-from service.routes.queries import NO_ENCODER, Ask, bits_of, query_request, scene_request
-from service.state import AppState, Deps
-from service.store.lifts import LiftRecord
-from service.store.selections import SelectionRecord, SplatSet
+from service.models import Lift, Selection, SelectionDetail
+from service.routes import Caller, Deps, Parts, cache_headers
+from service.routes.queries import NO_ENCODER, bits_text, query_request, scene_request
+from service.selections import SplatSet
+from service.store import Owner
 
-SELECTION_PATH = "/lifts/{lift}/selections/{selection}"
-SelectionId = Annotated[str, Path(pattern=r"^[0-9a-f]{16}$", description="the id of a selection of the lift")]
+PATH = "/lifts/{lift}/selections/{selection}"
+SelectionId = Annotated[
+    str, PathParameter(pattern=r"^[0-9a-f]{16}$", description="the id of a selection of the lift")
+]
+ObjectId = Annotated[
+    int, PathParameter(alias="object", ge=0, le=10**9, description="the id of an object of the lift")
+]
+WithBits = Annotated[bool, Query(description="with its splats, a bit for each of the lift's")]
 IfMatch = Annotated[
     str | None,
     Header(alias="If-Match", max_length=1000, description="the ETag of the version that is to be changed; else 412"),
 ]
 
-router = APIRouter(tags=["selections"], route_class=JsonRoute)
+router = APIRouter(tags=["selections"])
 
 
-@router.get("/lifts/{lift}/selections", response_model=models.Selections)
-def list_selections(lift: str, deps: Deps) -> models.Selections:
+@router.get("/lifts/{lift}/selections")
+def list_selections(lift: str, deps: Deps, owner: Caller) -> models.Selections:
     """List the selections of a lift, newest first."""
-    record = deps.store.lifts.get(deps.owner, lift)
-    selections = deps.store.selections.all(deps.owner, record.id)
-    return models.Selections(selections=[_summary(selection) for selection in selections])
+    record = deps.store.lift(owner, lift)
+    return models.Selections(selections=selections.list_selections(deps.store, record.id))
 
 
-@router.post("/lifts/{lift}/selections", response_model=models.SelectionDetail, status_code=201)
-def create_selection(lift: str, parameters: models.NewSelection, deps: Deps, ask: Ask) -> Response:
+@router.post("/lifts/{lift}/selections", status_code=201)
+def create_selection(
+    lift: str, parameters: models.NewSelection, response: Response, deps: Deps, owner: Caller
+) -> SelectionDetail:
     """Begin a selection, with the splats of an edit or with none. Questions name it as `sets=selection:ID`."""
-    record = deps.store.lifts.get(deps.owner, lift)
-    splats = _apply_edit(parameters.edit, record, deps, ask, bytes(-(-record.count // 8)))
-    selection = deps.store.selections.create(deps.owner, record.id, parameters.name, splats)
-    return _answer(selection, deps, 201, {"Location": f"/lifts/{record.id}/selections/{selection.id}"})
+    record = deps.store.lift(owner, lift)
+    splats = _edit(parameters.edit, record, deps, owner, bytes(-(-record.count // 8)))
+    selection = selections.create_selection(deps.store, owner, record.id, parameters.name, splats)
+    response.headers["Location"] = f"/lifts/{record.id}/selections/{selection.id}"
+    return _answer(selection, response, deps)
 
 
-@router.get(SELECTION_PATH, response_model=models.SelectionDetail)
+@router.get(PATH)
 def get_selection(
-    lift: str,
-    selection: SelectionId,
-    deps: Deps,
-    bits: Annotated[bool, Query(description="with its splats, a bit for each of the lift's")] = False,
-) -> Response:
-    """Return one selection: its content, and the steps of its history."""
-    record = deps.store.lifts.get(deps.owner, lift)
-    return _answer(deps.store.selections.get(deps.owner, record.id, selection), deps, bits=bits)
+    lift: str, selection: SelectionId, response: Response, deps: Deps, owner: Caller, bits: WithBits = False
+) -> SelectionDetail:
+    """Get one selection: its content, and the steps of its history."""
+    record = selections.get_selection(deps.store, deps.store.lift(owner, lift).id, selection)
+    text = bits_text(selections.bits_of_selection(deps.store, record)) if bits else None
+    return _answer(record, response, deps, text)
 
 
-@router.post(SELECTION_PATH + "/edits", response_model=models.SelectionDetail)
+@router.post(f"{PATH}/edits")
 def edit_selection(
-    lift: str, selection: SelectionId, parameters: models.EditRequest, deps: Deps, ask: Ask, match: IfMatch = None
-) -> Response:
+    lift: str, selection: SelectionId, edit: models.EditRequest, response: Response, deps: Deps, owner: Caller,
+    match: IfMatch = None,
+) -> SelectionDetail:  # fmt: skip
     """Add, take away, grow, shrink or set: a step of its history, which PATCH goes back."""
-    record = deps.store.lifts.get(deps.owner, lift)
-    before = deps.store.selections.get(deps.owner, record.id, selection, _versions(match))
-    splats = _apply_edit(parameters, record, deps, ask, deps.store.selections.bits(before))
+    record, versions = deps.store.lift(owner, lift), _versions(match)
+    before = selections.get_selection(deps.store, record.id, selection, versions)
+    splats = _edit(edit, record, deps, owner, selections.bits_of_selection(deps.store, before))
     try:  # the change is of the version that was read: one stored meanwhile is not overwritten
-        after = deps.store.selections.extend(deps.owner, record.id, selection, splats, frozenset({before.version}))
+        after = selections.extend_selection(deps.store, before, splats)
     except VersionMismatch as error:
-        if _versions(match) is not None:
+        if versions is not None:
             raise
-        hint = "send the edit again"
-        raise Conflict("selection", expected=error.expected, got="one that another edit changed", hint=hint) from None
-    return _answer(after, deps)
+        got, hint = "one that another edit changed", "send the edit again"
+        raise Conflict("selection", expected=error.expected, got=got, hint=hint) from None
+    return _answer(after, response, deps)
 
 
-@router.patch(SELECTION_PATH, response_model=models.SelectionDetail)
+@router.patch(PATH)
 def change_selection(
-    lift: str, selection: SelectionId, change: models.SelectionChange, deps: Deps, match: IfMatch = None
-) -> Response:
+    lift: str, selection: SelectionId, change: models.SelectionChange, response: Response, deps: Deps, owner: Caller,
+    match: IfMatch = None,
+) -> SelectionDetail:  # fmt: skip
     """Give it another name, or go to another step of its history: undo and redo."""
-    record = deps.store.lifts.get(deps.owner, lift)
-    changes = change.model_dump(exclude_unset=True, exclude_none=True)
-    after = deps.store.selections.change(deps.owner, record.id, selection, changes, _versions(match))
-    return _answer(after, deps)
+    changes, record = change.model_dump(exclude_unset=True, exclude_none=True), deps.store.lift(owner, lift)
+    after = selections.change_selection(deps.store, record.id, selection, changes, _versions(match))
+    return _answer(after, response, deps)
 
 
-@router.delete(SELECTION_PATH, status_code=204)
-def delete_selection(lift: str, selection: SelectionId, deps: Deps, match: IfMatch = None) -> Response:
-    """Forget a selection and its history."""
-    record = deps.store.lifts.get(deps.owner, lift)
-    deps.store.selections.delete(deps.owner, record.id, selection, _versions(match))
-    return Response(status_code=204)
+@router.delete(PATH, status_code=204)
+def delete_selection(lift: str, selection: SelectionId, deps: Deps, owner: Caller, match: IfMatch = None) -> None:
+    """Delete a selection and its history."""
+    selections.delete_selection(deps.store, deps.store.lift(owner, lift).id, selection, _versions(match))
 
 
-@router.patch("/lifts/{lift}/objects/{object}", response_model=models.ObjectLabel)
+@router.patch("/lifts/{lift}/objects/{object}")
 def change_object_label(
-    lift: str, object_id: ObjectId, change: models.ObjectLabelChange, deps: Deps, ask: Ask
+    lift: str, object_id: ObjectId, change: models.ObjectLabelChange, deps: Deps, owner: Caller
 ) -> models.ObjectLabel:
     """Give an object of a lift a name of your own, or hide it from lists; fields that are left out stay."""
-    record = deps.store.lifts.get(deps.owner, lift)
-    count = ask(scene_request("count_objects", record, deps)).header["count"]
+    record = deps.store.lift(owner, lift)
+    count = deps.queries.call(scene_request("count_objects", record, deps))["value"]["count"]
     if object_id >= count:
         raise NotFound("object", expected=f"one of the lift's {count} objects", got=str(object_id))
-    deps.store.selections.change_object_label(record.id, object_id, change.model_dump(exclude_unset=True))
-    name, is_hidden = deps.store.selections.object_labels(deps.owner, record.id).get(object_id, (None, False))
-    return models.ObjectLabel(id=object_id, name=name, hidden=is_hidden)
+    changes = change.model_dump(exclude_unset=True)
+    return selections.change_object_label(deps.store, owner, record.id, object_id, changes)
 
 
-def _apply_edit(
-    parameters: models.EditRequest | None, lift: LiftRecord, deps: AppState, ask: Ask, before: bytes
-) -> SplatSet:
+def _edit(edit: models.EditRequest | None, lift: Lift, deps: Parts, owner: Owner, before: bytes) -> SplatSet:
     """Apply an edit to a selection in the query process; without an edit, return it as it is."""
-    if parameters is None:
-        return SplatSet({"operation": "set"}, 0, None, before)
-    if parameters.query is None:
-        request = scene_request("edit", lift, deps) | NO_ENCODER
+    if edit is None:
+        return SplatSet({"operation": "set"}, 0, None, zlib.compress(before))
+    if edit.query is None:
+        work = scene_request("edit", lift, deps) | NO_ENCODER
+    elif edit.query.lift not in (None, lift.id):
+        raise InvalidRequest("query.lift", expected="the lift of the selection", got=str(edit.query.lift))
     else:
-        if parameters.query.lift not in (None, lift.id):
-            raise InvalidRequest(
-                "edit.query.lift", expected="the lift of the selection", got=str(parameters.query.lift)
-            )
-        request = query_request("edit", parameters.query, lift, deps)
-    edit = parameters.model_dump(mode="json", exclude={"query"}, exclude_none=True)
-    if parameters.query is not None:
-        edit["query"] = request["query"]
-    answer = ask(request | {"edit": edit, "before": bits_of(before)})
-    header = answer.header
-    return SplatSet(header["edit"], header["count"], header["box"], zlib.decompress(answer.body))
+        work = query_request("edit", edit.query, lift, deps, owner)
+    document: dict[str, Any] = edit.model_dump(mode="json", exclude={"query"}, exclude_none=True)
+    document |= {"query": work["query"]} if "query" in work else {}
+    value = deps.queries.call(work | {"edit": document, "before": bits_text(before)})["value"]
+    return SplatSet(value["edit"], value["count"], value["box"], zlib.compress(bytes.fromhex(value["bits"])))
 
 
 def _versions(match: str | None) -> frozenset[int] | None:
@@ -140,27 +135,6 @@ def _versions(match: str | None) -> frozenset[int] | None:
     return frozenset(int(digits) for digits in re.findall(r'"(\d{1,15})"', match))
 
 
-def _answer(
-    selection: SelectionRecord,
-    deps: AppState,
-    status: int = 200,
-    headers: dict[str, str] | None = None,
-    *,
-    bits: bool = False,
-) -> Response:
-    fields: dict[str, Any] = {"history": deps.store.selections.history(selection)}
-    fields["bits"] = base64.b64encode(deps.store.selections.bits(selection)).decode() if bits else None
-    document = models.SelectionDetail(**_summary(selection).model_dump(), **fields)
-    content = document.model_dump(mode="json")
-    return JSONResponse(content, status, headers=cache_headers(f'"{selection.version}"') | (headers or {}))
-
-
-def _summary(selection: SelectionRecord) -> models.ListedSelection:
-    path, parameters = (
-        f"/lifts/{selection.lift}/selections/{selection.id}",
-        f"lift={selection.lift}&sets=selection:{selection.id}",
-    )
-    links = {"self": path, "edits": f"{path}/edits", "query": f"/query?{parameters}"}
-    links |= {"splats": f"/query/splats?{parameters}", "selection": f"/query/selection?{parameters}"}
-    fields: dict[str, Any] = vars(selection) | {"links": links}
-    return models.ListedSelection(**{name: fields[name] for name in models.ListedSelection.model_fields})
+def _answer(selection: Selection, response: Response, deps: Parts, bits: str | None = None) -> SelectionDetail:
+    response.headers.update(cache_headers(f'"{selection.version}"'))
+    return selections.with_history(deps.store, selection, bits)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +13,11 @@ import httpx
 import pytest
 from playwright.sync_api import sync_playwright
 
-from service.app import assemble
+from service.app import create_app
+from service.commands.serve import bind, server_of
 from service.settings import ServiceSettings
-from service.store.store import Store
-from tests.crash.conftest import address_of, listening
-from tests.server import wait_for_end
+from service.store import Store
+from tests.server import until, wait_for_end
 from tests.tiny_scene import make_scene
 
 from .browser import Browser, Chromium, launch
@@ -24,37 +25,42 @@ from .browser import Browser, Chromium, launch
 
 @dataclass(frozen=True)
 class PageServer:
-    """Address, lift and store of a running service."""
+    """Address, lift and data directory of a running service."""
 
     address: str
     lift: str
-    store: Store
+    data: Path
 
 
 @contextlib.contextmanager
-def serving(data: Path, **settings: Any) -> Iterator[tuple[str, Store]]:
-    """A server on a free port: its address and its store."""
+def serving(data: Path, **settings: Any) -> Iterator[str]:
+    """A server in a thread and on a free port: its address."""
     server_settings = ServiceSettings.model_validate({"data": data, "disk_floor_bytes": 0, **settings})
-    store = Store.open(server_settings.data)
-    try:
-        with listening(assemble(server_settings, store), server_settings) as server:
-            yield "http://{}:{}".format(*address_of(server)), store
-    finally:
-        store.close()
+    addresses: list[str] = []
+    with contextlib.closing(Store(data)) as store, contextlib.closing(bind("127.0.0.1", 0)) as listener:
+        server = server_of(create_app(server_settings, store), server_settings, addresses.append)
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        thread.start()
+        try:
+            until(lambda: addresses)
+            yield addresses[0]
+        finally:
+            server.should_exit = True
+            thread.join()
 
 
 @pytest.fixture(scope="module")
 def server(chromium: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Iterator[PageServer]:
     folder, scene = tmp_path_factory.mktemp("page"), make_scene()
     (folder / "table.safetensors").write_bytes(scene.table)
-    with serving(folder / "data", encoder=f"table:{folder}/table.safetensors") as (address, store):
+    with serving(folder / "data", encoder=f"table:{folder}/table.safetensors") as address:
         with httpx.Client(base_url=address, timeout=60) as client:
             bodies = {kind: getattr(scene, kind) for kind in ("splats", "cameras", "features")}
             ids = {kind: client.put(f"/assets/{kind}", content=body).json()["id"] for kind, body in bodies.items()}
             order = ids | {"features": [ids["features"]], "settings": {"preset": "row-sum", "objects": True}}
             job = wait_for_end(client, client.post("/lift", json=order).headers["location"])
         assert job["state"] == "succeeded", job
-        yield PageServer(address, job["id"], store)
+        yield PageServer(address, job["id"], folder / "data")
 
 
 @pytest.fixture

@@ -54,7 +54,7 @@ def files(tmp_path: Path) -> dict[str, Path]:
 @pytest.fixture
 def empty(browser: Browser, files: dict[str, Path], tmp_path: Path) -> Iterator[Browser]:
     """The page of a service that has nothing yet."""
-    with serving(tmp_path / "data", encoder=f"table:{files['table']}") as (address, _):
+    with serving(tmp_path / "data", encoder=f"table:{files['table']}") as address:
         browser.window(1200, 800)
         browser.open(address)
         browser.until(OPEN)
@@ -197,7 +197,7 @@ def test_strangers_files_become_an_object_that_lights_up(browser: Browser, tmp_p
     """The whole way: files are dropped, a lift runs, a phrase lights up the object in 3D, and all is deleted."""
     scene, page = tmp_path / "still-life", browser
     write_still_life(scene, still_life(views=5, density=0.2))
-    with serving(tmp_path / "data", encoder=f"table:{scene}/text_table.safetensors") as (address, _):
+    with serving(tmp_path / "data", encoder=f"table:{scene}/text_table.safetensors") as address:
         page.window(1280, 800)
         page.open(address)
         page.until("globalThis.splatlift && !document.querySelector('#empty').hidden")

@@ -15,8 +15,7 @@ import pytest
 from safetensors import safe_open
 from safetensors.numpy import save
 
-from service.store.keys import Quota
-from service.store.owners import Scope
+from service.store import create_key, open_keys, revoke_key
 
 from .browser import Browser, Chromium, launch
 from .conftest import PageServer
@@ -508,8 +507,15 @@ def test_lines_to_take_away_ask_the_same(page: Browser) -> None:
     assert page.value(f"Promise.all({requests})") == [200] * 5
 
 
+def revoke(server: PageServer, key: str) -> None:
+    with open_keys(server.data) as keys:
+        revoke_key(keys, key)
+
+
 def test_page_asks_for_a_key_where_one_is_needed(page: Browser, server: PageServer) -> None:
-    key, secret = server.store.keys.create("page", frozenset({Scope.READ}), Quota())
+    """From here on the service is closed."""
+    with open_keys(server.data) as keys:
+        key, secret = create_key(keys, "page", "read")
     try:
         page.open(server.address)
         page.until("document.querySelector('#door').open")
@@ -523,12 +529,13 @@ def test_page_asks_for_a_key_where_one_is_needed(page: Browser, server: PageServ
         page.until("globalThis.splatlift && !document.querySelector('#empty').hidden")  # another's are not shown
         assert page.value("document.querySelector('#door').open") is False
     finally:
-        server.store.keys.revoke(key.id)
+        revoke(server, key.id)
 
 
 def test_shared_scene_is_asked_by_its_link_and_changed_by_nobody(browser: Browser, server: PageServer) -> None:
     """An owner makes the link on the page; who has it sees that scene, and nothing to change it with."""
-    owner, secret = server.store.keys.create("owner", frozenset({Scope.ADMIN}), Quota())
+    with open_keys(server.data) as keys:
+        owner, secret = create_key(keys, "owner", "admin")
     try:
         browser.open(f"{server.address}/?lift={server.lift}#key={secret}")
         browser.until(f"{READY} && !location.hash && document.querySelector('#whose').textContent === 'owner'")
@@ -548,9 +555,9 @@ def test_shared_scene_is_asked_by_its_link_and_changed_by_nobody(browser: Browse
             assert browser.value(visible_columns) is False, selector
         ask(browser, "lamp")
         assert columns(browser, AMBER)
-        server.store.keys.revoke(owner.id)
+        revoke(server, owner.id)
         browser.open(f"{server.address}/?again")
         browser.until("document.querySelector('#door').open")
     finally:
-        server.store.keys.revoke(owner.id)
+        revoke(server, owner.id)
         browser.value("sessionStorage.clear()")

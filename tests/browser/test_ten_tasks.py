@@ -37,7 +37,7 @@ def empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     (example / "features.safetensors.zst").write_bytes(zstandard.compress(scene.features))
     (tmp_path / "table.safetensors").write_bytes(scene.table)
     monkeypatch.setattr(operations, "EXAMPLE", example)
-    with serving(tmp_path / "data", encoder=f"table:{tmp_path}/table.safetensors") as (address, _):
+    with serving(tmp_path / "data", encoder=f"table:{tmp_path}/table.safetensors") as address:
         yield address
 
 

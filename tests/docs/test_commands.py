@@ -124,7 +124,7 @@ def test_every_preset_is_documented() -> None:
 
 def test_documented_settings_of_the_service_exist_and_have_that_default() -> None:
     sentence = dict(re.findall(r"^\| `SPLATLIFT_([A-Z_]+)` \| (.*?) \|", text(SERVICE), flags=re.MULTILINE))
-    assert {"DATA", "HOST", "KEYS", "TEXT_SPACES"} <= sentence.keys()
+    assert {"DATA", "HOST", "TEXT_SPACES"} <= sentence.keys()
     for name, documented_default in sentence.items():
         default = ServiceSettings.model_fields[name.lower()].get_default(call_default_factory=True)
         assert documented_default.split(" (")[0].strip("`") == ("-" if default in (None, (), "") else str(default)), (

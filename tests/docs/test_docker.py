@@ -17,7 +17,7 @@ from typing import Any
 import yaml
 
 from service.settings import ServiceSettings
-from tests.crash.service_process import ServiceProcess
+from tests.server import Server
 
 from .readme import ROOT, text
 
@@ -92,7 +92,7 @@ def test_the_port_is_the_services_own_everywhere() -> None:
 def test_health_check_tells_a_live_server_from_a_dead_one(tmp_path: Path) -> None:
     program, *command = health_check()
     assert program == "python"
-    with ServiceProcess(tmp_path, "--behaviour", "answer") as service:
+    with Server(tmp_path / "data") as service:
         port = os.environ | {"SPLATLIFT_PORT": str(service.client.base_url.port)}
         command_line = [sys.executable, *command]
         assert subprocess.run(command_line, env=port, capture_output=True, timeout=60, check=False).returncode == 0

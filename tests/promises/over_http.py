@@ -88,7 +88,15 @@ VALUES: dict[str, Any] = {
     "text": ["apple"], "view": "left", "example": "splat:1", "words": ["apple"], "name": "a name", "x": 1, "y": 1,
     "level": 0, "region": 0, "operation": "grow", "kind": "cameras",
 }  # fmt: skip
-PLACES = {"object": "0", "selection": "0" * 16, "share": "0" * 12, "kind": "cameras"}
+PLACES = {
+    "object": "0",
+    "selection": "0" * 16,
+    "share": "0" * 12,
+    "kind": "cameras",
+    "output": "scores",
+    "form": "labels",
+    "file": "splats",
+}
 
 
 def operations_of(client: Any) -> list[tuple[str, str, dict[str, Any]]]:

@@ -43,14 +43,13 @@ def test_a_scene_is_found_by_what_its_files_are(folder: Path, tmp_path: Path) ->
     assert scene.features.name == "grids.safetensors"
     assert scene.encoder == "lvis"
     assert zipfile.ZipFile(scene.cameras).namelist() == ["cameras.bin", "images.bin"]
-    assert scene.phrases == ("the cat", "the fish")  # what the view shows
+    assert scene.phrases == ("the cat",)  # the first of its objects
     assert scene.views == ("v",)
     assert scene.truth is not None
-    mask = scene.truth.mask_of("the fish", "v")
-    assert mask is not None and mask.tolist() == [[False, False, True]]
-    same_mask = scene.truth.mask_of("A Fish", "v")
-    assert same_mask is not None and np.array_equal(same_mask, mask)
-    assert scene.truth.mask_of("the unknown", "v") is None
+    masks = {"v": np.array([[True, False, True]])}
+    assert scene.truth.mean_iou("A Fish", masks) == scene.truth.mean_iou("the fish", masks) == 0.5
+    assert scene.truth.mean_iou("the unknown", masks) is None
+    assert scene.truth.name_of(masks) == "cat"
 
 
 def test_cameras_go_up_with_the_frame_of_their_splats(folder: Path, tmp_path: Path) -> None:
@@ -72,9 +71,6 @@ def test_phrases_of_the_user_come_first_and_a_table_is_the_encoder(folder: Path,
     assert scene.phrases == ("a whale",)
     assert scene.encoder == f"table:{folder / 'text_table.safetensors'}"
     assert (scene.cameras.name, scene.features.name) == ("cameras.json", "features.safetensors")
-    assert scene.other_packs == ("grids.safetensors",)
-    other = find_scene(folder, ["a whale"], tmp_path, folder / "grids.safetensors")
-    assert (other.features.name, other.other_packs) == ("grids.safetensors", ("features.safetensors",))
 
 
 def test_what_is_missing_is_named(folder: Path, tmp_path: Path) -> None:
@@ -107,4 +103,4 @@ def test_a_pack_that_names_no_text_space_has_the_words_of_the_table_beside_it(fo
     bare = find_scene(folder, (), tmp_path / "bare")
     assert (bare.phrases, bare.text_space) == ((), "")  # without a text space the demo queries nothing
     (folder / "text_table.safetensors").touch()
-    assert find_scene(folder, (), tmp_path / "worded").phrases == ("the cat", "the fish")
+    assert find_scene(folder, (), tmp_path / "worded").phrases == ("the cat",)

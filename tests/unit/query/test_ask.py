@@ -30,7 +30,6 @@ from liftcore.query.terms import Example, Pixel, PixelBox, Region, SplatTerm, St
 from liftcore.query.threshold import find_threshold
 from liftcore.scene.cameras import Cameras
 from liftcore.values.lift_file import save_lift
-from service.query_worker import open_scene
 from tests.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH
 
 COUNT = 3 * SPLATS_A_CLUSTER
@@ -404,8 +403,7 @@ def test_a_lift_with_other_rows_than_its_splats_answers_nothing(
     with pytest.raises(InvalidLift, match="a row for each of its"):
         ask(Scene(tmp_path / "cropped.lift"), Query.of((SplatTerm(0),)))  # scores alone, without places
     splats.write_bytes(b"".join(some_rows(tmp_path / "s.ply", np.arange(len(lift.features)) > 0, suffix)))
-    request = {"lift": str(path), "splats": str(splats), "cameras": str(tmp_path / "c.json")}
     with pytest.raises(InvalidLift, match="a row for each of its"):
-        open_scene(request)
+        Scene(path, splats=splats, cameras=tmp_path / "c.json")
     (tmp_path / "s.ply").write_bytes(splats.read_bytes())  # another file stands there now: only positions are lost
     ask(Scene(path), Query.of((SplatTerm(0),)))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
 import zipfile
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -26,6 +28,7 @@ from liftcore.values.pack import read_features
 from service import tasks
 from service.errors import Misconfigured
 from service.models import AssetKind
+from service.process import Reporter
 from service.settings import ServiceSettings, require_encoder_files
 from tests.scenes import random_splats
 
@@ -281,8 +284,9 @@ def test_a_file_in_the_place_of_another_kind_is_named_for_what_it_is_everywhere(
         if name != "table":
             with pytest.raises(Misconfigured, match=re.escape(identity.name)):
                 require_encoder_files(settings.model_copy(update={"encoder": f"table:{path}"}))
-        for kind in (*AssetKind, "lift"):
+        for kind in (*get_args(AssetKind), "lift"):
             if kind != name:
-                reply = tasks.check(kind, str(path))
-                assert reply["event"] == "invalid" and identity.name in reply["fault"]["got"], (name, kind)
-                assert identity.kind is None or f"/{identity.kind}" in reply["fault"]["hint"], (name, kind)
+                with pytest.raises(InvalidInput) as error:
+                    tasks.check({"kind": kind, "file": str(path)}, Reporter(io.BytesIO()))
+                assert identity.name in error.value.got, (name, kind)
+                assert identity.kind is None or f"/{identity.kind}" in error.value.hint, (name, kind)

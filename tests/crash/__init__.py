@@ -1,1 +1,0 @@
-"""Promises of the service when processes die, stop or are canceled, or the disk is full."""
