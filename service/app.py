@@ -11,19 +11,21 @@ import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from datetime import UTC, datetime
+from http import HTTPStatus
 from typing import Any
 
 import anyio
 from fastapi import FastAPI
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
-from starlette.datastructures import MutableHeaders
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from liftcore import __version__
 from liftcore.files import PhotoIndexes
 from service import errors
 from service.auth import Auth, with_keys
-from service.errors import PROBLEM, REQUEST_ID, TooLarge, answer_to
+from service.errors import PROBLEM, REQUEST_ID, answer_to
 from service.models import BODY_BYTES
 from service.process import Children
 from service.query_client import QueryClient
@@ -117,7 +119,7 @@ class Recorder:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        start, status, sent_bytes = time.monotonic(), 0, 0
+        start, status, sent_bytes, is_replaced = time.monotonic(), 0, 0, False
         values = [value for name, value in scope["headers"] if name == b"x-request-id"]
         is_sane = len(values) == 1 and SANE_ID.fullmatch(values[0])
         request_id = values[0].decode("ascii") if is_sane else secrets.token_hex(16)
@@ -125,8 +127,6 @@ class Recorder:
         async def send_marked(message: Message) -> None:
             nonlocal status, sent_bytes
             if message["type"] == "http.response.start":
-                if message["status"] == 413 and (b"content-type", b"text/plain; charset=utf-8") in message["headers"]:
-                    raise TooLarge("body", expected=f"at most {BODY_BYTES} bytes", got="more")  # of the framework
                 status = message["status"]
                 message = {**message, "headers": list(message.get("headers", ()))}
                 headers = MutableHeaders(raw=message["headers"])
@@ -136,9 +136,22 @@ class Recorder:
             await send(message)
             sent_bytes += len(message.get("body", b""))
 
+        async def send_problem(message: Message) -> None:
+            """Send a problem in place of a refusal of the framework in plain text."""
+            nonlocal is_replaced
+            if message["type"] == "http.response.start" and message["status"] >= HTTPStatus.BAD_REQUEST:
+                headers = Headers(raw=message["headers"])
+                if headers["content-type"].startswith("text/plain"):
+                    is_replaced = True
+                    range_header = {"Content-Range": headers["content-range"]} if "content-range" in headers else None
+                    error = HTTPException(message["status"], headers=range_header)
+                    await answer_to(error, scope["path"][:200])(scope, receive, send_marked)
+            if not is_replaced:
+                await send_marked(message)
+
         token = REQUEST_ID.set(request_id)
         try:
-            await self._app(scope, receive, send_marked)
+            await self._app(scope, receive, send_problem)
         except Exception as error:
             if status:  # the answer has begun: the connection is closed
                 raise

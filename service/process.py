@@ -256,9 +256,12 @@ class Children:
         """End every child."""
         self.stopping.set()
         with self._lock:
-            children, self._spare = [*self._running, *([self._spare] if self._spare else [])], None
-        for child in children:
+            children, spare, self._spare = [*self._running], self._spare, None
+        for child in children:  # `run` closes them
             child.end()
+        if spare is not None:
+            spare.end()
+            spare.close()
 
     def _take(self) -> Child:
         """Return the spare, or a new child while none lives."""

@@ -1,0 +1,174 @@
+"""Children and the query process: orders, limits, kills from outside, and nothing that is left."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.errors import Busy, Fault, InvalidRequest
+from service.process import Children
+from service.query_client import QueryClient
+from tests.server import until
+from tests.tiny_scene import cameras_json, ply, splat_rows
+
+from .bombs import cameras, splats
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def children() -> Iterator[Children]:
+    children = Children()
+    yield children
+    children.stop()
+    assert not running()
+
+
+def running() -> list[int]:
+    """Return the ids of child processes of this one that run service.process or service.query_worker."""
+    ids = []
+    for task in Path("/proc/self/task").iterdir():
+        for child in (task / "children").read_text().split():
+            command = Path(f"/proc/{child}/cmdline").read_bytes()
+            if b"service.process" in command or b"service.query_worker" in command:
+                ids.append(int(child))
+    return ids
+
+
+def check_of(folder: Path, kind: str, content: bytes, **more: Any) -> dict[str, Any]:
+    """Return the order of the check of a file."""
+    file = folder / "upload"
+    file.write_bytes(content)
+    return {
+        "task": "check",
+        "kind": kind,
+        "file": str(file),
+        "scratch": str(folder),
+        "names": {str(file): kind},
+    } | more
+
+
+def kill(signal_number: int) -> None:
+    for process in running():
+        os.kill(process, signal_number)
+
+
+def test_child_of_a_check_is_used_again(children: Children, tmp_path: Path) -> None:
+    for _ in range(3):
+        result = children.check(check_of(tmp_path, "cameras", cameras_json()), 600, "cameras")
+        assert (result["suffix"], result["counts"]["views"]) == (".json", 3)
+    before = running()
+    with pytest.raises(Fault) as error:
+        children.check(check_of(tmp_path, "cameras", b"{"), 600, "cameras")
+    assert error.value.fault["status"] == 422 and str(tmp_path) not in json.dumps(error.value.fault)
+    assert running() == before
+
+
+def test_order_beyond_its_time_or_memory_is_refused(children: Children, tmp_path: Path) -> None:
+    order = check_of(tmp_path, "splats", ply(np.repeat(splat_rows(), 20_000, axis=0)))
+    with pytest.raises(InvalidRequest, match="it took more than"):
+        children.check(order, 0.0, "splats")
+    with pytest.raises((Fault, InvalidRequest)):
+        children.check(order | {"memory": 1 << 20}, 600, "splats")
+    assert children.check(check_of(tmp_path, "cameras", cameras_json()), 600, "cameras")["counts"]["views"] == 3
+
+
+def test_children_that_are_killed_or_stopped_are_replaced(children: Children, tmp_path: Path) -> None:
+    for signal_number in (signal.SIGKILL, signal.SIGSTOP):
+        until(children.is_ready)
+        kill(signal_number)
+        assert children.check(check_of(tmp_path, "cameras", cameras_json()), 600, "cameras")["counts"]["views"] == 3
+
+
+def test_reason_ends_an_order_with_its_group(children: Children, tmp_path: Path) -> None:
+    until(children.is_ready)
+    order = check_of(tmp_path, "cameras", cameras_json()) | {"task": "no such task"}
+    began = time.monotonic()
+    ending = children.run(order | {"task": "check"}, 600, why_end=lambda: "it is canceled")
+    if ending.last is None:  # the check may have been faster than the first look
+        assert ending.reason == "it is canceled"
+    assert time.monotonic() - began < 300 and children.count() == 0
+
+
+def test_stopped_children_take_no_order(tmp_path: Path) -> None:
+    children = Children()
+    children.stop()
+    with pytest.raises(Busy):
+        children.check(check_of(tmp_path, "cameras", cameras_json()), 600, "cameras")
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"), [("splats", name) for name in splats()] + [("cameras", name) for name in cameras()]
+)
+def test_bomb_is_refused_with_reasons(children: Children, tmp_path: Path, kind: str, name: str) -> None:
+    content = (splats() if kind == "splats" else cameras())[name]
+    with pytest.raises(Fault) as error:
+        children.check(check_of(tmp_path, kind, content, memory=1 << 30), 600, kind)
+    fault = error.value.fault
+    assert fault["status"] == 422 and fault["expected"] and fault["got"] and len(json.dumps(fault)) < 5000
+
+
+# The query process
+
+
+REQUEST = {
+    "operation": "query", "lift": "/nowhere/lift", "splats": "/nowhere/splats", "cameras": "/nowhere/cameras",
+    "kernel": "3dgs", "world": {}, "names": {"/nowhere": "the data"}, "encoder": None, "encoder_version": None,
+    "query": {"like": ["splat:1"]}, "view": None, "top": 1, "links": {},
+}  # fmt: skip
+
+
+@pytest.fixture
+def queries() -> Iterator[QueryClient]:
+    client = QueryClient("lvis", 600)
+    yield client
+    client.stop()
+
+
+def fault_of_request(queries: QueryClient) -> dict[str, Any]:
+    with pytest.raises(Fault) as error:
+        queries.call(REQUEST)
+    return error.value.fault
+
+
+def test_query_process_that_is_killed_or_stopped_is_replaced(queries: QueryClient) -> None:
+    fault = fault_of_request(queries)
+    assert fault["status"] in (404, 422) and "/nowhere/lift" not in json.dumps(fault)
+    for signal_number in (signal.SIGKILL, signal.SIGSTOP):
+        kill(signal_number)
+        assert fault_of_request(queries) == fault
+    thread = threading.Thread(target=lambda: (time.sleep(0.05), kill(signal.SIGKILL)))
+    thread.start()
+    assert fault_of_request(queries) == fault  # killed while it answers: the next one does
+    thread.join()
+    until(queries.revive)
+
+
+def test_calls_beyond_the_line_or_after_the_stop_are_refused(queries: QueryClient) -> None:
+    outcomes = list[type[BaseException] | None]()
+
+    def ask() -> None:
+        try:
+            queries.call(REQUEST)
+        except (Fault, Busy) as error:
+            outcomes.append(type(error))
+
+    kill(signal.SIGSTOP)  # nobody is answered until it is replaced
+    threads = [threading.Thread(target=ask) for _ in range(30)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert set(outcomes) <= {Fault, Busy} and Fault in outcomes
+    queries.stop()
+    with pytest.raises(Busy):
+        queries.call(REQUEST)
