@@ -13,6 +13,7 @@ import anyio
 from fastapi import APIRouter, Body, Depends, Query, Request, Response
 from fastapi.responses import FileResponse
 from pydantic import BaseModel
+from starlette.convertors import Convertor
 
 from liftcore.files import PhotoIndexes
 from service.models import CURSOR, PAGE, Key
@@ -27,6 +28,19 @@ Limit = Annotated[int, Query(ge=1, le=PAGE, description="number of items to list
 Cursor = Annotated[str | None, Query(pattern=CURSOR, description="the `next` of the page before")]
 Number = Annotated[int, Query(ge=0, le=10**9)]
 Endpoint = TypeVar("Endpoint", bound=Callable[..., Any])
+
+
+class OneOf(Convertor[str]):
+    """The part of a path that is one of some names; others are no such route."""
+
+    def __init__(self, *names: str) -> None:
+        self.regex = "|".join(names)
+
+    def convert(self, value: str) -> str:
+        """Return the name."""
+        return value
+
+    to_string = convert
 
 
 @dataclass(frozen=True)

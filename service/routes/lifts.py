@@ -9,6 +9,7 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as PathParameter
 from fastapi.responses import StreamingResponse
 from starlette.background import BackgroundTask
+from starlette.convertors import register_url_convertor
 
 from liftcore.errors import NotFound
 from liftcore.files import in_camera_orientation
@@ -22,6 +23,7 @@ from service.routes import (
     Deps,
     Limit,
     Number,
+    OneOf,
     Parts,
     cache_headers,
     content_of,
@@ -271,7 +273,10 @@ def _nodes(operation: str, lift: Lift, deps: Parts, owner: Owner, options: model
     return work | {"first": options.cursor, "count": options.limit, "head": head}
 
 
-@router.get("/lifts/{lift}/{file}", responses=content_of(BINARY, NPY), response_class=Response)
+register_url_convertor("file", OneOf("splats", "colours"))
+
+
+@router.get("/lifts/{lift}/{file:file}", responses=content_of(BINARY, NPY), response_class=Response)
 def get_viewer_file(
     lift: str, file: Literal["splats", "colours"], request: Request, deps: Deps, owner: Caller, what: Layer = "pca"
 ) -> Response:

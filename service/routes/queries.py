@@ -16,6 +16,7 @@ from fastapi import Path as PathParameter
 from fastapi import Query as Parameter
 from fastapi.responses import FileResponse
 from starlette.background import BackgroundTask
+from starlette.convertors import register_url_convertor
 
 from liftcore import Query, __version__
 from liftcore.text import encoder_file
@@ -38,7 +39,7 @@ from service.models import (
     Words,
     WordsAnswer,
 )
-from service.routes import BINARY, Caller, Deps, Parts, cache_headers, content_of, get_and_post, unchanged
+from service.routes import BINARY, Caller, Deps, OneOf, Parts, cache_headers, content_of, get_and_post, unchanged
 from service.selections import bits_of_selection, get_selection, object_labels
 from service.settings import encoder_label, encoder_spec, encoder_version
 from service.store import SERVICE, Owner
@@ -69,6 +70,8 @@ def _list(outputs: dict[Any, tuple[str, str]]) -> str:
     return "\n".join(f"- `{name}`: {text}" for name, (_, text) in outputs.items())
 
 
+register_url_convertor("output", OneOf(*OUTPUTS))
+register_url_convertor("form", OneOf(*WORD_OUTPUTS))
 router = APIRouter(tags=["queries"])
 
 
@@ -255,7 +258,7 @@ def segment(words: SegmentRequest, request: Request, deps: Deps, owner: Caller) 
 
 
 @router.post(
-    "/query/segment/{form}", responses=content_of(NPY, PNG), response_class=Response,
+    "/query/segment/{form:form}", responses=content_of(NPY, PNG), response_class=Response,
     description=f"Return splats or a view by their words, of POST /query/segment.\n\n{_list(WORD_OUTPUTS)}",
 )  # fmt: skip
 def segment_output(form: WordOutput, words: SegmentRequest, request: Request, deps: Deps, owner: Caller) -> Response:
@@ -325,7 +328,7 @@ def name_example(words: NearestWordsRequest, request: Request, deps: Deps, owner
 
 
 @get_and_post(
-    router, "/query/{output}", QuestionParameters, Question, response_class=Response,
+    router, "/query/{output:output}", QuestionParameters, Question, response_class=Response,
     responses=content_of(NPY, PNG, BINARY) | {200: content_of(NPY, PNG, BINARY)[200] | {"model": ObjectsAnswer}},
     description=f"Return an output of a question, or in a body of a question with vectors.\n\n{_list(OUTPUTS)}",
 )  # fmt: skip
