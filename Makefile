@@ -14,7 +14,7 @@ CUDA_TORCH_PIP ?=
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 export PIP_ROOT_USER_ACTION = ignore
 
-.PHONY: demo test check coverage kernels soak contract load gpu wheel lint format serve web bench docs sbom setup clean
+.PHONY: demo test check coverage kernels contract gpu wheel lint format serve web bench docs sbom setup clean
 
 demo: $(READY)  ## the whole job through the real service; SCENE=DIR takes a scene of your own, ASK=TEXT a question
 	$(BIN)/splatlift demo --out "$(OUT)" $(if $(SCENE),--scene "$(SCENE)") $(if $(ASK),--ask "$(ASK)")
@@ -43,14 +43,8 @@ coverage: $(READY) kernels  ## how much of the code the unit tests run, by file;
 kernels: $(READY)
 	$(BIN)/python -m tests.kernels
 
-soak: $(READY)  ## the long proofs of docs/service.md: prints their figures, takes an hour or so
-	$(BIN)/python -m tests.benchmarks.soak
-
 contract: $(READY)  ## every operation against the OpenAPI document, without keys and with them; some minutes
 	$(BIN)/python -m tests.contract
-
-load: $(READY)  ## what clients wait for under load (docs/service.md): prints figures, takes some minutes
-	$(BIN)/python -m tests.benchmarks.load
 
 # Another torch than the lock's build brings the triton that it was made with: that one stays.
 gpu:  ## all that a card is for: CUDA's torch, conformance, speed, accuracy, gsplat beside; prints figures

@@ -231,7 +231,7 @@ class Job(BaseModel):
     parameters: dict[str, Any] = Field(description="the table of a lift's words; budget_s of a trade-off, its labels")
     plan: Plan | None = Field(description="of a lift, before its first view is rasterized; of the latest attempt")
     progress: Progress | None
-    problem: Problem | None
+    problem: dict[str, Any] | None = Field(description="why it failed: a problem, as of an error")
     request_id: str | None = Field(description="the X-Request-ID of the request that made it")
     created: Seconds
     started: Seconds | None
