@@ -26,7 +26,6 @@ from liftcore.models import (
     Viewpoint,
     takes,
 )
-from service.errors import Problem
 
 # Limits of one file or request; a body has at most `BODY_BYTES`
 BODY_BYTES = 1 << 20

@@ -9,7 +9,7 @@ import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict, SettingsError
@@ -80,10 +80,10 @@ class ServiceSettings(BaseSettings):
 def variables() -> Iterator[tuple[str, str, str]]:
     """Yield the environment variable, default and description of each setting, in order."""
     for name, field in ServiceSettings.model_fields.items():
-        default = cast("Any", field.default)
+        default = field.default
         text = "not set" if default in (None, (), "") else str(default)
-        if name.endswith("bytes"):
-            text = f"{default} ({int(default) // MiB} MiB)"
+        if isinstance(default, int) and name.endswith("bytes"):
+            text = f"{default} ({default // MiB} MiB)"
         yield f"SPLATLIFT_{name.upper()}", text, field.description or ""
 
 

@@ -34,7 +34,7 @@ class OneOf(Convertor[str]):
     """The part of a path that is one of some names; others are no such route."""
 
     def __init__(self, *names: str) -> None:
-        self.regex = "|".join(names)
+        vars(self)["regex"] = "|".join(names)
 
     def convert(self, value: str) -> str:
         """Return the name."""

@@ -380,6 +380,9 @@ class StoreMachine(RuleBasedStateMachine):
 
 
 StoreMachine.TestCase.settings = settings(
-    max_examples=25, stateful_step_count=20, deadline=None, suppress_health_check=[*HealthCheck]
+    max_examples=25,
+    stateful_step_count=20,
+    deadline=None,
+    suppress_health_check=(HealthCheck.too_slow, HealthCheck.filter_too_much),
 )
 TestStore = StoreMachine.TestCase
