@@ -307,7 +307,7 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path) -> DemoScene
         raise InvalidInput("--scene", expected="a folder", got=f"nothing at {folder}")
     splats = identify(folder).accepted_over_http
     packs = [path for path in visible_files(folder, "*.safetensors") if identify(path).kind == "features"]
-    for kind, paths in (("splats", splats), ("features", packs)):
+    for kind, paths in (("features", packs), ("splats", splats)):
         if not paths:
             expected = f"{kind} that the service takes"
             raise InvalidInput(f"{kind} of {folder.name}", expected=expected, got="none")
