@@ -42,7 +42,7 @@ SERVICE_COMMANDS = {  # modules of another package, which are entry points in sp
     "serve": "run the HTTP service",
     "view": "show a lift on the service's page, until Ctrl-C",
     "keys": "manage the API keys of the HTTP service",
-    "store": "repair the HTTP service's data directory",
+    "store": "back up, verify and clean the HTTP service's data",
 }
 WITH_ACTIONS = ("keys", "pack", "store")  # whose actions take the shared options
 INTERNAL_ERROR = 1

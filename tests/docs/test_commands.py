@@ -84,7 +84,7 @@ def test_commands_within_sentences_and_tables_parse(document: str, capsys: pytes
 
 def test_commands_that_errors_and_hints_name_exist() -> None:
     documented = {words for folder in ("liftcore", "service") for words in _named_in_sentences(ROOT / folder)}
-    assert {"pack", "keys", "store"} <= {words[0] for words in documented}
+    assert {"pack", "keys"} <= {words[0] for words in documented}
     for words in documented:
         parser = _commands()[words[0]]
         nested = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
