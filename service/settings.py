@@ -59,7 +59,7 @@ class ServiceSettings(BaseSettings):
     encoder: str = Field(
         "lvis",
         description="text encoder for lifts of its own text space and, if you set it, for those whose text space has "
-        "no entry in SPLATLIFT_TEXT_SPACES: lvis, minilm, table:FILE, open_clip:MODEL...",
+        "no entry in SPLATLIFT_TEXT_SPACES: lvis, table:FILE, open_clip:MODEL...",
     )
     text_spaces: dict[str, str] = Field(
         {}, description="text space -> text encoder, in the same notation (JSON object)"

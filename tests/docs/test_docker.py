@@ -16,6 +16,7 @@ from typing import Any
 
 import yaml
 
+from service.models import BODY_BYTES
 from service.settings import ServiceSettings
 from tests.server import Server
 

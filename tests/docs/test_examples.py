@@ -37,7 +37,6 @@ from liftcore.values.pack import read_features, write_pack
 from service import models
 from service.commands.demo import find_scene
 from service.errors import Problem
-from service.routes import assets, jobs, lifts, operations, queries, selections
 from tests.run_lengths import sam_records
 from tests.tiny_scene import HEIGHT, WIDTH, WORDS, cameras_document, codebook, colmap_zip, labels, make_scene
 
