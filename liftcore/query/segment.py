@@ -213,7 +213,7 @@ def _by_nodes(scene: OpenedLift, labels: np.ndarray, weights: np.ndarray, parts:
     Args:
         labels: [P] i32, NO_WORD for none. weights: [P] f64. parts: [n, N] bool, the nodes that words name.
     """
-    if scene.node is None or scene.node_parents is None:
+    if scene.node is None or scene.node_parents is None or not len(scene.node_parents):  # no ray met a region
         return labels
     output = labels.copy()
     for node in sorted(np.flatnonzero(parts.any(axis=0)).tolist(), key=lambda n: len(scene.node_path(n))):

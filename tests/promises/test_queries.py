@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.promises.tiny_files import photo_vectors, scene_with, write_lift, write_table
-from tests.tiny_scene import HEIGHT, SPLATS_A_CLUSTER, labels
+from tests.promises.tiny_files import photo_vectors, scene_with, write_files, write_lift, write_table
+from tests.tiny_scene import HEIGHT, SPLATS_A_CLUSTER, labels, ply, splat_rows
 
 CLUSTER = np.repeat(np.arange(3), SPLATS_A_CLUSTER)
 
@@ -180,3 +180,15 @@ def test_selections_by_hand_are_asked_as_they_are(lift: Path) -> None:
 def test_notation_of_no_example_is_refused(notation: str, lift: Path) -> None:
     with pytest.raises(lc.InvalidQuery, match="like"):
         lc.Scene(lift).ask(lc.Query(like=[notation]))
+
+
+def test_splats_that_no_region_meets_are_named_by_no_word(tmp_path: Path) -> None:
+    files = write_files(tmp_path)
+    rows = splat_rows()
+    rows[:, 7:10] = 88.0  # log scales: each splat is larger than any float
+    files["splats"].write_bytes(ply(rows))
+    settings = lc.LiftSettings.of(preset="tikhonov")
+    lift = lc.lift_files(files["splats"], files["cameras"], [files["features"]], settings)
+    scene = lc.Scene(lift, splats=files["splats"], cameras=files["cameras"])
+    words = scene.segment(["apple", "lamp"], encoder=lc.open_encoder(f"table:{files['table']}"))
+    assert words.summary.none == words.summary.splats == len(rows)
