@@ -12,6 +12,7 @@ import fcntl
 import importlib
 import json
 import logging
+import math
 import os
 import resource
 import signal
@@ -40,13 +41,6 @@ Message = dict[str, Any]
 log = logging.getLogger(__name__)
 
 
-def is_stopped(process: int) -> bool:
-    """Return True if a process is stopped (SIGSTOP), as Linux reports it: it lives and does not respond."""
-    with contextlib.suppress(OSError):
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] in ("T", "t")
-    return False
-
-
 def log_lines(pipe: IO[bytes], name: str) -> None:
     """Log each line that a process prints, in a thread, until it has ended."""
 
@@ -68,32 +62,36 @@ class Ending(NamedTuple):
 
 
 class Child:
-    """A child process, from the server's side. Any thread may `end` it."""
+    """A child process, from the server's side: it leads a group. Any thread may `end` it.
 
-    def __init__(self, threads: int) -> None:
+    Args:
+        module: that it runs. arguments: of it, behind the lifeline. environment: beside the server's.
+    """
+
+    def __init__(self, module: str, *arguments: str, **environment: str) -> None:
         lifeline, self._lifeline = os.pipe()
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "service.process", str(lifeline)],
+                [sys.executable, "-m", module, str(lifeline), *arguments],
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, pass_fds=[lifeline],
-                start_new_session=True,
-                env=os.environ | {"OMP_NUM_THREADS": f"{threads}", "OPENBLAS_NUM_THREADS": f"{threads}"},
+                start_new_session=True, env=os.environ | environment,
             )  # fmt: skip
         finally:
             os.close(lifeline)
+        assert self._process.stdin is not None and self._process.stdout is not None
         assert self._process.stderr is not None
-        log_lines(self._process.stderr, "a child")
+        self.input, self.output = self._process.stdin, self._process.stdout
+        log_lines(self._process.stderr, module)
         self._ending = threading.Lock()
         self.orders = 0
 
     def messages(self, order: Message) -> Iterator[Message]:
         """Send an order; yield what the child says, up to its last message or its end."""
-        assert self._process.stdin is not None and self._process.stdout is not None
         self.orders += 1
         with contextlib.suppress(BrokenPipeError):  # it died as a spare
-            self._process.stdin.write(json.dumps(order).encode() + b"\n")
-            self._process.stdin.flush()
-        for line in self._process.stdout:
+            self.input.write(json.dumps(order).encode() + b"\n")
+            self.input.flush()
+        for line in self.output:
             if not line.endswith(b"\n"):  # a killed child may leave half a line
                 return
             message = json.loads(line)
@@ -106,8 +104,41 @@ class Child:
         return self._process.poll() is None and not self.is_stopped()
 
     def is_stopped(self) -> bool:
-        """Return True if it was stopped (SIGSTOP)."""
-        return is_stopped(self._process.pid)
+        """Return True if it was stopped (SIGSTOP), as Linux reports it: it lives and does not respond."""
+        with contextlib.suppress(OSError):
+            state = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()[0]
+            return state in ("T", "t")
+        return False
+
+    @contextlib.contextmanager
+    def watched(self, why_end: Callable[[], str]) -> Iterator[list[str]]:
+        """End it during the block for a reason, or if it stays stopped.
+
+        Args:
+            why_end: called a few times a second; returns a reason, or an empty text.
+
+        Yields:
+            A list that gets the reason.
+        """
+        reasons, is_done, stopped_since = list[str](), threading.Event(), math.inf
+
+        def watch() -> None:
+            nonlocal stopped_since
+            while not reasons and not is_done.wait(TICK_SECONDS):
+                now = time.monotonic()
+                stopped_since = min(stopped_since, now) if self.is_stopped() else math.inf
+                reason = STOPPED if now - stopped_since > STOPPED_SECONDS else why_end()
+                if reason:
+                    reasons.append(reason)
+                    self.end()
+
+        watcher = threading.Thread(target=watch, daemon=True)
+        watcher.start()
+        try:
+            yield reasons
+        finally:
+            is_done.set()
+            watcher.join()
 
     def end(self) -> int:
         """Kill the group; return the status, negative for a signal. No process of it is left after this.
@@ -131,9 +162,9 @@ class Child:
 
     def close(self) -> None:
         """Close its pipes, after its end."""
-        for pipe in (self._process.stdin, self._process.stdout):
+        for pipe in (self.input, self.output):
             with contextlib.suppress(BrokenPipeError):
-                pipe.close() if pipe is not None else None
+                pipe.close()
 
 
 def is_last(message: Message) -> bool:
@@ -150,8 +181,11 @@ class Children:
 
     def __init__(self, threads: int = 1) -> None:
         self.stopping = threading.Event()
-        self._threads, self._lock, self._running = threads, threading.Lock(), set[Child]()
-        self._spare: Child | None = Child(threads)
+        self._threads, self._lock, self._running = f"{threads}", threading.Lock(), set[Child]()
+        self._spare: Child | None = self._start()
+
+    def _start(self) -> Child:
+        return Child("service.process", OMP_NUM_THREADS=self._threads, OPENBLAS_NUM_THREADS=self._threads)
 
     def count(self) -> int:
         """Return the number of children that work."""
@@ -181,41 +215,26 @@ class Children:
         Raises:
             Busy: the server stops, or there is no room for a process.
         """
-        child = self._take()
-        deadline, reason, is_done, last = time.monotonic() + seconds, "", threading.Event(), None
+        child, last = self._take(), None
+        deadline = time.monotonic() + seconds
 
-        def watch() -> None:
-            nonlocal reason
-            stopped_since: float | None = None
-            while not is_done.wait(TICK_SECONDS):
-                now = time.monotonic()
-                stopped_since = (stopped_since or now) if child.is_stopped() else None
-                if self.stopping.is_set():
-                    reason = "the server stops"
-                elif now > deadline:
-                    reason = f"it took more than {seconds:g} s"
-                elif stopped_since is not None and now - stopped_since > STOPPED_SECONDS:
-                    reason = STOPPED
-                else:
-                    reason = why_end()
-                if reason:
-                    child.end()
-                    return
+        def reason_now() -> str:
+            if self.stopping.is_set():
+                return "the server stops"
+            return f"it took more than {seconds:g} s" if time.monotonic() > deadline else why_end()
 
-        watcher = threading.Thread(target=watch, daemon=True)
-        watcher.start()
+        reasons = list[str]()
         try:
-            for message in child.messages(order):
-                if is_last(message):
-                    last = message
-                else:
-                    take(message)
+            with child.watched(reason_now) as reasons:
+                for message in child.messages(order):
+                    if is_last(message):
+                        last = message
+                    else:
+                        take(message)
         finally:
-            is_done.set()
-            watcher.join()
             with self._lock:
                 self._running.discard(child)
-            if last is not None and reusable and not reason and child.orders < ORDERS:
+            if last is not None and reusable and not reasons and child.orders < ORDERS:
                 self._keep(child)
                 status = 0
             else:
@@ -225,8 +244,8 @@ class Children:
         if last is not None:
             return Ending(last)
         ending = f"signal {-status}" if status < 0 else f"status {status}"
-        was_killed = reason == STOPPED or (not reason and status == -signal.SIGKILL)
-        return Ending(None, reason or f"its process ended with {ending}", was_killed)
+        was_killed = reasons == [STOPPED] or (not reasons and status == -signal.SIGKILL)
+        return Ending(None, "".join(reasons) or f"its process ended with {ending}", was_killed)
 
     def check(self, order: Message, seconds: float, argument: str) -> Message:
         """Return the result of an order that a request waits for. After a kill from outside it is sent once more.
@@ -274,7 +293,7 @@ class Children:
                 child.close()
                 child = None
             try:
-                child = child or Child(self._threads)
+                child = child or self._start()
             except OSError as error:
                 got = f"none: {error.strerror}"
                 raise Busy("server", expected="room for a process", got=got, hint="send it again") from None
@@ -287,7 +306,7 @@ class Children:
             if not self.stopping.is_set() and (self._spare is None or not self._spare.is_alive()):
                 dead, self._spare = self._spare, child
                 with contextlib.suppress(OSError):  # no room for a process: the next order tries again
-                    self._spare = child or Child(self._threads)
+                    self._spare = child or self._start()
                 child = dead
         if child is not None:
             child.end()

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import json
 import logging
-import os
-import subprocess
-import sys
 import threading
 import time
 from contextlib import suppress
 from typing import Any
 
 from service.errors import Busy, Fault, ProcessDied, TimedOut
-from service.process import is_stopped, log_lines
+from service.process import Child
 
 WAITING = 16  # calls that wait or run
 TRIES = 3  # of a call whose process is killed
@@ -41,38 +38,15 @@ class QueryClient:
         self._encoder, self._seconds = encoder, seconds
         self._turn, self._places = threading.Lock(), threading.Semaphore(WAITING)
         self._is_stopped, self.starts, self.calls = False, 0, 0
-        self._process = self._start()
+        self._child = self._start()
 
-    def _start(self) -> subprocess.Popen[bytes]:
+    def _start(self) -> Child:
         self.starts += 1
-        lifeline, self._lifeline = os.pipe()
-        try:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "service.query_worker", str(lifeline), self._encoder],
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, pass_fds=[lifeline],
-                start_new_session=True, env=ENVIRONMENT | os.environ,
-            )  # fmt: skip
-        finally:
-            os.close(lifeline)
-        assert process.stderr is not None
-        log_lines(process.stderr, "the query process")
-        return process
-
-    def _end(self) -> None:
-        self._process.kill()
-        self._process.wait()
-        for pipe in (self._process.stdin, self._process.stdout):
-            with suppress(BrokenPipeError):
-                pipe.close() if pipe is not None else None
-        os.close(self._lifeline)
-
-    def is_alive(self) -> bool:
-        """Return True if the process lives and is not stopped."""
-        return self._process.poll() is None and not is_stopped(self._process.pid)
+        return Child("service.query_worker", self._encoder, **ENVIRONMENT)
 
     def revive(self) -> bool:
         """Return True if the process lives; else start a new one, unless a call is about to."""
-        if self.is_alive():
+        if self._child.is_alive():
             return True
         if self._turn.acquire(blocking=False):
             try:
@@ -84,9 +58,10 @@ class QueryClient:
     def stop(self) -> None:
         """End the process and its query; waiting calls are refused."""
         self._is_stopped = True
-        self._process.kill()
+        self._child.end()
         with self._turn:
-            self._end()
+            self._child.end()
+            self._child.close()
 
     def call(self, request: dict[str, Any]) -> dict[str, Any]:
         """Send a request to the worker and return its answer: a ``value``, or the ``content``, empty if it is a file.
@@ -113,16 +88,17 @@ class QueryClient:
     def _restart(self) -> None:
         if self._is_stopped:
             raise Busy("query", expected="a running server", got="one that stops", hint="ask the next one")
-        self._end()
+        self._child.end()
+        self._child.close()
         try:
-            self._process = self._start()
+            self._child = self._start()
         except OSError as error:
             got = f"none: {error.strerror}"
             raise Busy("query", expected="room for a process", got=got, hint="try again soon") from None
 
     def _ask(self, line: bytes, deadline: float) -> dict[str, Any]:
         for _ in range(TRIES):  # it may have been killed while idle, which is not the fault of this call
-            if self._is_stopped or not self.is_alive():
+            if self._is_stopped or not self._child.is_alive():
                 self._restart()
             answer = self._exchange(line, deadline)
             if answer is not None:
@@ -137,25 +113,17 @@ class QueryClient:
         raise Busy("query", expected="a process that answers", got="one that was ended", hint="try again soon")
 
     def _exchange(self, line: bytes, deadline: float) -> dict[str, Any] | None:
-        """Return the answer of the process; None if it died, or was killed at the deadline."""
-        process = self._process
-        assert process.stdin is not None and process.stdout is not None
-        timer = threading.Timer(max(0.0, deadline - time.monotonic()), process.kill)
-        timer.start()
-        try:
-            with suppress(OSError):
-                process.stdin.write(line)
-                process.stdin.flush()
-                header = process.stdout.readline()
-                if header.endswith(b"\n"):
-                    answer = json.loads(header)
-                    count = answer.get("bytes", 0)
-                    content = process.stdout.read(count)
-                    if len(content) == count:
-                        return answer | {"content": content}
-        finally:
-            timer.cancel()
-            timer.join()
-        process.kill()
-        process.wait()
+        """Return the answer of the process; None if it died, or was ended at the deadline."""
+        child = self._child
+        with child.watched(lambda: "it is late" if time.monotonic() > deadline else ""), suppress(OSError):
+            child.input.write(line)
+            child.input.flush()
+            header = child.output.readline()
+            if header.endswith(b"\n"):
+                answer = json.loads(header)
+                count = answer.get("bytes", 0)
+                content = child.output.read(count)
+                if len(content) == count:
+                    return answer | {"content": content}
+        child.end()
         return None
