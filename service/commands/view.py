@@ -41,9 +41,7 @@ ENDING_SECONDS = 10.0  # for a server that was interrupted to end
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    parser.add_argument(
-        "lift", type=Path, help="a lift (.safetensors), whose splats and cameras are where they were"
-    )
+    parser.add_argument("lift", type=Path, help="a lift (.safetensors), whose splats and cameras are where they were")
     parser.add_argument("--port", type=int, default=0, help="the port of this machine; 0 picks a free one")
     parser.add_argument("--no-browser", action="store_true", help="print the address, and open nothing")
 

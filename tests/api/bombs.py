@@ -7,6 +7,7 @@ import json
 import struct
 import zipfile
 import zlib
+from functools import cache
 from typing import Any
 
 from tests.tiny_scene import cameras_document, cameras_json
@@ -21,6 +22,7 @@ def vertices(count: bytes, properties: bytes = b"property float x\n") -> bytes:
     return PLY + b"element vertex " + count + b"\n" + properties + b"end_header\n"
 
 
+@cache
 def splats() -> dict[str, bytes]:
     """Bombs for the reader of splats."""
     return {
@@ -38,6 +40,7 @@ def splats() -> dict[str, bytes]:
     }
 
 
+@cache
 def cameras() -> dict[str, bytes]:
     """Bombs for the readers of cameras."""
     return camera_documents() | camera_archives()
