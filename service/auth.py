@@ -17,8 +17,7 @@ import anyio
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from liftcore.errors import SplatliftError
-from service.errors import Forbidden, InvalidRequest, Misdirected, TooLarge, Unauthorized, answer_to
+from service.errors import Forbidden, InvalidRequest, Misdirected, TooLarge, Unauthorized
 from service.models import BODY_BYTES, Key
 from service.settings import ServiceSettings
 from service.store import SERVICE, Owner, Store, admit
@@ -36,7 +35,7 @@ SCHEME = {"type": "http", "scheme": "bearer", "description": f"A key with one or
 
 
 class Auth:
-    """ASGI middleware: put the `Owner` and the `Key` into the scope's state, or answer with a refusal."""
+    """ASGI middleware: put the `Owner` and the `Key` into the scope's state, or raise a refusal."""
 
     def __init__(self, app: ASGIApp, store: Store, settings: ServiceSettings) -> None:
         self._app, self._store = app, store
@@ -47,25 +46,22 @@ class Auth:
         self._lookups = anyio.CapacityLimiter(4)  # threads, separate from those of slow routes
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Check a request and pass it on."""
+        """Check a request and pass it on; `service.app.Recorder` answers refusals."""
         if scope["type"] == "http":
-            try:
-                owner, key = await self._check(scope)
-            except (SplatliftError, OSError) as error:
-                await answer_to(error, scope["path"][:200])(scope, receive, send)
-                return
+            headers, line = Headers(scope=scope), f"{scope['method']} {scope['path']}"
+            self._require_host(scope["method"], headers)
+            owner, key = await self._caller(headers, line)
+            require_length(headers, line)
             scope.setdefault("state", {}).update(owner=owner, key=key)
         await self._app(scope, receive, send)
 
-    async def _check(self, scope: Scope) -> tuple[Owner, Key | None]:
-        headers, line = Headers(scope=scope), f"{scope['method']} {scope['path']}"
-        reads = READS.fullmatch(line) is not None
-        self._require_host(scope["method"], headers)
-        length = headers.get("content-length", "0")
-        if "transfer-encoding" in headers and "content-length" in headers:  # a proxy may see another end (RFC 9112)
-            raise InvalidRequest("Content-Length", expected="either it or Transfer-Encoding", got="both")
-        if not UPLOAD.fullmatch(line) and length.isdigit() and int(length[:20]) > BODY_BYTES:
-            raise TooLarge("body", expected=f"at most {BODY_BYTES} bytes", got="more")
+    async def _caller(self, headers: Headers, line: str) -> tuple[Owner, Key | None]:
+        """Return who sends a request, and the key.
+
+        Raises:
+            Unauthorized: the service wants a key, and none of its keys came.
+            Forbidden: the key may not do that.
+        """
         if OPEN.fullmatch(line):
             return NOBODY, None
         authorization = headers.getlist("authorization")
@@ -80,7 +76,7 @@ class Auth:
                 got="one that is not valid" if authorization else "none",
                 hint="the operator makes keys with splatlift keys create",
             )  # fmt: skip
-        require_scope(key, "read" if reads else "write", scope["path"])
+        require_scope(key, line)
         return Owner(key.id, "admin" in key.scopes.split(), json.dumps(key.lifts)), key
 
     def _require_host(self, method: str, headers: Headers) -> None:
@@ -107,17 +103,31 @@ class Auth:
         return authority != "" and (authority == host or host_name(authority) in self._allowed_hosts)
 
 
-def require_scope(key: Key, needed: str, path: str) -> None:
-    """Require that a key may do what needs that scope at that path.
+def require_scope(key: Key, line: str) -> None:
+    """Require that a key may do what needs a scope: of a request's method and path.
 
     Raises:
         Forbidden: it may not.
     """
-    scopes = key.scopes.split()
-    is_shared = "shared" in scopes and needed == "read" and SHARED.fullmatch(path)
+    scopes, needed = key.scopes.split(), "read" if READS.fullmatch(line) else "write"
+    is_shared = "shared" in scopes and needed == "read" and SHARED.fullmatch(line.partition(" ")[2])
     if not (needed in scopes or "admin" in scopes or is_shared):
         expected, got = f"a key with the scope {needed}", f"one with {', '.join(scopes)}"
         raise Forbidden("Authorization", expected=expected, got=got)
+
+
+def require_length(headers: Headers, line: str) -> None:
+    """Require that the head of a request announces no more than may come.
+
+    Raises:
+        InvalidRequest: the end of the body is told in two ways.
+        TooLarge: it is too long for JSON.
+    """
+    length = headers.get("content-length", "0")
+    if "transfer-encoding" in headers and "content-length" in headers:  # a proxy may see another end (RFC 9112)
+        raise InvalidRequest("Content-Length", expected="either it or Transfer-Encoding", got="both")
+    if not UPLOAD.fullmatch(line) and length.isdigit() and int(length[:20]) > BODY_BYTES:
+        raise TooLarge("body", expected=f"at most {BODY_BYTES} bytes", got="more")
 
 
 def host_name(host: str) -> str | None:

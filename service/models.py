@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, computed_field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, computed_field
 from pydantic_core import PydanticCustomError
 
 from liftcore import Answer, CoveringRegion, LiftSettings, Objects, Picture, Query, SceneObject, WorldFrame
@@ -59,13 +59,6 @@ SettingText = Annotated[str, Field(min_length=1, max_length=WORD_CHARACTERS, pat
 Next = Annotated[str | None, Field(description="the cursor of the page after this one; null at the end")]
 NextNumber = Annotated[int | None, Field(description="likewise")]
 BODY_CONFIG = ConfigDict(defer_build=False)  # of models of bodies, which FastAPI builds at the start
-
-
-def _canonical(settings: Any) -> Any:
-    """Return settings of a lift, complete and checked; too many are refused before they are parsed."""
-    if not isinstance(settings, dict) or len(settings) > SETTINGS:
-        raise PydanticCustomError("settings", "{expected}", {"expected": f"an object of at most {SETTINGS} settings"})
-    return settings
 
 
 # Assets
@@ -131,8 +124,9 @@ class LiftInputs(Body):
     features: Annotated[list[AssetId], Field(min_length=1, max_length=PACKS, fail_fast=True)] = Field(
         description=f"feature packs, each counts once; at most {PACKS}"
     )
-    settings: Annotated[dict[str, Any], BeforeValidator(_canonical)] = Field(
+    settings: dict[str, Any] = Field(
         {},
+        max_length=SETTINGS,
         description="settings of the lift; others take the values of the preset and the quality",
         examples=[{"preset": "default", "quality": "balanced"}],
     )

@@ -192,12 +192,12 @@ class Children:
         return len(self._running)
 
     def is_ready(self) -> bool:
-        """Return True if the spare lives, or none is due; else start a new one."""
+        """Return True if the spare lives, or is at a check; else start a new one."""
         with self._lock:
-            is_alive = self._spare is not None and self._spare.is_alive()
-        if not is_alive:
+            is_ready = bool(self._running) if self._spare is None else self._spare.is_alive()
+        if not is_ready:
             self._keep(None)
-        return is_alive
+        return is_ready
 
     def run(
         self, order: Message, seconds: float, take: Callable[[Message], None] = lambda _: None,
@@ -216,6 +216,8 @@ class Children:
             Busy: the server stops, or there is no room for a process.
         """
         child, last = self._take(), None
+        if not reusable:
+            self._keep(None)  # for checks beside it, and for the next job
         deadline = time.monotonic() + seconds
 
         def reason_now() -> str:
@@ -232,8 +234,6 @@ class Children:
                     else:
                         take(message)
         finally:
-            with self._lock:
-                self._running.discard(child)
             if last is not None and reusable and not reasons and child.orders < ORDERS:
                 self._keep(child)
                 status = 0
@@ -241,6 +241,8 @@ class Children:
                 status = child.end()
                 child.close()
                 self._keep(None)
+            with self._lock:
+                self._running.discard(child)
         if last is not None:
             return Ending(last)
         ending = f"signal {-status}" if status < 0 else f"status {status}"

@@ -46,22 +46,10 @@ from service.settings import encoder_version
 EDITED = "edited"  # the name of a selection during an edit; names of questions are hexadecimal
 SCENES = 2  # lifts that are kept open
 CACHE_BYTES = 256 << 20  # of answers and views that are kept
-ENTRY_BYTES = 2 << 10  # of a cache entry, or of an object in it, beside its arrays
+ENTRY_BYTES = 2 << 10  # of what is no array in a cached value: an object, a word
 PIPE_BYTES = 256 << 10  # of an answer in the pipe; a larger one is a file, so that a slow client keeps no memory
 WORD_COSINES = 1 << 31  # of splats times words: about a minute and a half on one core
 MASK_PIXELS = 1 << 26  # of all views of an export: a minute, as for the largest picture
-ARRAYS = (
-    "scores",
-    "has_feature",
-    "selected",
-    "numbers",
-    "labels",
-    "margin",
-    "attention",
-    "row_sums",
-    "mask",
-    "features",
-)
 # Files of an answer and of many words, by operation: what `Scene.blocks_of` calls them
 WORD_FILES = {"labels": "splat_labels", "map": "labels", "picture": "picture"}
 SPLATS_FILES = {"object": "object", "scores": "coloured"}
@@ -87,10 +75,10 @@ class Cache:
 
 
 def bytes_of(value: Any) -> int:
-    """Return about the bytes that an answer, its objects, a view of it, or a list of objects takes."""
-    arrays = sum(getattr(getattr(value, name, None), "nbytes", 0) for name in ARRAYS)
-    lists = sum(len(getattr(value, name, ())) for name in ("objects", "nodes", "relations"))
-    return ENTRY_BYTES * (1 + lists) + arrays
+    """Return about the bytes of an answer, a view of it, or a list of objects: its arrays, and so much an item."""
+    fields = [*vars(value).values(), *(getattr(value, "__pydantic_private__", None) or {}).values()]
+    items = itertools.chain.from_iterable(field if isinstance(field, tuple | list) else (field,) for field in fields)
+    return sum(getattr(item, "nbytes", ENTRY_BYTES) for item in items)
 
 
 class Answers:

@@ -606,7 +606,8 @@ def require_database(root: Path) -> None:
     Raises:
         Misconfigured: there are files without it.
     """
-    if not (root / DATABASE).exists() and any(file for name in ("blobs", "lifts") for file in root.glob(f"{name}/*")):
+    is_new = not ((root / DATABASE).exists() and (root / DATABASE).stat().st_size)
+    if is_new and any(file for name in ("blobs", "lifts") for file in root.glob(f"{name}/*")):
         hint = "put its newest backup there, or name another directory with --data"
         expected = f"the {DATABASE} that the files beside it were stored with"
         raise Misconfigured("data", expected=expected, got=f"none in {root}", hint=hint)

@@ -150,9 +150,10 @@ def test_objects_are_there_without_words_and_words_name_them(client: httpx.Clien
         middle = entry["centre"][0]
         assert entry["name"] == WORDS[round(middle / 1.2) + 1] and entry["score"] > 0.9
         assert entry["box"]["low"][0] < middle < entry["box"]["high"][0]
-    ply = client.get(f"{lift['links']['objects']}/1/splats").content
+    splats = {"lift": lift["id"], "sets": "object:1"}
+    ply = client.get("/query/splats", params=splats).content
     assert f"element vertex {SPLATS_A_CLUSTER}\n".encode() in ply[:200]
-    assert_problem(client.get(f"{lift['links']['objects']}/77/splats"), 404)
+    assert_problem(client.get("/query/splats", params=splats | {"sets": "object:77"}))
     assert_problem(client.get(lift["links"]["objects"], params={"encoder": "nowhere"}), 422)
 
 

@@ -217,7 +217,7 @@ def test_uploaded_table_answers_and_completes(client: httpx.Client, lift: dict[s
     assert (problem["argument"], problem["nearest"]) == ("text.0", ["boat"])
     words = client.get("/query/words", params=fields | {"text": "no"}).json()
     assert [entry["word"] for entry in words["words"]] == ["novel"]
-    assert set(client.get("/query/words", params=fields).json()["here"]) == {"fruit", "novel", "light"}
+    assert set(client.get("/query/words", params=fields).json()["scene_words"]) == {"fruit", "novel", "light"}
     assert_problem(client.get("/query", params=fields | {"text": "light", "encoder": "default"}), 422)
     assert_problem(client.get("/query", params=fields | {"text": "light", "table": lift["splats"]}), 422)
 
@@ -237,7 +237,7 @@ def test_table_of_an_order_has_the_words_of_its_lift(client: httpx.Client, order
 def test_every_splat_has_its_word(client: httpx.Client, lift: dict[str, Any], table: str) -> None:
     body = {"lift": lift["id"], "table": table, "view": "middle"}
     answer = client.post("/query/segment", json=body).json()
-    values = {entry["word"]: entry["value"] for entry in answer["found"]}
+    values = {entry["word"]: entry["value"] for entry in answer["named_words"]}
     assert set(values) == {"fruit", "novel", "light"}
     labels = array(client.post("/query/segment/labels", json=body).content)
     assert (labels.dtype, (labels == 0).sum()) == (np.int32, answer["none"])
