@@ -141,7 +141,6 @@ class LiftInputs(Body):
 class LiftRequest(LiftInputs):
     """Inputs of a lift, with the words for its queries: assets that are uploaded."""
 
-    model_config = BODY_CONFIG
     table: AssetId | None = Field(
         None, description="an uploaded text table, with the words of the lift's queries; else those of its text space"
     )
@@ -169,7 +168,6 @@ class Labels(Body):
 class TradeoffRequest(LiftInputs):
     """Inputs of a trade-off: lifts of these assets, each with another preset or quality level."""
 
-    model_config = BODY_CONFIG
     budget_s: Annotated[float, Field(ge=10, le=86_400), NoBoolean] = Field(
         600, description="seconds for all runs; the exact run is made in any case"
     )
@@ -424,7 +422,6 @@ class Question(Query, LiftQuestion):
 class QuestionParameters(Question):
     """A question to a lift in the query of a request, which holds no vectors and no camera."""
 
-    model_config = BODY_CONFIG
     like: Notations = _query_field("like")  # pyright: ignore[reportIncompatibleVariableOverride]
     unlike: Notations = _query_field("unlike")  # pyright: ignore[reportIncompatibleVariableOverride]
     camera: ClassVar[None] = None  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -433,6 +430,7 @@ class QuestionParameters(Question):
 class Words(LiftQuestion, Body):
     """Many words at once."""
 
+    model_config = BODY_CONFIG
     words: Annotated[list[Text], Field(max_length=WORDS, fail_fast=True)] | None = Field(
         None, description="words to find, each once; all words of a table if left out"
     )
@@ -447,14 +445,12 @@ class SegmentRequest(Words, Viewpoint):
 class NamedQuestion(Question):
     """A question to a lift, and what files call its answer."""
 
-    model_config = BODY_CONFIG
     name: Name | None = Field(None, description="name of the label; by default the words of the question")
 
 
 class ExportRequest(Words):
     """The content of a ZIP: the answers of questions, every splat's best word, or the objects of the lift."""
 
-    model_config = BODY_CONFIG
     of: Literal["questions", "words", "objects"] = Field("objects", description="the labels of the content")
     questions: Annotated[list[NamedQuestion], Field(max_length=QUESTIONS, fail_fast=True)] = Field(
         [], description="for content `questions`: each is a class of the labels"
@@ -467,7 +463,6 @@ class ExportRequest(Words):
 class NearestWordsRequest(Words):
     """Example for which the nearest words are requested."""
 
-    model_config = BODY_CONFIG
     example: AnExample = Field(description="the example")
     top: Annotated[int, Field(ge=1, le=1000), NoBoolean] = Field(5, description="number of words")
 
@@ -490,7 +485,6 @@ class RenderRequest(Picture):
 class RenderParameters(RenderRequest):
     """A picture of a lift's scene, by a view of it."""
 
-    model_config = BODY_CONFIG
     camera: ClassVar[None] = None  # pyright: ignore[reportIncompatibleVariableOverride]
 
 

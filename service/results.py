@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ from service.models import Key, Lift, NewShare, Share, Tradeoff
 from service.store import LIFTS, VALID, VISIBLE, Owner, Store, create_key, require_whole, sync
 
 MOST_SHARES = 100  # valid keys of one lift
-BY_HAND = "set by hand"  # reason of the rendering in a lift's plan: the setting was not auto
 
 
 def change_lift(store: Store, owner: Owner, lift: str, changes: dict[str, Any]) -> Lift:
@@ -68,21 +66,6 @@ def changed_copy(lift: Lift, draft: Path) -> bool:
     return True
 
 
-def order_of(metadata: Mapping[str, Any], cameras: str | None = None) -> dict[str, Any]:
-    """Return the order that a lift's file records: what it was made of.
-
-    Args:
-        metadata: of the lift. cameras: an asset in place of the cameras that it names.
-    """
-    files = (metadata["splats"], metadata["cameras"], *metadata["features"])
-    splats, own_cameras, *packs = [f"sha256:{file['sha256']}" for file in files]
-    settings, plan = dict(metadata["settings"]), metadata["diagnostics"].get("plan")
-    if isinstance(plan, Mapping) and BY_HAND not in str(plan.get("rendering", BY_HAND)):
-        settings["antialiased"] = "auto"  # the lift records the resolved value
-    inputs = {"splats": splats, "cameras": cameras or own_cameras, "features": packs}
-    return {"kind": "lift", **inputs, "settings": settings, "parameters": {}}
-
-
 def find_lift_file(store: Store, owner: Owner, sha256: str) -> Lift | None:
     """Return the lift of a file with that digest; None if there is none."""
     rows = store.rows(f"{LIFTS} WHERE {VISIBLE} AND sha256 = :sha256 LIMIT 1", sha256=sha256, **vars(owner))
@@ -101,8 +84,11 @@ def add_lift(store: Store, owner: Owner, draft: Path, content: dict[str, Any], c
         InvalidLift: it does not fit them.
     """
     metadata = content["metadata"]
-    order = order_of(metadata, cameras)
-    splats = store.asset(owner, order["splats"], "splats")
+    files = (metadata["splats"], metadata["cameras"], *metadata["features"])
+    splats_id, own_cameras, *packs = [f"sha256:{file['sha256']}" for file in files]
+    order = {"kind": "lift", "splats": splats_id, "cameras": cameras or own_cameras, "settings": metadata["settings"],
+             "features": [pack for pack in packs if store.find_asset(owner, pack)], "parameters": {}}  # fmt: skip
+    splats = store.asset(owner, splats_id, "splats")
     if splats.counts["splats"] != content["count"]:
         got = f"{content['count']} for {splats.counts['splats']} splats"
         raise InvalidLift("lift", expected="a row for each splat", got=got)
@@ -113,7 +99,6 @@ def add_lift(store: Store, owner: Owner, draft: Path, content: dict[str, Any], c
         raise NotFound(error.argument, expected=error.expected, got=error.got, hint=hint) from None
     if seen_views is not None and metadata["views"]:
         require_pairs(metadata["views"], seen_views)
-    order["features"] = [pack for pack in order["features"] if store.find_asset(owner, pack)]
     sync(draft)
     now = time.time()
     with store.write():
