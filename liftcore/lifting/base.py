@@ -83,10 +83,6 @@ class LiftSteps(Protocol[Weights]):
         """
         ...
 
-    def discount_distance(self, W: Weights) -> Weights:
-        """Multiply W by the factors of Huber's loss."""
-        ...
-
     def solve(self, W: Weights, clusters: RegionObjects | None) -> tuple[Tensor, SplatSupport]:
         """Solve for X [P, F] in closed form; given clusters, prepare their features for `aggregate`."""
         ...

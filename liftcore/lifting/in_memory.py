@@ -30,7 +30,6 @@ from liftcore.solve.consensus import mask_consensus
 from liftcore.solve.diagnostics import ViewMeasures, measure_samples
 from liftcore.solve.directions import region_totals
 from liftcore.solve.least_squares import AllRays, reference, refine
-from liftcore.solve.loss import huber_factors
 from liftcore.solve.mask_edges import weaken_edges
 from liftcore.solve.membership import Memberships, RegionGroups, memberships
 from liftcore.solve.objects import NodeVectors, RegionObjects, region_objects
@@ -141,10 +140,6 @@ class InMemory(LiftSteps[SceneWeights]):
         )  # fmt: skip
         result = replace(W.with_factors(reweighting.factors), consensus=None, reweighting=reweighting)
         return result, reweighting.reliability
-
-    def discount_distance(self, W: SceneWeights) -> SceneWeights:
-        keywords = {"means": self.splats.means, "threads": self.threads}
-        return W.with_factors(huber_factors(W.weights, W.geometry.codebook, self.timings.progress, **keywords))
 
     def solve(self, W: SceneWeights, clusters: RegionObjects | None) -> tuple[Tensor, SplatSupport]:
         solution = solve(

@@ -158,8 +158,8 @@ def region_weights(
         splats, cameras, views, preset, progress, threads, settings: as in `lift`. All views count, whatever the
             settings' coverage. A label on several levels is one region a level.
         reweight: False: W by geometry alone, which reads no feature. True: W of the solve of `lift`, reweighted by
-            the features of other views (``robust_steps``, ``consensus``, ``reliability``, ``loss``); sums of rows
-            stay the same except with ``loss=huber``.
+            the features of other views (``robust_steps``, ``consensus``, ``reliability``); sums of rows stay
+            the same.
 
     Returns:
         W on the CPU, a row a splat: in memory, or in mapped files if it is large. With E the views' codebooks,

@@ -206,7 +206,7 @@ def reweigh(
 ) -> tuple[Weights, float | None]:
     """Reweight W for the solve; return it and the median reliability of regions, None if that is off.
 
-    Consensus, the robust steps and Huber's loss each multiply the entries of W by factors.
+    Consensus and the robust steps multiply the entries of W by factors.
 
     Args:
         masks: True if any view has masks.
@@ -222,9 +222,6 @@ def reweigh(
     if settings.robust_steps:
         with timings.stage("robust"):
             W, reliability = steps.reweight(W, levels_apart)
-    if settings.loss == "huber":
-        with timings.stage("loss"):
-            W = steps.discount_distance(W)
     return W, reliability
 
 

@@ -13,7 +13,6 @@ from liftcore.solve.closed_form import solve
 from liftcore.solve.codebook import Codebook, ViewCodebook
 from liftcore.solve.consensus import mask_consensus
 from liftcore.solve.directions import RegionDirections
-from liftcore.solve.loss import huber_factors
 from liftcore.solve.objects import region_objects
 from liftcore.solve.reweight import reweighting_factors
 from liftcore.solve.smooth import warm_up_smoothing
@@ -38,8 +37,6 @@ def warm_up_lift(kernel: Kernel, device: Device, settings: LiftSettings) -> None
         mask_consensus(W, np.zeros(1, np.int8), 1)
     if settings.reliability:
         reweighting_factors(W, book, 1, principal=1, threads=1, reliability=torch.ones(1, dtype=torch.bool))
-    if settings.loss == "huber":
-        huber_factors(W, book, threads=1)
     if settings.smoothness:
         warm_up_smoothing()
     if settings.aggregation:

@@ -36,7 +36,6 @@ class LiftOptions(TypedDict, total=False):
     reliability: bool | Literal["auto"]
     consensus: bool | Literal["auto"]
     objects: bool | Literal["auto"]
-    loss: Literal["l2", "huber"]
     dtype: Literal["float16", "float32"]
     aggregation: bool
     aggregation_clusters: Literal["hdbscan", "touching", "graph", "auto"]

@@ -111,7 +111,7 @@ GROUPS = {  # of the settings, for people who read all of them
     "weights of a ray that count": ("selection", "k", "mass", "weight_floor", "power"),
     "pixels, views and levels": ("stride", "view_stride", "coverage", "view_cosine", "levels", "grid_reading"),
     "the rasterizer": ("kernel", "antialiased", "lift_gain", "render_gain", "alpha_cap", "transmittance_stop"),
-    "wrong masks": ("robust_steps", "robust_directions", "reliability", "consensus", "loss"),
+    "wrong masks": ("robust_steps", "robust_directions", "reliability", "consensus"),
     "objects and clusters": (
         "objects", "aggregation", "aggregation_clusters", "aggregation_guard", "aggregation_iou",
         "aggregation_cluster_size", "aggregation_neighbours", "aggregation_sample", "aggregation_channels",
@@ -224,11 +224,6 @@ class LiftSettings(PlainModel):
         description="find objects without words: `auto` where there are masks (with several levels only beside a "
         "robust step), `true` always (region weights of several levels then take twice as long), "
         "`false` never",
-    )
-    loss: Literal["l2", "huber"] = Field(
-        "l2",
-        description="the loss that features minimise: squares, or `huber` by three reweighted closed forms after "
-        "any robust step; it gains nothing where masks are wrong",
     )
     dtype: Literal["float16", "float32"] = Field(
         "float16", description="how features are stored, or `float32`; what float16 cannot hold is stored as float32"
@@ -359,9 +354,6 @@ class LiftSettings(PlainModel):
         if self.aggregation_resolve and self.smoothness:
             expected = "smoothness=0 beside aggregation_resolve, whose features know no neighbours"
             raise PydanticCustomError("whole_regions", "{expected}", {"expected": expected})
-        if self.loss == "huber" and self.cg_steps:
-            requirement = "cg_steps=0 beside loss=huber: such steps go towards the least squares"
-            raise PydanticCustomError("one_loss", "{expected}", {"expected": requirement})
         if (self.reliability or self.consensus or self.aggregation_guard) and not self.robust_steps:
             requirement = (
                 "robust_steps of 1 or more beside reliability, consensus and aggregation_guard, which need a step"
@@ -425,7 +417,7 @@ class LiftSettings(PlainModel):
     @property
     def weighs_rows(self) -> bool:
         """True if W needs a column for each region; else levels may share one for each distinct tuple of labels."""
-        by_settings = self.robust_steps or self.loss == "huber" or self.aggregation_resolve or self.objects is True
+        by_settings = self.robust_steps or self.aggregation_resolve or self.objects is True
         return bool(by_settings or self.clusters_by_masks)
 
     def finds_objects(self, masks: bool) -> bool:

@@ -52,8 +52,6 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "robust": {"preset": "row-sum", "robust_steps": 1},
     "and reliability": {"preset": "default", "consensus": False},
     "default": {"preset": "default"},
-    "huber": {"preset": "row-sum", "loss": "huber"},
-    "default, huber": {"preset": "default", "loss": "huber"},
     "published": {"preset": "default", **AGGREGATED, "aggregation_clusters": "hdbscan", "aggregation_guard": False},
     "touching": {"preset": "default", **AGGREGATED, "aggregation_clusters": "touching"},
     "aggregated": {"preset": "default", **AGGREGATED},

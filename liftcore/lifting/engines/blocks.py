@@ -68,7 +68,6 @@ class Job:
     usual_share: float | None = None  # the mean share of mask consensus; None where there is none
     by_region: bool = False  # True if each region has one weight
     levels_apart: bool = False  # True if regions are compared with those of their own level alone
-    delta: float | None = None  # of Huber's loss
     clusters: int = 0  # whose features splats may take
     has_guard: bool = False  # True if they do only where it explains them
 

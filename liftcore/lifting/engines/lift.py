@@ -44,7 +44,6 @@ from liftcore.solve.clusters import Clustering
 from liftcore.solve.consensus import mean_share
 from liftcore.solve.diagnostics import ViewMeasures, join_measures, measure_view
 from liftcore.solve.directions import RegionDirections
-from liftcore.solve.loss import mean_distance
 from liftcore.solve.objects import (
     NodeVectors,
     RegionObjects,
@@ -326,10 +325,6 @@ class InBlocks(LiftSteps[Job]):
             scene = SceneConsistency.of(_sums(W, f"cosines-{step}", shape), region_mask, level)
             steps.write_scene_consistency(W, step, scene)
         return W, scene.reliability if scene else None
-
-    def discount_distance(self, W: Job) -> Job:
-        self.run("loss", steps.measure, W, W.splat_pieces)
-        return replace(W, delta=mean_distance(_sums(W, "measure", (2, 1))))
 
     def solve(self, W: Job, clusters: RegionObjects | None) -> tuple[Tensor, SplatSupport]:
         job = _with_clusters(W, clusters)

@@ -11,7 +11,6 @@ them up and writes the totals as files too. So the result is bitwise identical t
     label     splats     the object of each splat, and its weight in other regions and in views
     share     views      the consensus of other views about their entries (`liftcore.solve.consensus`)
     compare   splats     cosines of regions with the other views (`liftcore.solve.reweight`)
-    measure   splats     distances of regions from features (`liftcore.solve.loss`)
     solve     splats     X, view consistency and confidence
     spread    splats     X with the features of clusters (`liftcore.solve.aggregate`)
 
@@ -43,7 +42,6 @@ from liftcore.solve.closed_form import solve_rows
 from liftcore.solve.codebook import Codebook, ViewCodebook
 from liftcore.solve.consensus import SplatTuples, along_curve, region_shares, splat_tuples, with_mean
 from liftcore.solve.directions import StoredDirections, region_totals
-from liftcore.solve.loss import RegionDistances, huber_factors
 from liftcore.solve.membership import RegionGroups, memberships
 from liftcore.solve.objects import (
     node_containers,
@@ -418,15 +416,6 @@ def _reweighted(job: Job, piece: int, block: SplatBlock, threads: int | None) ->
     return scale_weights(block.W, factors), scores
 
 
-@piece_of("measure")
-def measure(job: Job, piece: int, threads: int | None) -> Piece:
-    """Write the sums of the distances of regions from the first closed form."""
-    block = _splat_block(job, piece)
-    W, _ = _reweighted(job, piece, block, threads)
-    distances = RegionDistances(W, codebook_of(job), block.means, threads)
-    return {}, list(distances.sums(distances.after(torch.ones_like(W.weight))))
-
-
 @one_thread()
 def solve(job: Job, piece: int, threads: int | None) -> None:
     """Write X of a block of splats with view consistency and confidence."""
@@ -435,8 +424,6 @@ def solve(job: Job, piece: int, threads: int | None) -> None:
         return
     block, codebook, settings = _splat_block(job, piece), codebook_of(job), job.settings
     W, scores = _reweighted(job, piece, block, threads)
-    if settings.loss == "huber":
-        W = scale_weights(W, huber_factors(W, codebook, means=block.means, threads=threads, delta=job.delta))
     X = torch.zeros(block.last - block.first, job.channels, dtype=job.dtype)
     rows = torch.nonzero(W.indptr.diff())[:, 0]
     squares = solve_rows(X, rows, W, codebook, means=block.means, threads=threads)

@@ -315,7 +315,7 @@ def _seconds(raster: Raster, views: LiftViews, names: Sequence[str], settings: L
 
 def weight_bytes(visible: Visibility, entries: np.ndarray, settings: LiftSettings) -> int:
     """Estimate the bytes of W of all views from the number of entries of each [V]."""
-    factor_bytes = FACTOR_BYTES if settings.robust_steps or settings.loss == "huber" else 0
+    factor_bytes = FACTOR_BYTES if settings.robust_steps else 0
     return int(ROW_BYTES * _splat_counts(visible).sum() + (ENTRY_BYTES + factor_bytes) * entries.sum())
 
 
@@ -429,7 +429,7 @@ def memory_phases(
     }
     if settings.finds_objects(masks):
         phases["objects"] = weighed | {"objects": int(OBJECT_BYTES * of_all) + 8 * min(MOST_REGIONS, regions) ** 2}
-    if settings.robust_steps or settings.loss == "huber":
+    if settings.robust_steps:
         factors = int(REWEIGHT_BYTES * min(of_all, MEMORY_LIMIT / ENTRY_BYTES))  # more lies in files
         if settings.consensus and masks:
             factors += int(CONSENSUS_BYTES * of_all + BLOCK_BYTES * min(of_all, BLOCK_ENTRIES))

@@ -115,7 +115,7 @@ def assert_same_metadata(left: lc.LiftResult, right: lc.LiftResult) -> None:
     "overrides",
     [
         {"preset": "row-sum", "objects": True},
-        {"preset": "default", "robust_steps": 2, "loss": "huber"},
+        {"preset": "default", "robust_steps": 2},
         {"preset": "default", "aggregation": True, "dtype": "float32"},
     ],
 )
