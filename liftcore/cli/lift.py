@@ -216,12 +216,10 @@ def _verdict(document: dict[str, Any], cameras: Path) -> Iterable[str]:
     if row_sum is not None:
         note = "as in a scene without holes" if row_sum >= CLOSED_SCENE_ROW_SUM else "so parts of rays hit no splat"
         yield f"splats fill {row_sum:.1%} of a ray on average, {note}"
-    if "candidates" in diagnostics.get("smoothing", {}):
-        yield smoothing_line(diagnostics["smoothing"])
     masks = diagnostics.get("reweighting", {}).get("masks")
     if masks is not None and not document["settings"]["smoothness"] and (not masks or document["views"] <= FEW_VIEWS):
         of = f"{document['views']} views of masks" if masks else "maps without masks"
-        yield f"for {of}: --set smoothness=auto smooths as far as it helps halves of the views to predict each other"
+        yield f"for {of}: --set smoothness=4 draws neighbours together, and splatlift tradeoff tells whether it helps"
     if diagnostics["warnings"]:
         yield "see the warnings: splatlift check tests whether photos, cameras and splats match"
     space = document["text_space"]

@@ -91,29 +91,14 @@ def place_of(point: tuple[float, ...]) -> str:
 
 def smoothing_line(facts: Mapping[str, Any]) -> str:
     """Describe the smoothing of a lift (``diagnostics["smoothing"]``) in a sentence."""
-    reason = _choice_reason(facts["smoothness"], facts["candidates"]) if "candidates" in facts else ""
-    if not facts["smoothness"]:
-        return f"smoothness 0{reason}"
     shift = "not at all" if facts["moved"] is None else f"by {facts['moved']:.1%} of their length"
     neighbourhood = "position and colour" if facts["colours"] else "position only, as the splats have no colours"
     cut_share = facts.get("parted", 0.0)
     neighbourhood += f", except between masks ({cut_share:.1%} of affinity)" if cut_share else ""
     return (
-        f"smoothness {facts['smoothness']:g}{reason}: features moved {shift} towards their neighbours' in "
+        f"smoothness {facts['smoothness']:g}: features moved {shift} towards their neighbours' in "
         f"{neighbourhood}; {facts['filled']} splats without weight took their neighbours' "
         f"({facts['steps']} steps, {facts['residual']:.1g} of the gradient remaining)"
-    )
-
-
-def _choice_reason(smoothness: float, candidates: Sequence[Mapping[str, float]]) -> str:
-    """Describe the reason for the lambda that auto selected, as a clause."""
-    if not candidates:
-        return ", as the views cannot be split into halves to compare values"
-    bits = {candidate["smoothness"]: candidate["information"] for candidate in candidates}
-    if not smoothness:
-        return f", as smoothing does not help to predict half of the views ({bits[0]:.3f} bits a splat)"
-    return (
-        f", which predicts {bits[smoothness]:.3f} bits a splat of the other half of the views, {bits[0]:.3f} without"
     )
 
 

@@ -35,7 +35,6 @@ from liftcore.solve.membership import Memberships, RegionGroups, memberships
 from liftcore.solve.objects import NodeVectors, RegionObjects, region_objects
 from liftcore.solve.reweight import Reweighting, reweighting_factors, scale_weights, whole_regions
 from liftcore.solve.smooth import smooth
-from liftcore.solve.smooth_by_halves import choose_smoothness
 from liftcore.solve.sums import sum_pieces
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.region_weights import RegionWeights
@@ -169,23 +168,15 @@ class InMemory(LiftSteps[SceneWeights]):
         return X, facts
 
     def smooth(self, W: SceneWeights, X: Tensor, support: SplatSupport) -> tuple[Tensor, dict[str, Any]]:
-        weights, strength, choice = W.weights, self.settings.smoothness, dict[str, Any]()
         graph, weakened_edges = weaken_edges(
-            SplatGraph.of(self.splats, self.threads), weights, W.geometry.levels, self.threads
+            SplatGraph.of(self.splats, self.threads), W.weights, W.geometry.levels, self.threads
         )  # fmt: skip
-        if strength == "auto":
-            with self.timings.stage("halves"):
-                best = choose_smoothness(
-                    weights, W.geometry.codebook, graph, support.confidence, seed=self.settings.seed,
-                    progress=self.timings.progress, threads=self.threads,
-                )  # fmt: skip
-            strength, choice = best.smoothness, {"candidates": best.facts()}
         visible = torch.from_numpy(support.sums > 0)
         X, facts = smooth(
-            X, graph, support.total_weight, support.confidence, visible, strength, self.timings.progress,
-            self.threads,
+            X, graph, support.total_weight, support.confidence, visible, self.settings.smoothness,
+            self.timings.progress, self.threads,
         )  # fmt: skip
-        return X, facts | {"parted": weakened_edges} | choice
+        return X, facts | {"parted": weakened_edges}
 
     def aggregate(self, W: SceneWeights, X: Tensor, clusters: RegionObjects | None) -> tuple[Tensor, Aggregation]:
         settings, reweighting, guard_inputs = self.settings, W.reweighting, None

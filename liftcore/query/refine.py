@@ -47,17 +47,12 @@ def refine(
         InvalidLift: it was smoothed before, or its splats have the features of clusters.
     """
     strength = LiftSettings.of(smoothness=smoothness).smoothness
-    if strength == "auto":
-        hint = "a lift keeps no weights of its views: lift again with smoothness=auto, or name a number"
-        raise InvalidSettings("smoothness", expected="a number above 0", got="auto", hint=hint)
     if not strength:
         raise InvalidSettings("smoothness", expected="a number above 0", got="0", hint="1 is a good first try")
     lift.require_splats(splats)
     settings = lift.settings
-    before = lift.diagnostics.get("smoothing", {}).get("smoothness") if settings.smoothness == "auto" else None
-    if settings.smoothness and before != 0:
-        hint = "lift again with smoothness=0" if settings.smoothness == "auto" else "refine the lift it came from"
-        got = f"one of smoothness={settings.smoothness}"
+    if settings.smoothness:
+        got, hint = f"one of smoothness={settings.smoothness}", "refine the lift it came from"
         raise InvalidLift("lift", expected="a lift without smoothness", got=got, hint=hint)
     if settings.aggregation:
         hint = f"lift again with smoothness={strength:g} beside aggregation: clusters are made of smooth features"

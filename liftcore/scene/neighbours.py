@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self, TypeVar
 
 import numpy as np
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 NEIGHBOURS = 16  # of each splat, the nearest by their centres
 COLOUR_WIDTH = 0.1  # standard deviation of colours in 0..1, over all three channels
 LEAST_AFFINITY = 1e-6  # of pairs in the graph: weaker ones move nothing
-PATCH = 1 << 12  # splats that lie together
 _PIECE = 1 << 12  # points whose neighbours are worked on at once: what is made of them stays in the cache
 _JITTER = 1e-12  # of the farthest coordinate
 
@@ -120,27 +119,6 @@ class SplatGraph:
         graph.sort_indices()
         indices = graph.indices.astype(np.int32, copy=False)
         return cls(order, graph.indptr.astype(np.int64), indices, graph.data, colours is not None)
-
-    def patches(self, limit: int) -> Self:
-        """Return the graph of at most ``limit`` splats, in evenly spaced patches of PATCH splats."""
-        from scipy.sparse import csr_array
-
-        count = len(self.order)
-        if count <= limit:
-            return self
-        firsts = np.linspace(0, count - PATCH, max(limit // PATCH, 1)).astype(np.int64)
-        rows = np.unique((firsts[:, None] + np.arange(PATCH)).ravel())
-        graph = csr_array((self.affinities, self.neighbours, self.starts), shape=(count, count))
-        part = csr_array(graph[rows][:, rows])
-        part.sort_indices()
-        indices = part.indices.astype(np.int32, copy=False)
-        return replace(
-            self,
-            order=self.order[rows],
-            starts=part.indptr.astype(np.int64),
-            neighbours=indices,
-            affinities=part.data,
-        )
 
 
 def base_colours(splats: Splats) -> np.ndarray | None:

@@ -47,7 +47,6 @@ PROBES = LANES  # random sums of all channels, whose steps are used
 # Of the gradient, relative to that at X0, over sqrt(1 + lambda): components that vary slowly over the scene have a
 # small share of the gradient, smaller for larger lambda.
 TOLERANCE = 2e-3
-ROUGHLY = 2e-2  # tolerance for comparisons of features that are not returned
 STEPS = 200  # of conjugate gradients at most; about 20 are enough for lambda 4
 
 Step = tuple[np.float32, np.float32]  # alpha and beta
@@ -65,7 +64,7 @@ class _System:
     tolerance: float  # of the gradient, relative to that at X0
 
     @classmethod
-    def of(cls, graph: SplatGraph, weights: np.ndarray, smoothness: float, tolerance: float = TOLERANCE) -> _System:
+    def of(cls, graph: SplatGraph, weights: np.ndarray, smoothness: float) -> _System:
         """Build from weights [P] f64 in the graph's order, at most one."""
         roots, counts = np.sqrt(weights), np.diff(graph.starts)
         couplings = (smoothness * graph.affinities * np.repeat(roots, counts) * roots[graph.neighbours]).astype(
@@ -74,7 +73,7 @@ class _System:
         rows = np.repeat(np.arange(len(weights), dtype=np.int32), counts)
         diagonal = weights + np.bincount(rows, couplings, minlength=len(weights))
         inverse = np.divide(1.0, diagonal, out=np.zeros_like(diagonal), where=weights > 0)
-        relative = tolerance / (1.0 + smoothness) ** 0.5
+        relative = TOLERANCE / (1.0 + smoothness) ** 0.5
         diagonal, inverse = diagonal.astype(np.float32), inverse.astype(np.float32)
         return cls(graph, weights.astype(np.float32), couplings, diagonal, inverse, relative)
 
@@ -116,7 +115,7 @@ def smooth(
     squares, steps, residual = np.zeros((2, channels)), list[Step](), 0.0
     with ThreadPoolExecutor(threads or cores()) as pool:
         if smoothness and has_weight.any():
-            _, steps, residual = _conjugate_gradients(system, _probe(X, graph.order, has_weight, pool), pool)
+            steps, residual = _conjugate_gradients(system, _probe(X, graph.order, has_weight, pool), pool)
             staged = torch.empty(count, BLOCK, dtype=X.dtype)  # a block in the graph's order, in X's dtype
             source, target = _in_words(X, staged)
             values, *iterates = (np.zeros((count, BLOCK), np.float32) for _ in range(3))
@@ -166,19 +165,6 @@ def smooth(
             "features are less smooth than requested"
         )
     return X, facts
-
-
-def smooth_channels(
-    graph: SplatGraph, values: np.ndarray, weights: np.ndarray, smoothness: float, pool: Executor
-) -> np.ndarray:
-    """Smooth features [P, C] f32 with weights [P] f64 up to one, in the graph's order, to the tolerance ROUGHLY.
-
-    Splats without total weight are zero.
-    """
-    padded = np.zeros((len(values), -(-values.shape[1] // LANES) * LANES), np.float32)
-    np.copyto(padded[:, : values.shape[1]], values, where=weights[:, None] > 0)
-    system = _System.of(graph, weights, smoothness, ROUGHLY)
-    return _conjugate_gradients(system, padded, pool)[0][:, : values.shape[1]]
 
 
 def warm_up_smoothing() -> None:
@@ -244,8 +230,8 @@ def _probe(X: Tensor, order: np.ndarray, mask: np.ndarray, pool: Executor) -> np
     return np.where(mask[:, None] & np.isfinite(sums), sums, np.float32(0.0))
 
 
-def _conjugate_gradients(system: _System, start: np.ndarray, pool: Executor) -> tuple[np.ndarray, list[Step], float]:
-    """Minimise from X0 [P, C] f32, all channels as one vector; return X, the steps, and the final relative gradient.
+def _conjugate_gradients(system: _System, start: np.ndarray, pool: Executor) -> tuple[list[Step], float]:
+    """Minimise from X0 [P, C] f32, all channels as one vector; return the steps and the final relative gradient.
 
     C is a multiple of LANES.
     """
@@ -274,7 +260,7 @@ def _conjugate_gradients(system: _System, start: np.ndarray, pool: Executor) -> 
         new = run(advance_rows, system.inverse, length, direction, image, length, X, rest)
         slope, turn = new, np.float32(new / slope)
         run(turn_rows, system.inverse, turn, rest, direction)
-    return X, steps, float(np.sqrt(slope / first)) if first > 0 else 0.0
+    return steps, float(np.sqrt(slope / first)) if first > 0 else 0.0
 
 
 def _descend(

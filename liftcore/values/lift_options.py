@@ -48,7 +48,7 @@ class LiftOptions(TypedDict, total=False):
     aggregation_channels: int
     diagnostic_rays: int
     seed: int
-    smoothness: float | Literal["auto"]
+    smoothness: float
     cg_steps: int
     damping: float
     cg_basis: int

@@ -278,12 +278,14 @@ class LiftSettings(PlainModel):
         lt=2**31,
         description="of all samples, of a stride's first pixel in each view, and of random projections",
     )
-    smoothness: Annotated[float, Field(ge=0, le=1e6)] | Literal["auto"] = Field(
+    smoothness: float = Field(
         0.0,
-        description="strength of the smoothing over splats that are near in place and in colour: 0 is off; `auto` "
-        "compares lifts of even and odd views and takes the best strength, or none. A large number loses accuracy "
-        "where features vary within an object. Edges between regions of masks are smoothed less. `splatlift refine` "
-        "smooths a finished lift, with a number and without masks. It runs on the CPU, also with `device=cuda`. "
+        ge=0,
+        le=1e6,
+        description="strength of the smoothing over splats that are near in place and in colour: 0 is off, 4 helps "
+        "grids and few views of masks. A large number loses accuracy where features vary within an object; "
+        "`splatlift tradeoff` tries it on held-out views. Edges between regions of masks are smoothed less. "
+        "`splatlift refine` smooths a finished lift, without masks. It runs on the CPU, also with `device=cuda`. "
         "Refused with an `engine`, and with `aggregation_resolve`",
     )
     cg_steps: int = Field(
@@ -464,7 +466,7 @@ class LiftSettings(PlainModel):
             changes = [f"{name}=0" for name in requested if name in ("cg_steps", "reference_channels", "smoothness")]
             if len(changes) < len(unsupported):
                 changes.append("aggregation=false, or aggregation_clusters=graph where views have masks")
-            strength = 1 if self.smoothness == "auto" else self.smoothness
+            strength = self.smoothness
             after = f", then smooth the lift by `splatlift refine LIFT --smoothness {strength:g}`" if strength else ""
             raise InvalidSettings(
                 "engine",

@@ -24,7 +24,7 @@ const PRESETS = {
 };
 const QUALITIES = { exact: "every pixel", balanced: "every 4th pixel", fast: "fewer views too", draft: "for a preview" };
 const STAGES = { read: "Reading files", digest: "Reading files", compile: "Compiling kernels", plan: "Planning", geometry: "Rasterizing the views",
-  solve: "Solving", robust: "Comparing views", halves: "Comparing halves of the views", smooth: "Smoothing", certify: "Checking the result", save: "Saving" };
+  solve: "Solving", robust: "Comparing views", smooth: "Smoothing", certify: "Checking the result", save: "Saving" };
 
 export class UploadPanel {
   // onOpen(id): open a lift. onDelete(): after lifts were deleted. openLiftId(): the id of the open lift, or null.

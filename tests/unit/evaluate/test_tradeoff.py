@@ -136,10 +136,11 @@ def test_candidates_start_from_the_preset_of_the_order():
     assert {"aggregation", "tikhonov"} <= set(names[0]) and "default" in names[1]
     # A setting that stands on the robust step leaves out presets that have none.
     assert [candidate.name for candidate in candidates_of({"reliability": True}) if candidate.kind == "preset"] == [
-        "smooth",
+        "smoothness 1",
+        "smoothness 4",
         "aggregation",
     ]
-    assert "smooth" not in [candidate.name for candidate in candidates_of({"smoothness": "auto"})]
+    assert "smoothness 4" not in [candidate.name for candidate in candidates_of({"smoothness": 4})]
 
 
 def test_cosines_count_splats_that_the_exact_run_saw():

@@ -71,7 +71,7 @@ def test_command_without_features_tells_what_to_encode_first(tmp_path, capsys):
     assert f"encode first: {', '.join(plan.order)}" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("smoothness", ["0", "4", "auto"])
+@pytest.mark.parametrize("smoothness", ["0", "4"])
 def test_smoothness_changes_no_share_and_the_plan_says_so(smoothness, tmp_path, capsys):
     paths = write_scene(tmp_path, 2)
     plan = lc.plan_photos(lc.read_splats(paths[0]), lc.read_cameras(paths[1]))

@@ -98,6 +98,4 @@ def test_keyword_arguments_of_a_lift_are_typed_as_its_settings() -> None:
             expected = annotation | Literal[tuple(str(value) for value in annotation)]
         elif annotation == LiftSettings.model_fields["levels"].annotation:
             expected = Literal["rows", "composite"] | int
-        elif name == "smoothness":
-            expected = float | Literal["auto"]
         assert hints[name] == expected, name

@@ -15,14 +15,10 @@ from torch import Tensor
 
 import liftcore as lc
 from liftcore.cli.reply import smoothing_line
-from liftcore.lifting import in_memory
 from liftcore.lifting.files import lift_files
 from liftcore.scene.neighbours import SplatGraph
 from liftcore.scene.splats import Splats
-from liftcore.solve.codebook import Codebook, ViewCodebook
 from liftcore.solve.smooth import STEPS, smooth
-from liftcore.solve.smooth_by_halves import STRENGTHS, SmoothnessChoice, choose_smoothness
-from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import LiftSettings
 from tests.scenes import random_splats, write_scene
 from tests.unit.command_line import run
@@ -139,49 +135,6 @@ def test_features_that_are_one_stay_as_they_are() -> None:
     assert "not at all" in smoothing_line(facts)
 
 
-PLACES = np.random.default_rng(2).random((900, 2))  # of splats on a square
-STRIPE_LABELS = (4 * PLACES[:, 0]).astype(int)  # four stripes
-STRIPES = np.random.default_rng(4).normal(size=(4, 6))[STRIPE_LABELS]
-
-
-def choose(
-    truth: np.ndarray, noise: float, views: int = 6, places: np.ndarray = PLACES, **options: Any
-) -> SmoothnessChoice:
-    """The choice for splats at places, a colour a stripe, each with a noisy copy of its truth [P, F] in each view."""
-    rng, count = np.random.default_rng(3), len(places)
-    means = torch.from_numpy(np.column_stack([places, np.zeros(count)])).float()
-    stripes = torch.from_numpy((4 * places[:, 0]).astype(int) - 1.5).float()
-    colours = stripes[:, None, None].expand(-1, 1, 3)
-    graph = SplatGraph.of(replace(random_splats(3, count), means=means, sh=colours))
-    rows = truth + noise * rng.normal(size=(views, *truth.shape))
-    regions = (torch.arange(views)[None] * count + torch.arange(count)[:, None]).reshape(-1).int()
-    starts, total_weight = torch.arange(count + 1) * views, torch.full((count,), float(views))
-    splats = torch.arange(count, dtype=torch.int32)
-    offsets = torch.arange(views + 1) * count
-    W = RegionWeights(splats, starts, regions, torch.ones(views * count), splats, total_weight, offsets)
-    codebook = Codebook(tuple(ViewCodebook(torch.from_numpy(book).float()) for book in rows))
-    return choose_smoothness(W, codebook, graph, None, **options)
-
-
-def test_strength_is_large_for_noise_and_small_for_features_that_vary_by_splat() -> None:
-    choice = choose(STRIPES, 2.0)
-    assert choice.smoothness >= STRENGTHS[1]
-    assert 0 < 1.2 * choice.information[0.0] < choice.information[choice.smoothness] < 2.1  # 2 bits name one of four
-    permuted = np.random.default_rng(6).permutation(STRIPES)  # neighbours are no more alike than others
-    for truth, noise in (
-        (permuted, 0.3),
-        (permuted, 1.0),
-        (np.random.default_rng(7).normal(size=STRIPES.shape), 0.3),
-    ):
-        assert choose(truth, noise).smoothness <= STRENGTHS[0]
-
-
-@pytest.mark.parametrize("views", [1, 2])
-def test_strength_is_zero_where_halves_share_no_information(views: int) -> None:
-    noise = 0.0 if views == 2 else 1.0  # all that two views say is one vector
-    assert choose(np.ones_like(STRIPES), noise, views) == SmoothnessChoice(0.0, {})
-
-
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
     return write_scene(tmp_path_factory.mktemp("scene"), 3)
@@ -217,43 +170,12 @@ def test_refined_lift_is_the_lift_with_that_smoothness(grids: tuple[Path, Path, 
     assert "smooth" in refined.metadata.timings
 
 
-@pytest.mark.parametrize("choice", [None, SmoothnessChoice(0.3, {0.0: 1.0, 0.1: 1.2, 0.3: 1.3, 1.0: 1.1})])
-def test_lift_with_auto_is_the_lift_with_the_chosen_strength(
-    files: tuple[Path, Path, Path], choice: SmoothnessChoice | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of the scene's own choice, which is none, and of another."""
-    if choice is not None:
-        monkeypatch.setattr(in_memory, "choose_smoothness", lambda *_, **__: choice)
-
-    def lifted(smoothness: float | str) -> lc.LiftResult:
-        return lift_files(files[0], files[1], files[2:], LiftSettings.of(smoothness=smoothness))
-
-    auto = lifted("auto")
-    facts = dict(auto.diagnostics["smoothing"])
-    candidates = facts.pop("candidates")
-    assert facts["smoothness"] in [single["smoothness"] for single in candidates]
-    fixed = lifted(facts["smoothness"])
-    assert torch.equal(auto.features, fixed.features)
-    if choice is None:
-        assert facts["smoothness"] == 0
-        assert auto.refined(lc.read_splats(files[0]), smoothness=1).settings.smoothness == 1
-        return
-    assert facts == fixed.diagnostics["smoothing"]
-    assert facts["smoothness"] == 0.3
-    assert "of the views" in smoothing_line(auto.diagnostics["smoothing"])
-    assert auto.settings.smoothness == "auto"
-    with pytest.raises(lc.InvalidLift, match="smoothness=auto; lift again with smoothness=0"):
-        auto.refined(lc.read_splats(files[0]), smoothness=1)
-
-
 def test_refinement_that_cannot_be_is_refused_in_words(
     files: tuple[Path, Path, Path], baseline: lc.LiftResult
 ) -> None:
     splats = lc.read_splats(files[0])
     with pytest.raises(lc.InvalidSettings, match="smoothness: expected a number above 0"):
         baseline.refined(splats, smoothness=0)
-    with pytest.raises(lc.InvalidSettings, match="lift again with smoothness=auto"):
-        baseline.refined(splats, smoothness="auto")  # pyright: ignore[reportArgumentType]
     with pytest.raises(lc.InvalidSettings, match="smoothness"):
         baseline.refined(splats, smoothness=float("nan"))
     with pytest.raises(lc.InvalidSplats, match="splats"):
@@ -271,24 +193,22 @@ def test_lift_in_blocks_refuses_smoothness_and_is_refined(
     files: tuple[Path, Path, Path], baseline: lc.LiftResult
 ) -> None:
     scene = lc.read_splats(files[0]), lc.read_cameras(files[1]), lc.read_features(files[2])
-    strengths: list[tuple[Any, str]] = [(2, "2"), ("auto", "1")]
-    for strength, to_take in strengths:
-        way = rf"got smoothness={strength}.*; set smoothness=0, then .*splatlift refine LIFT --smoothness {to_take}`"
-        with pytest.raises(lc.InvalidSettings, match=way):
-            lc.lift(*scene, smoothness=strength, engine=lc.LocalEngine(1))
+    way = r"got smoothness=2.*; set smoothness=0, then .*splatlift refine LIFT --smoothness 2`"
+    with pytest.raises(lc.InvalidSettings, match=way):
+        lc.lift(*scene, smoothness=2, engine=lc.LocalEngine(1))
     in_blocks = lc.lift(*scene, engine=lc.LocalEngine(1)).refined(scene[0], smoothness=2)
     assert in_blocks.settings.smoothness == 2
     assert torch.equal(in_blocks.features, baseline.refined(scene[0], smoothness=2).features)
 
 
-@pytest.mark.parametrize("smoothness", ["0", "auto"])
+@pytest.mark.parametrize("smoothness", ["0", "4"])
 def test_lift_of_few_views_recommends_smoothness(
     files: tuple[Path, Path, Path], smoothness: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "scene.lift.safetensors"
     status, text, _ = run(capsys, "lift", *files, "-o", out, "--set", f"smoothness={smoothness}")
     assert status == 0
-    assert ("3 views of masks: --set smoothness=auto smooths" in text) == (smoothness == "0")
+    assert ("3 views of masks: --set smoothness=4 draws" in text) == (smoothness == "0")
 
 
 def test_command_refines_a_lift_that_is_there(
