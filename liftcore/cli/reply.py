@@ -93,8 +93,6 @@ def smoothing_line(facts: Mapping[str, Any]) -> str:
     """Describe the smoothing of a lift (``diagnostics["smoothing"]``) in a sentence."""
     shift = "not at all" if facts["moved"] is None else f"by {facts['moved']:.1%} of their length"
     neighbourhood = "position and colour" if facts["colours"] else "position only, as the splats have no colours"
-    cut_share = facts.get("parted", 0.0)
-    neighbourhood += f", except between masks ({cut_share:.1%} of affinity)" if cut_share else ""
     return (
         f"smoothness {facts['smoothness']:g}: features moved {shift} towards their neighbours' in "
         f"{neighbourhood}; {facts['filled']} splats without weight took their neighbours' "

@@ -30,7 +30,6 @@ from liftcore.solve.consensus import mask_consensus
 from liftcore.solve.diagnostics import ViewMeasures, measure_samples
 from liftcore.solve.directions import region_totals
 from liftcore.solve.least_squares import AllRays, reference, refine
-from liftcore.solve.mask_edges import weaken_edges
 from liftcore.solve.membership import Memberships, RegionGroups, memberships
 from liftcore.solve.objects import NodeVectors, RegionObjects, region_objects
 from liftcore.solve.reweight import Reweighting, reweighting_factors, scale_weights, whole_regions
@@ -168,15 +167,11 @@ class InMemory(LiftSteps[SceneWeights]):
         return X, facts
 
     def smooth(self, W: SceneWeights, X: Tensor, support: SplatSupport) -> tuple[Tensor, dict[str, Any]]:
-        graph, weakened_edges = weaken_edges(
-            SplatGraph.of(self.splats, self.threads), W.weights, W.geometry.levels, self.threads
-        )  # fmt: skip
-        visible = torch.from_numpy(support.sums > 0)
-        X, facts = smooth(
+        graph, visible = SplatGraph.of(self.splats, self.threads), torch.from_numpy(support.sums > 0)
+        return smooth(
             X, graph, support.total_weight, support.confidence, visible, self.settings.smoothness,
             self.timings.progress, self.threads,
         )  # fmt: skip
-        return X, facts | {"parted": weakened_edges}
 
     def aggregate(self, W: SceneWeights, X: Tensor, clusters: RegionObjects | None) -> tuple[Tensor, Aggregation]:
         settings, reweighting, guard_inputs = self.settings, W.reweighting, None

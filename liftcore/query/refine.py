@@ -28,10 +28,7 @@ MEMORY_SHARE = 0.5  # of the free memory: larger features are held in a mapped f
 def refine(
     lift: AnyLift, splats: Splats, smoothness: float, progress: Progress = silent, threads: int | None = None
 ) -> AnyLift:
-    """Smooth the features of a lift, as `LiftSettings.smoothness` does during a lift.
-
-    Lifts of grids have the same bits in both. Masks weaken edges of the graph only during a lift, as a finished one
-    has no weights of its views.
+    """Smooth the features of a lift, as `LiftSettings.smoothness` does during a lift, with the same bits.
 
     Args:
         lift: of any engine; it is not changed. splats: that were lifted. smoothness: lambda, above zero.

@@ -284,8 +284,8 @@ class LiftSettings(PlainModel):
         le=1e6,
         description="strength of the smoothing over splats that are near in place and in colour: 0 is off, 4 helps "
         "grids and few views of masks. A large number loses accuracy where features vary within an object; "
-        "`splatlift tradeoff` tries it on held-out views. Edges between regions of masks are smoothed less. "
-        "`splatlift refine` smooths a finished lift, without masks. It runs on the CPU, also with `device=cuda`. "
+        "`splatlift tradeoff` tries it on held-out views. "
+        "`splatlift refine` smooths a finished lift. It runs on the CPU, also with `device=cuda`. "
         "Refused with an `engine`, and with `aggregation_resolve`",
     )
     cg_steps: int = Field(

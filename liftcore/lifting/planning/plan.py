@@ -65,7 +65,6 @@ OBJECT_BYTES = 12  # of an entry: the membership of its splat, the node, its pla
 CG_VECTORS, CG_CHANNELS = 14, 32  # [P, 32] f32 of conjugate gradients, with the images of a view
 CLUSTERING = 80_000_000  # of hdbscan and its dependencies
 TOUCHING_BYTES = 1_000  # of a splat, for the graph of splats that touch
-MEMBER_BYTES = 5  # of an entry: the membership of its splat in its region
 SMOOTHING_BYTES = 2_100  # of a splat: the graph while it is built, or with a block of channels
 SPARE = 0.9  # of the free memory: 10 % are left to other processes
 DEVICE_SPARE = 0.8  # of a GPU's free memory, which is fragmented
@@ -438,7 +437,7 @@ def memory_phases(
         vectors = 4 * (splats.count * (CG_VECTORS * CG_CHANNELS) + 3 * largest * CG_CHANNELS)
         phases["refinement"] = solved | {"refinement": vectors, "view": view}
     if settings.smoothness:
-        phases["smoothing"] = solved | {"smoothing": SMOOTHING_BYTES * splats.count + int(MEMBER_BYTES * of_all)}
+        phases["smoothing"] = solved | {"smoothing": SMOOTHING_BYTES * splats.count}
     if settings.aggregation:
         clusters = CLUSTERING + 24 * channels * min(splats.count, settings.aggregation_sample)
         if settings.aggregation_clusters in ("auto", "touching"):  # afterwards, and of one cluster at a time

@@ -163,7 +163,7 @@ def test_refined_lift_is_the_lift_with_that_smoothness(grids: tuple[Path, Path, 
     for name in ("features", "total_weight", "view_consistency", "confidence", "has_feature"):
         assert torch.equal(getattr(refined, name), getattr(smoothed, name)), name
     assert refined.settings == smoothed.settings
-    assert refined.diagnostics["smoothing"] | {"parted": 0} == smoothed.diagnostics["smoothing"]
+    assert refined.diagnostics["smoothing"] == smoothed.diagnostics["smoothing"]
     assert refined.diagnostics["smoothing"]["colours"]
     assert refined.diagnostics["residual"] is None
     assert smoothed.diagnostics["residual"] > baseline.diagnostics["residual"] * 0.5
