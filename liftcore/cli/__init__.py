@@ -22,7 +22,6 @@ __all__ = ["Parser", "build_parser", "main", "whole_number"]  # for commands of 
 COMMANDS = {
     "check": "check that splats, cameras, photos and features match",
     "lift": "lift features onto splats",
-    "refine": "smooth the features of a lift",
     "transfer": "transfer a lift to an edited copy of its splats",
     "plan": "plan a lift: views, memory and time",
     "query": "find words and examples in a lift",

@@ -134,31 +134,6 @@ class LiftResult(Lift):
         """
         return self.scene(splats).catalogue(words, vectors, encoder=encoder)
 
-    def refined(
-        self,
-        splats: Splats,
-        *,
-        smoothness: float,
-        progress: Progress | bool | None = None,
-        threads: int | None = None,
-    ) -> LiftResult:
-        """Return the lift with smooth features, as by the setting ``smoothness``, without lifting again.
-
-        Args:
-            splats: that were lifted, with their colours where they have any. smoothness: lambda, above zero.
-            progress, threads: as `liftcore.lift` has them.
-
-        Raises:
-            InvalidSplats: other splats than were lifted.
-            InvalidSettings: smoothness is zero or out of range.
-            InvalidLift: it was smoothed before, or its splats have the features of clusters.
-        """
-        from liftcore.query.refine import refine
-        from liftcore.runtime.progress import shown_progress
-
-        with shown_progress(progress) as reporter:
-            return refine(self, splats, smoothness, reporter, threads)
-
     def transferred(
         self, old: Splats, new: Splats | Path | str, *, matrix: Any = None, progress: Progress | bool | None = None
     ) -> LiftResult:

@@ -285,8 +285,7 @@ class LiftSettings(PlainModel):
         description="strength of the smoothing over splats that are near in place and in colour: 0 is off, 4 helps "
         "grids and few views of masks. A large number loses accuracy where features vary within an object; "
         "`splatlift tradeoff` tries it on held-out views. "
-        "`splatlift refine` smooths a finished lift. It runs on the CPU, also with `device=cuda`. "
-        "Refused with an `engine`, and with `aggregation_resolve`",
+        "It runs on the CPU, also with `device=cuda`. Refused with an `engine`, and with `aggregation_resolve`",
     )
     cg_steps: int = Field(
         0,
@@ -466,14 +465,12 @@ class LiftSettings(PlainModel):
             changes = [f"{name}=0" for name in requested if name in ("cg_steps", "reference_channels", "smoothness")]
             if len(changes) < len(unsupported):
                 changes.append("aggregation=false, or aggregation_clusters=graph where views have masks")
-            strength = self.smoothness
-            after = f", then smooth the lift by `splatlift refine LIFT --smoothness {strength:g}`" if strength else ""
             raise InvalidSettings(
                 "engine",
                 expected="settings that work on blocks of splats: least squares need all rays, smoothness and "
                 "clusters by HDBSCAN all features in one place",
                 got=", ".join(unsupported),
-                hint=f"set {' and '.join(changes)}{after}; or lift without an engine",
+                hint=f"set {' and '.join(changes)}; or lift without an engine",
             )
 
     def _compositing(self, opacity_logit_scale: float) -> CompositingParams:

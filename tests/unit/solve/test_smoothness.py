@@ -1,4 +1,4 @@
-"""The smoothness of features: its minimum, its bits, and a finished lift refined by it."""
+"""The smoothness of features: its minimum, its bits, and the setting of a lift."""
 
 from __future__ import annotations
 
@@ -135,92 +135,34 @@ def test_features_that_are_one_stay_as_they_are() -> None:
     assert "not at all" in smoothing_line(facts)
 
 
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
-    return write_scene(tmp_path_factory.mktemp("scene"), 3)
-
-
-@pytest.fixture(scope="module")
-def grids(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
-    return write_scene(tmp_path_factory.mktemp("grids"), 3, grids=True)
-
-
-@pytest.fixture(scope="module")
-def baseline(files: tuple[Path, Path, Path]) -> lc.LiftResult:
-    return lift_files(files[0], files[1], files[2:], LiftSettings.of())
-
-
 @pytest.mark.parametrize("dtype", ["float16", "float32"])
-def test_refined_lift_is_the_lift_with_that_smoothness(grids: tuple[Path, Path, Path], dtype: str) -> None:
-    baseline, smoothed = (
-        lift_files(grids[0], grids[1], grids[2:], LiftSettings.of(smoothness=strength, dtype=dtype))
+def test_setting_smooths_what_the_lift_solved(dtype: str, tmp_path: Path) -> None:
+    files = write_scene(tmp_path, 3)
+    baseline, result = (
+        lift_files(files[0], files[1], files[2:], LiftSettings.of(smoothness=strength, dtype=dtype))
         for strength in (0, 1.5)
     )
-    before = baseline.features.clone()
-    refined = baseline.refined(lc.read_splats(grids[0]), smoothness=1.5)
-    assert torch.equal(baseline.features, before)
-    assert not torch.equal(smoothed.features, before)
-    for name in ("features", "total_weight", "view_consistency", "confidence", "has_feature"):
-        assert torch.equal(getattr(refined, name), getattr(smoothed, name)), name
-    assert refined.settings == smoothed.settings
-    assert refined.diagnostics["smoothing"] == smoothed.diagnostics["smoothing"]
-    assert refined.diagnostics["smoothing"]["colours"]
-    assert refined.diagnostics["residual"] is None
-    assert smoothed.diagnostics["residual"] > baseline.diagnostics["residual"] * 0.5
-    assert "smooth" in refined.metadata.timings
+    arguments = SplatGraph.of(lc.read_splats(files[0])), baseline.total_weight, baseline.confidence
+    expected, facts = smooth(baseline.features.clone(), *arguments, baseline.has_feature, 1.5)
+    assert torch.equal(result.features, expected) and not torch.equal(expected, baseline.features)
+    for name in ("total_weight", "confidence", "has_feature"):
+        assert torch.equal(getattr(result, name), getattr(baseline, name)), name
+    assert result.diagnostics["smoothing"] == facts and facts["colours"]
 
 
-def test_refinement_that_cannot_be_is_refused_in_words(
-    files: tuple[Path, Path, Path], baseline: lc.LiftResult
-) -> None:
-    splats = lc.read_splats(files[0])
-    with pytest.raises(lc.InvalidSettings, match="smoothness: expected a number above 0"):
-        baseline.refined(splats, smoothness=0)
-    with pytest.raises(lc.InvalidSettings, match="smoothness"):
-        baseline.refined(splats, smoothness=float("nan"))
-    with pytest.raises(lc.InvalidSplats, match="splats"):
-        baseline.refined(splats[:10], smoothness=1)
-    with pytest.raises(lc.InvalidLift, match="without smoothness"):
-        baseline.refined(splats, smoothness=1).refined(splats, smoothness=1)
-    clustered = lift_files(files[0], files[1], files[2:], LiftSettings.of(aggregation=True))
-    with pytest.raises(lc.InvalidLift, match="aggregation"):
-        clustered.refined(splats, smoothness=1)
+def test_lift_in_blocks_refuses_smoothness() -> None:
+    settings = LiftSettings.of(smoothness=2)
+    with pytest.raises(lc.InvalidSettings, match=r"engine: .*got smoothness=2.*; set smoothness=0"):
+        settings.check_blocks(masks=True)
     with pytest.raises(lc.InvalidSettings, match="smoothness=0"):
         LiftSettings.of(smoothness=1, aggregation=True, aggregation_resolve=True, aggregation_clusters="hdbscan")
 
 
-def test_lift_in_blocks_refuses_smoothness_and_is_refined(
-    files: tuple[Path, Path, Path], baseline: lc.LiftResult
-) -> None:
-    scene = lc.read_splats(files[0]), lc.read_cameras(files[1]), lc.read_features(files[2])
-    way = r"got smoothness=2.*; set smoothness=0, then .*splatlift refine LIFT --smoothness 2`"
-    with pytest.raises(lc.InvalidSettings, match=way):
-        lc.lift(*scene, smoothness=2, engine=lc.LocalEngine(1))
-    in_blocks = lc.lift(*scene, engine=lc.LocalEngine(1)).refined(scene[0], smoothness=2)
-    assert in_blocks.settings.smoothness == 2
-    assert torch.equal(in_blocks.features, baseline.refined(scene[0], smoothness=2).features)
-
-
 @pytest.mark.parametrize("smoothness", ["0", "4"])
 def test_lift_of_few_views_recommends_smoothness(
-    files: tuple[Path, Path, Path], smoothness: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    smoothness: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "scene.lift.safetensors"
+    files, out = write_scene(tmp_path, 3), tmp_path / "scene.lift.safetensors"
     status, text, _ = run(capsys, "lift", *files, "-o", out, "--set", f"smoothness={smoothness}")
     assert status == 0
     assert ("3 views of masks: --set smoothness=4 draws" in text) == (smoothness == "0")
-
-
-def test_command_refines_a_lift_that_is_there(
-    baseline: lc.LiftResult, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "scene.lift.safetensors"
-    baseline.save(path)
-    status, out, err = run(capsys, "refine", path, "--smoothness", "1")
-    assert (status, err) == (0, "")
-    assert "smoothness 1: features moved by" in out
-    refined = lc.load_lift(tmp_path / "scene.lift.smooth.safetensors")
-    assert refined.settings.smoothness == 1
-    assert torch.equal(lc.load_lift(path).features, baseline.features)
-    assert run(capsys, "refine", tmp_path / "scene.lift.smooth.safetensors", "--smoothness", "1")[0] == 2
-    assert run(capsys, "refine", path, "--smoothness", "1", "-o", path)[0] == 2
