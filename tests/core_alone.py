@@ -106,7 +106,7 @@ def check_hints(lc: Any, folder: Path) -> None:
         ("open_clip", "encoders", lambda: lc.open_encoder("open_clip:ViT-B-32/openai").encode(["mug"])),
         ("fastapi", "service", lambda: lc.load_plugin("splatlift.commands", "serve")),
         ("matplotlib", "evaluate", lambda: compare_speeds(scene, budget=1.0)),
-        ("hdbscan", "aggregation", lambda: lc.lift(*inputs, aggregation=True, aggregation_clusters="hdbscan")),
+        ("hdbscan", "aggregation", lambda: lc.lift(*inputs, aggregation=True)),
     ):
         if find_spec(package) is not None:
             continue

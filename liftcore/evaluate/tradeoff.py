@@ -85,7 +85,6 @@ CANDIDATES = (  # in the order in which the budget is spent; a candidate overrid
     DRAFT,
     Candidate("smoothness 1", "preset", {"smoothness": 1.0}, 2.0),
     Candidate("smoothness 4", "preset", {"smoothness": 4.0}, 2.0),
-    Candidate("aggregation", "preset", {"aggregation": True}, 2.5),
     Candidate("tikhonov + aggregation", "preset", {"preset": "tikhonov", "aggregation": True}, 2.5),
     Candidate("balanced", "dial", {"quality": "balanced"}),
     Candidate("front-mass", "preset", {"preset": "front-mass"}),

@@ -83,8 +83,8 @@ class LiftSteps(Protocol[Weights]):
         """
         ...
 
-    def solve(self, W: Weights, clusters: RegionObjects | None) -> tuple[Tensor, SplatSupport]:
-        """Solve for X [P, F] in closed form; given clusters, prepare their features for `aggregate`."""
+    def solve(self, W: Weights) -> tuple[Tensor, SplatSupport]:
+        """Solve for X [P, F] in closed form."""
         ...
 
     def solve_least_squares(self, W: Weights, X: Tensor, visible: np.ndarray) -> tuple[Tensor, dict[str, Any]]:
@@ -95,8 +95,8 @@ class LiftSteps(Protocol[Weights]):
         """Smooth X over neighbouring splats by the settings; return facts of the smoothing too."""
         ...
 
-    def aggregate(self, W: Weights, X: Tensor, clusters: RegionObjects | None) -> tuple[Tensor, Aggregation]:
-        """Give splats the features of their clusters: of these objects, or of similar features if None."""
+    def aggregate(self, W: Weights, X: Tensor) -> tuple[Tensor, Aggregation]:
+        """Give splats the features of their clusters."""
         ...
 
     def measure(self, W: Weights, X: Tensor) -> ViewMeasures:

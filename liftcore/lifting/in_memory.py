@@ -24,7 +24,7 @@ from liftcore.runtime.device import Device
 from liftcore.runtime.progress import Timings
 from liftcore.scene.neighbours import SplatGraph
 from liftcore.scene.splats import Splats
-from liftcore.solve.aggregate import Aggregation, aggregate, solve_from_kept_regions
+from liftcore.solve.aggregate import Aggregation, aggregate
 from liftcore.solve.closed_form import solve
 from liftcore.solve.consensus import mask_consensus
 from liftcore.solve.diagnostics import ViewMeasures, measure_samples
@@ -139,7 +139,7 @@ class InMemory(LiftSteps[SceneWeights]):
         result = replace(W.with_factors(reweighting.factors), consensus=None, reweighting=reweighting)
         return result, reweighting.reliability
 
-    def solve(self, W: SceneWeights, clusters: RegionObjects | None) -> tuple[Tensor, SplatSupport]:
+    def solve(self, W: SceneWeights) -> tuple[Tensor, SplatSupport]:
         solution = solve(
             W.weights, W.geometry.codebook, getattr(torch, self.settings.dtype), self.timings.progress,
             means=self.splats.means, threads=self.threads, memory=W.memory,
@@ -173,22 +173,9 @@ class InMemory(LiftSteps[SceneWeights]):
             self.timings.progress, self.threads,
         )  # fmt: skip
 
-    def aggregate(self, W: SceneWeights, X: Tensor, clusters: RegionObjects | None) -> tuple[Tensor, Aggregation]:
-        settings, reweighting, guard_inputs = self.settings, W.reweighting, None
-        if settings.aggregation_guard and reweighting and reweighting.feature_consistency is not None:
-            guard_inputs = W.weights, reweighting.directions, reweighting.feature_consistency
-        X, aggregation = aggregate(
-            X, W.geometry.total_weight().numpy(), self.splats, W.raster, W.views, settings, self.timings.progress,
-            self.threads, objects=clusters, guard_inputs=guard_inputs,
-        )  # fmt: skip
-        if not settings.aggregation_resolve:
-            return X, aggregation
-        with self.timings.stage("resolve"):
-            X, facts = solve_from_kept_regions(
-                X, aggregation, W.weights, W.geometry.codebook, W.row_sums(), self.timings.progress,
-                means=self.splats.means, threads=self.threads,
-            )  # fmt: skip
-        return X, replace(aggregation, facts=aggregation.facts | facts)
+    def aggregate(self, W: SceneWeights, X: Tensor) -> tuple[Tensor, Aggregation]:
+        total_weight, progress = W.geometry.total_weight().numpy(), self.timings.progress
+        return aggregate(X, total_weight, W.raster, W.views, self.settings, progress, self.threads)
 
     def measure(self, W: SceneWeights, X: Tensor) -> ViewMeasures:
         return measure_samples(W.geometry.samples, X, W.geometry.books, self.threads)

@@ -40,7 +40,6 @@ class LiftInputs:
         splats = check_splats_and_threads(splats, threads)
         lift_settings, source_views = lift_settings.for_splats(splats), as_views(views)
         lifted = LiftViews.of(source_views, cameras, lift_settings)
-        masks = lift_settings.aggregation and any(lifted.features.is_regions(name) for name in lifted.names)
-        if lift_settings.aggregation and not (masks and lift_settings.clusters_by_masks):
+        if lift_settings.aggregation:
             require_hdbscan()
         return cls(splats, source_views, lifted, lift_settings)

@@ -135,9 +135,8 @@ def _run(
     objects, node_vectors = find_objects(steps, W, statistics.masks, settings, timings)
     levels_apart = needs_separate_levels(node_vectors, len(plan.views))
     W, reliability = reweigh(steps, W, statistics.masks, levels_apart, settings, timings)
-    clusters = objects if settings.clusters_by_masks else None
     with timings.stage("solve"):
-        X, support = steps.solve(W, clusters)
+        X, support = steps.solve(W)
     facts = dict[str, Any]()
     if settings.cg_steps or settings.reference_channels:
         with timings.stage("rays"):
@@ -148,11 +147,11 @@ def _run(
             X, facts["smoothing"] = steps.smooth(W, X, support)
     if settings.aggregation:
         with timings.stage("aggregate"):
-            X, aggregation = steps.aggregate(W, X, clusters)
+            X, aggregation = steps.aggregate(W, X)
         facts["aggregation"] = aggregation.facts
     if settings.robust_steps:
         facts["reweighting"] = reweighting_facts(statistics.levels, reliability, support.confidence, levels_apart)
-    if objects and node_vectors and settings.objects:
+    if objects and node_vectors:
         facts["objects"] = object_facts(objects, node_vectors)
     with timings.step("certify"):
         measures = steps.measure(W, X)
@@ -168,7 +167,7 @@ def _run(
         cluster=aggregation.clusters if aggregation else None,
         cluster_features=aggregation.cluster_features if aggregation else None,
         embeddings=torch.from_numpy(table.embeddings) if table else None,
-        **(object_tensors(objects, node_vectors) if objects and node_vectors and settings.objects else {}),
+        **(object_tensors(objects, node_vectors) if objects and node_vectors else {}),
     )
     return steps.deliver(W, lift)
 

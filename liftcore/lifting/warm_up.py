@@ -8,11 +8,9 @@ import numpy as np
 import torch
 
 from liftcore.raster.cpu.warm_up import warm_up
-from liftcore.solve.aggregate import cluster_consistency
 from liftcore.solve.closed_form import solve
 from liftcore.solve.codebook import Codebook, ViewCodebook
 from liftcore.solve.consensus import mask_consensus
-from liftcore.solve.directions import RegionDirections
 from liftcore.solve.objects import region_objects
 from liftcore.solve.reweight import reweighting_factors
 from liftcore.solve.smooth import warm_up_smoothing
@@ -31,7 +29,7 @@ def warm_up_lift(kernel: Kernel, device: Device, settings: LiftSettings) -> None
     W = one_view(first, torch.tensor([0, 1]), first, unit, first, unit, regions=1)
     book = Codebook((ViewCodebook(unit[None]),))
     solve(W, book, torch.float32, threads=1)
-    if settings.objects or settings.aggregation:
+    if settings.objects:
         region_objects(W, np.zeros(1, np.int8), np.ones(1), 1)
     if settings.consensus:
         mask_consensus(W, np.zeros(1, np.int8), 1)
@@ -39,5 +37,3 @@ def warm_up_lift(kernel: Kernel, device: Device, settings: LiftSettings) -> None
         reweighting_factors(W, book, 1, principal=1, threads=1, reliability=torch.ones(1, dtype=torch.bool))
     if settings.smoothness:
         warm_up_smoothing()
-    if settings.aggregation:
-        cluster_consistency(W, RegionDirections.of_weights(W, book, 1), first, unit[None], 1)

@@ -17,11 +17,12 @@ from torch import Tensor
 from liftcore.errors import Unavailable
 from liftcore.runtime.cores import cores
 from liftcore.runtime.one_thread import one_thread
-from liftcore.scene.splats import Splats
-from liftcore.scene.touching import touching
 from liftcore.values.settings import LiftSettings
 
 NO_CLUSTER = -1
+SAMPLE = 10_000  # splats that HDBSCAN clusters; every other splat joins the nearest cluster
+CHANNELS = 50  # principal components that HDBSCAN sees
+NEIGHBOURS = 10  # on which the density at a splat depends (HDBSCAN's min_samples)
 BLOCK = 8_192  # rows converted to float32 at once; fixed, so that products have one shape on any machine
 FULL_ODDS_WEIGHT = 1.0  # total weight, in rays, from which a splat has full odds to be sampled
 REACH = 1.5  # a cluster takes splats up to this multiple of the distance from its centre
@@ -68,21 +69,21 @@ def cluster_splats(
     count = features.shape[0]
     has_feature = nonzero_rows(features)
     odds = np.where(has_feature, np.minimum(total_weight, FULL_ODDS_WEIGHT), 0.0)
-    rows = draw(odds, settings.aggregation_sample, settings.seed)
+    rows = draw(odds, SAMPLE, settings.seed)
     share = rows.size / max(int((odds > 0).sum()), 1)
-    smallest = max(2 * settings.aggregation_neighbours, 2, round(settings.aggregation_cluster_size * share))
-    facts: dict[str, Any] = {"clustered_by": "hdbscan", "sample": rows.size, "smallest_in_sample": smallest}
+    smallest = max(2 * NEIGHBOURS, round(settings.aggregation_cluster_size * share))
+    facts: dict[str, Any] = {"sample": rows.size, "smallest_in_sample": smallest}
     none = torch.full((count,), NO_CLUSTER, dtype=torch.int32)
     no_clusters = Clustering(none, 0, facts | {"sample_noise_share": 1.0})
     if rows.size < 2 * smallest:
         return no_clusters
     sample = features[torch.from_numpy(rows)]
-    directions = directions_of(sample, settings.aggregation_channels)
+    directions = directions_of(sample, CHANNELS)
     if directions is None:
         return no_clusters
     with one_thread():
         points = directions.coordinates(sample)
-    sample_labels = hdbscan_labels(points, smallest, settings.aggregation_neighbours, settings.seed)
+    sample_labels = hdbscan_labels(points, smallest, settings.seed)
     clusters = int(sample_labels.max()) + 1
     if clusters == 0:
         return no_clusters
@@ -91,23 +92,6 @@ def cluster_splats(
     )
     facts["sample_noise_share"] = float((sample_labels < 0).mean())
     return Clustering(torch.from_numpy(labels), clusters, facts)
-
-
-def split_by_touch(clustering: Clustering, splats: Splats, smallest: int, threads: int | None = None) -> Clustering:
-    """Split each cluster into groups of touching splats; groups of fewer than ``smallest`` have no cluster.
-
-    A mask shows one object: of two similar objects in one cluster, neither's mask matches the footprint of both.
-    """
-    before, count = clustering.labels.numpy(), 0
-    labels = np.full(before.size, NO_CLUSTER, np.int32)
-    for cluster in range(clustering.count):
-        rows = np.flatnonzero(before == cluster)
-        groups = touching(splats, rows, threads)
-        is_large = np.bincount(groups) >= smallest
-        numbers = np.where(is_large, count + np.cumsum(is_large) - 1, NO_CLUSTER)
-        labels[rows] = numbers[groups]
-        count += int(is_large.sum())
-    return Clustering(torch.from_numpy(labels), count, {**clustering.facts, "clustered_by": "touching"})
 
 
 def nonzero_rows(features: Tensor) -> np.ndarray:
@@ -147,11 +131,11 @@ def require_hdbscan() -> None:
     """
     if find_spec("hdbscan") is None:
         expected = "the package hdbscan, for clusters of features"
-        hint = "pip install 'splatlift[aggregation]', or use aggregation_clusters=graph if views have masks"
+        hint = "pip install 'splatlift[aggregation]', or set aggregation=false"
         raise Unavailable("aggregation", expected=expected, got="none", hint=hint)
 
 
-def hdbscan_labels(points: np.ndarray, smallest: int, neighbours: int, seed: int) -> np.ndarray:
+def hdbscan_labels(points: np.ndarray, smallest: int, seed: int) -> np.ndarray:
     """Return HDBSCAN's labels [n] i64 of points [n, D], -1 = noise (Campello, Moulavi and Sander 2013).
 
     Equal points would have infinite density, so seeded noise of float16's resolution is added first.
@@ -162,7 +146,7 @@ def hdbscan_labels(points: np.ndarray, smallest: int, neighbours: int, seed: int
     shift *= RESOLUTION / max(np.sqrt(points.shape[1]), 1.0)
     # Prim's algorithm is exact, and its time depends on n alone; Boruvka's, the default, is up to twice as slow.
     model = hdbscan.HDBSCAN(
-        min_cluster_size=smallest, min_samples=neighbours, algorithm="prims_kdtree", core_dist_n_jobs=1
+        min_cluster_size=smallest, min_samples=NEIGHBOURS, algorithm="prims_kdtree", core_dist_n_jobs=1
     )
     return model.fit(points.astype(np.float64) + shift).labels_
 

@@ -43,8 +43,7 @@ an edge would lose their weight there.
 themselves, and geometry counts more the less they agree. This exponent leaves correct masks unchanged.
 
 **Confidence** of a splat is the mean of c_jm over its entries, by their final weights: the agreement of independent
-views. **Feature consistency** of a splat is the same mean of ``(1 - p) c_jm + p c``: how well its own feature
-explains its views, where a splat of a single view has the scene's mean, not zero.
+views.
 
 **Blocks of splats.** Cosines, factors and scores are functions of a splat's own row of W (`BlockReweighter`, on any
 block of splats). From the scene they need c, r and the r_m: sums over all splats, by pieces (`SceneConsistency`).
@@ -82,9 +81,7 @@ class Reweighting:
     """Factors and scores of a reweighting of W."""
 
     factors: Tensor  # [nnz] f32, of each entry of W; the sums of rows do not change
-    directions: RegionDirections  # of the compared regions
     confidence: Tensor | None  # [P] f32 in 0..1; None after no step
-    feature_consistency: Tensor | None  # [P] f32 in 0..1, of a splat's own feature with its views; None likewise
     reliability: float | None = None  # r, the median over regions; None if not requested
 
 
@@ -147,7 +144,7 @@ def reweighting_factors(
     """
     block = BlockReweighter(W, means, threads, levels)
     directions = RegionDirections.of_weights(W, codebook, principal, threads)
-    factors, scores, scene = None, torch.zeros(2, 0, dtype=torch.float32), None
+    factors, confidence, scene = None, None, None
     for step in range(steps):
         table = np.zeros((2, codebook.regions + block.levels))
 
@@ -156,12 +153,12 @@ def reweighting_factors(
 
         cosines = block.cosines(directions, factors, reliability is not None, add)
         scene = SceneConsistency.of(table, reliability, block.level)
-        scores = block.weigh(cosines, factors, scene, consensus)
+        confidence = block.weigh(cosines, factors, scene, consensus)
         factors = cosines
         progress("robust", step + 1, steps, "steps")
     if factors is None or scene is None:
-        return Reweighting(torch.ones_like(W.weight), directions, None, None)
-    return Reweighting(factors, directions, scores[0], scores[1], scene.reliability)
+        return Reweighting(torch.ones_like(W.weight), None)
+    return Reweighting(factors, confidence, scene.reliability)
 
 
 def level_numbers(levels: np.ndarray | None, count: int) -> np.ndarray:
@@ -272,16 +269,16 @@ class BlockReweighter:
             consensus: [nnz] f32 of each entry (`mask_consensus`); None: no consensus.
 
         Returns:
-            [2, n] f32: confidence and feature consistency of each splat.
+            [n] f32, the confidence of each splat.
         """
-        scores = torch.zeros(2, self.W.indptr.shape[0] - 1, dtype=torch.float32)
-        parts = cosines, scene.regions, _or_ones(consensus), scores, scene.mean_cosine, scene.power
+        confidence = torch.zeros(self.W.indptr.shape[0] - 1, dtype=torch.float32)
+        parts = cosines, scene.regions, _or_ones(consensus), confidence, scene.mean_cosine, scene.power
         powers = ((np.arange(POWERS + 2) / POWERS) ** scene.power.numpy()[:, None]).astype(np.float32)
         arrays = [*self._arrays(_or_ones(factors)), *(part.numpy() for part in parts), powers]
         # In the order of memory: nothing is shared by neighbours, unlike in `cosines`.
         blocks = [(first, last, *arrays) for first, last in self.W.blocks(BLOCK_ROWS, BLOCK_ENTRIES)]
         run_each(weigh_rows, blocks, self.threads)
-        return scores
+        return confidence
 
     def _entries(self) -> Tensor:
         """Return zeros for the entries of W, [nnz] f32."""
@@ -301,7 +298,7 @@ def _or_ones(factors: Tensor | None) -> Tensor:
 
 @kernel
 def weigh_rows(
-    first_row, last_row, indptr, region, weight, factors, view, level, cosines, reliable, consensus, scores,
+    first_row, last_row, indptr, region, weight, factors, view, level, cosines, reliable, consensus, confidence,
     mean_cosine, power, powers,
 ):  # fmt: skip
     """Compute `BlockReweighter.weigh` of rows ``first_row..last_row``.
@@ -310,12 +307,12 @@ def weigh_rows(
     """
     levels = mean_cosine.size
     before, after, gain = np.empty(levels), np.empty(levels), np.empty(levels)
-    cosine_sums, blended_sums, view_shares = np.empty(levels), np.empty(levels), np.empty(levels)
+    cosine_sums, view_shares = np.empty(levels), np.empty(levels)
     for row in range(first_row, last_row):
         first, last = indptr[row], indptr[row + 1]
         if first == last:
             continue
-        before[:] = after[:] = cosine_sums[:] = blended_sums[:] = 0.0
+        before[:] = after[:] = cosine_sums[:] = 0.0
         for k in range(first, last):
             before[level[region[k]]] += weight[k]
         k = first
@@ -329,8 +326,7 @@ def weigh_rows(
             for n in range(begin, k):
                 a = level[region[n]]
                 share = min(view_shares[a], 1.0)
-                blended = (1.0 - share) * cosines[n] + share * mean_cosine[a]
-                scaled = blended * reliable[region[n]]
+                scaled = ((1.0 - share) * cosines[n] + share * mean_cosine[a]) * reliable[region[n]]
                 if consensus.size > 0:
                     if consensus[n] > STEEP:
                         place = consensus[n] * np.float32(POWERS)
@@ -340,19 +336,16 @@ def weigh_rows(
                         scaled *= consensus[n] ** np.float32(power[a])
                 after[a] += weight[n] * scaled
                 cosine_sums[a] += weight[n] * scaled * cosines[n]
-                blended_sums[a] += weight[n] * scaled * blended
                 cosines[n] = scaled
-        total = cosine_total = blended_total = 0.0
+        total = cosine_total = 0.0
         for a in range(levels):
             gain[a] = before[a] / after[a] if after[a] > 0.0 else 0.0
             total += before[a]
             cosine_total += gain[a] * cosine_sums[a]
-            blended_total += gain[a] * blended_sums[a] if after[a] > 0.0 else before[a] * mean_cosine[a]
         for n in range(first, last):
             a = level[region[n]]
             cosines[n] = cosines[n] * gain[a] if gain[a] > 0.0 else 1.0
-        scores[0, row] = cosine_total / total if total > 0.0 else 0.0
-        scores[1, row] = blended_total / total if total > 0.0 else mean_cosine[0]
+        confidence[row] = cosine_total / total if total > 0.0 else 0.0
 
 
 @kernel

@@ -38,14 +38,8 @@ class LiftOptions(TypedDict, total=False):
     objects: bool | Literal["auto"]
     dtype: Literal["float16", "float32"]
     aggregation: bool
-    aggregation_clusters: Literal["hdbscan", "touching", "graph", "auto"]
-    aggregation_guard: bool
     aggregation_iou: float
     aggregation_cluster_size: int
-    aggregation_neighbours: int
-    aggregation_sample: int
-    aggregation_resolve: bool
-    aggregation_channels: int
     diagnostic_rays: int
     seed: int
     smoothness: float

@@ -57,9 +57,9 @@ class Preset(StrEnum):
     MEAN = "mean"  # the same ray, and the plain mean over the views that see the splat (Semantic Gaussians)
 
 
-_REWEIGHTED = {"reliability": "auto", "consensus": "auto", "aggregation_guard": True}  # they need a robust step
+_REWEIGHTED = {"reliability": "auto", "consensus": "auto"}  # they need a robust step
 _PRESETS: dict[Preset, dict[str, Any]] = {
-    Preset.DEFAULT: {"robust_steps": 1, **_REWEIGHTED, "aggregation_clusters": "auto"},
+    Preset.DEFAULT: {"robust_steps": 1, **_REWEIGHTED},
     Preset.ROW_SUM: {},
     Preset.TIKHONOV: {"power": 2, "lift_gain": TIKHONOV_GAIN, "render_gain": TIKHONOV_GAIN},
     Preset.ARGMAX: {"selection": Selection.TOP_K, "k": 1},
@@ -112,11 +112,7 @@ GROUPS = {  # of the settings, for people who read all of them
     "pixels, views and levels": ("stride", "view_stride", "coverage", "view_cosine", "levels", "grid_reading"),
     "the rasterizer": ("kernel", "antialiased", "lift_gain", "render_gain", "alpha_cap", "transmittance_stop"),
     "wrong masks": ("robust_steps", "robust_directions", "reliability", "consensus"),
-    "objects and clusters": (
-        "objects", "aggregation", "aggregation_clusters", "aggregation_guard", "aggregation_iou",
-        "aggregation_cluster_size", "aggregation_neighbours", "aggregation_sample", "aggregation_channels",
-        "aggregation_resolve",
-    ),
+    "objects and clusters": ("objects", "aggregation", "aggregation_iou", "aggregation_cluster_size"),
     "neighbours": ("smoothness",),
     "least squares": ("cg_steps", "damping", "cg_basis", "reference_channels"),
     "the result, and where it is made": ("dtype", "diagnostic_rays", "seed", "device"),
@@ -131,8 +127,7 @@ class LiftSettings(PlainModel):
     preset: Preset = Field(
         Preset.DEFAULT,
         description="sets `selection`, `k`, `mass`, `weight_floor`, `power`, `lift_gain` and `render_gain`; "
-        "`default` also `robust_steps`, `reliability`, `consensus`, `aggregation_clusters` and "
-        "`aggregation_guard`",
+        "`default` also `robust_steps`, `reliability` and `consensus`",
     )
     quality: Quality = Field(
         Quality.EXACT,
@@ -201,7 +196,7 @@ class LiftSettings(PlainModel):
         ge=0,
         le=100,
         description="how often each region's weight at a splat is multiplied by its agreement with the other "
-        "views; 1 is enough. 0 turns off the next three and `aggregation_guard` as well",
+        "views; 1 is enough. 0 turns off the next three",
     )
     robust_directions: int = Field(
         DIRECTIONS,
@@ -228,18 +223,7 @@ class LiftSettings(PlainModel):
     dtype: Literal["float16", "float32"] = Field(
         "float16", description="how features are stored, or `float32`; what float16 cannot hold is stored as float32"
     )
-    aggregation: bool = Field(False, description="Post-Lifting Aggregation: one feature a cluster of splats")
-    aggregation_clusters: Literal["hdbscan", "touching", "graph", "auto"] = Field(
-        "hdbscan",
-        description="what makes clusters: `hdbscan` on features, as published; `touching`, its clusters parted "
-        "where splats do not touch; `graph`, the objects of masks; `auto` is `graph` where there are "
-        "masks and no `aggregation_resolve`, else `touching`",
-    )
-    aggregation_guard: bool = Field(
-        False,
-        description="with a robust step: a splat takes its cluster's feature only if this agrees with the splat's "
-        "views at least as well as the splat's own feature",
-    )
+    aggregation: bool = Field(False, description="one feature a cluster of splats, by HDBSCAN")
     aggregation_iou: float = Field(
         0.75,
         gt=0,
@@ -250,21 +234,6 @@ class LiftSettings(PlainModel):
     aggregation_cluster_size: int = Field(
         500, ge=2, le=10_000_000, description="the least number of splats in a cluster"
     )
-    aggregation_neighbours: int = Field(
-        10, ge=1, le=1_000, description="neighbours that the density at a splat depends on (HDBSCAN's `min_samples`)"
-    )
-    aggregation_sample: int = Field(
-        10_000,
-        ge=2,
-        le=50_000,
-        description="number of sampled splats that HDBSCAN clusters; every other splat joins the nearest cluster",
-    )
-    aggregation_resolve: bool = Field(
-        False,
-        description="splats that take no cluster's feature are solved again from the kept regions, where these "
-        "have most of their weight",
-    )
-    aggregation_channels: int = Field(50, ge=1, le=1_024, description="principal components that HDBSCAN sees")
     diagnostic_rays: int = Field(
         4_000,
         ge=0,
@@ -285,7 +254,7 @@ class LiftSettings(PlainModel):
         description="strength of the smoothing over splats that are near in place and in colour: 0 is off, 4 helps "
         "grids and few views of masks. A large number loses accuracy where features vary within an object; "
         "`splatlift tradeoff` tries it on held-out views. "
-        "It runs on the CPU, also with `device=cuda`. Refused with an `engine`, and with `aggregation_resolve`",
+        "It runs on the CPU, also with `device=cuda`. Refused with an `engine`",
     )
     cg_steps: int = Field(
         0,
@@ -342,23 +311,8 @@ class LiftSettings(PlainModel):
     @model_validator(mode="after")
     def _check_combinations(self) -> Self:
         """Refuse combinations of settings that contradict each other."""
-        if self.aggregation_resolve and self.levels == "composite":
-            requirement = (
-                "other levels than composite, which cut to pieces the regions that aggregation_resolve drops"
-            )
-            raise PydanticCustomError("whole_regions", "{expected}", {"expected": requirement})
-        if self.aggregation_resolve and self.aggregation_clusters == "graph":
-            requirement = (
-                "aggregation_clusters=hdbscan beside aggregation_resolve: masks that make clusters are all kept"
-            )
-            raise PydanticCustomError("whole_regions", "{expected}", {"expected": requirement})
-        if self.aggregation_resolve and self.smoothness:
-            expected = "smoothness=0 beside aggregation_resolve, whose features know no neighbours"
-            raise PydanticCustomError("whole_regions", "{expected}", {"expected": expected})
-        if (self.reliability or self.consensus or self.aggregation_guard) and not self.robust_steps:
-            requirement = (
-                "robust_steps of 1 or more beside reliability, consensus and aggregation_guard, which need a step"
-            )
+        if (self.reliability or self.consensus) and not self.robust_steps:
+            requirement = "robust_steps of 1 or more beside reliability and consensus, which need a step"
             raise PydanticCustomError("needs_robust_step", "{expected}", {"expected": requirement})
         return self
 
@@ -410,29 +364,20 @@ class LiftSettings(PlainModel):
         return Weighting(self.power, self.selection, self.k, self.mass, self.weight_floor)
 
     @property
-    def clusters_by_masks(self) -> bool:
-        """True if masks, where there are any, make the clusters of the aggregation; then no region is dropped."""
-        auto_clusters = self.aggregation_clusters == "auto" and not self.aggregation_resolve
-        return self.aggregation and (auto_clusters or self.aggregation_clusters == "graph")
-
-    @property
     def weighs_rows(self) -> bool:
         """True if W needs a column for each region; else levels may share one for each distinct tuple of labels."""
-        by_settings = self.robust_steps or self.aggregation_resolve or self.objects is True
-        return bool(by_settings or self.clusters_by_masks)
+        return bool(self.robust_steps) or self.objects is True
 
     def finds_objects(self, masks: bool) -> bool:
         """Return True if objects are looked for, where views have masks or not.
 
         Raises:
-            InvalidSettings: objects, or clusters from masks, are required, and no view has masks.
+            InvalidSettings: objects are required, and no view has masks.
         """
-        graph = self.aggregation and self.aggregation_clusters == "graph"
-        for name, requested in (("objects", self.objects is True), ("aggregation_clusters", graph)):
-            if requested and not masks:
-                expected = "views with masks: objects are what masks of several views keep together"
-                raise InvalidSettings(name, expected=expected, got=NO_MASKS, hint="take auto")
-        return masks and bool(self.objects or self.clusters_by_masks)
+        if self.objects is True and not masks:
+            expected = "views with masks: objects are what masks of several views keep together"
+            raise InvalidSettings("objects", expected=expected, got=NO_MASKS, hint="take auto")
+        return masks and bool(self.objects)
 
     def uses_consensus(self, masks: bool) -> bool:
         """Return True if masks are compared with one another, where views have masks or not.
@@ -445,31 +390,21 @@ class LiftSettings(PlainModel):
             raise InvalidSettings("consensus", expected=expected, got=NO_MASKS, hint="leave it at auto")
         return masks and bool(self.consensus)
 
-    def check_blocks(self, masks: bool) -> None:
+    def check_blocks(self) -> None:
         """Refuse what no engine can work on in blocks of views and splats.
 
-        Args:
-            masks: True if any view has masks, which make clusters in blocks.
-
         Raises:
-            InvalidSettings: least squares, smoothness, or an aggregation by HDBSCAN.
+            InvalidSettings: least squares, smoothness, or an aggregation.
         """
-        requested = [name for name in ("cg_steps", "reference_channels", "smoothness") if getattr(self, name)]
-        if self.aggregation and not self.clusters_by_masks:
-            # aggregation_clusters is never empty: without clusters by masks HDBSCAN makes them, which no engine does
-            requested += [name for name in ("aggregation_clusters", "aggregation_resolve") if getattr(self, name)]
-        unsupported = [f"{name}={getattr(self, name)}" for name in requested]
-        if self.aggregation and self.clusters_by_masks and not masks:
-            unsupported.append(f"aggregation_clusters={self.aggregation_clusters} of grids")
-        if unsupported:
-            changes = [f"{name}=0" for name in requested if name in ("cg_steps", "reference_channels", "smoothness")]
-            if len(changes) < len(unsupported):
-                changes.append("aggregation=false, or aggregation_clusters=graph where views have masks")
+        whole = ("cg_steps", "reference_channels", "smoothness", "aggregation")
+        requested = {name: getattr(self, name) for name in whole if getattr(self, name)}
+        if requested:
+            changes = (f"{name}={'false' if value is True else 0}" for name, value in requested.items())
             raise InvalidSettings(
                 "engine",
                 expected="settings that work on blocks of splats: least squares need all rays, smoothness and "
-                "clusters by HDBSCAN all features in one place",
-                got=", ".join(unsupported),
+                "clusters all features in one place",
+                got=", ".join(f"{name}={value}" for name, value in requested.items()),
                 hint=f"set {' and '.join(changes)}; or lift without an engine",
             )
 

@@ -45,16 +45,13 @@ MISTAKES = {
     "misnamed": (Mistakes(0, 0, 0.3, 0, 1.0), 0.0),
 }
 PACKS = ("features_hard", "features", "features_clean", "grids")
-AGGREGATED = {"aggregation": True}
 SETTINGS: dict[str, dict[str, Any]] = {
     "row-sum": {"preset": "row-sum"},
     "tikhonov": {"preset": "tikhonov"},
     "robust": {"preset": "row-sum", "robust_steps": 1},
     "and reliability": {"preset": "default", "consensus": False},
     "default": {"preset": "default"},
-    "published": {"preset": "default", **AGGREGATED, "aggregation_clusters": "hdbscan", "aggregation_guard": False},
-    "touching": {"preset": "default", **AGGREGATED, "aggregation_clusters": "touching"},
-    "aggregated": {"preset": "default", **AGGREGATED},
+    "published": {"preset": "default", "aggregation": True},
 }
 
 

@@ -68,8 +68,6 @@ class Job:
     usual_share: float | None = None  # the mean share of mask consensus; None where there is none
     by_region: bool = False  # True if each region has one weight
     levels_apart: bool = False  # True if regions are compared with those of their own level alone
-    clusters: int = 0  # whose features splats may take
-    has_guard: bool = False  # True if they do only where it explains them
 
     @property
     def view_pieces(self) -> int:
@@ -97,12 +95,8 @@ class Job:
         """Return the file of a step of that piece."""
         return self.folder / f"{step}-{number:05}.safetensors"
 
-    def solved_file(self, number: int) -> Path:
-        """Return the file of X of a block of splats from the solve, before splats take features of clusters."""
-        return self.piece_file("solved", number) if self.clusters else self.features_file(number)
-
     def features_file(self, number: int) -> Path:
-        """Return the file of the final X of a block of splats."""
+        """Return the file of X of a block of splats."""
         return self.folder / "lift" / features_file(number)
 
     def columns_file(self, number: int) -> Path:

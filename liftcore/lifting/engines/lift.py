@@ -39,8 +39,6 @@ from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Timings
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
-from liftcore.solve.aggregate import MASKS_MADE, Aggregation, aggregation_facts, cluster_means
-from liftcore.solve.clusters import Clustering
 from liftcore.solve.consensus import mean_share
 from liftcore.solve.diagnostics import ViewMeasures, join_measures, measure_view
 from liftcore.solve.directions import RegionDirections
@@ -94,8 +92,7 @@ def steps_in_blocks(
     if not hasattr(engine, "run"):
         hint = "LocalEngine() or RayEngine(address) makes one"
         raise InvalidSettings("engine", expected="an engine, or None", got=repr(engine)[:80], hint=hint)
-    views = inputs.views
-    inputs.settings.check_blocks(any(views.features.is_regions(name) for name in views.names))
+    inputs.settings.check_blocks()
     with _folder(folder or engine.scratch, permanent=folder is not None) as place, _in_words(place), one_thread():
         try:
             yield InBlocks(engine, place, inputs, timings, threads, rows, selected)
@@ -290,7 +287,6 @@ class InBlocks(LiftSteps[Job]):
         labels, total_weight = _column(W, "labels-1", "labels"), _column(W, "rows", "total_weight")
         weights = _sums(W, "labels-1", (1, number * groups.views))
         numbers = node_numbering(labels, total_weight, tree)
-        steps.write_piece(W.folder / steps.OBJECTS, {"object": numbers.object})
         return number_objects(labels, tree, numbers, weights.reshape(number, groups.views))
 
     def _label(self, job: Job, step: int, tree: RegionTree) -> None:
@@ -326,14 +322,14 @@ class InBlocks(LiftSteps[Job]):
             steps.write_scene_consistency(W, step, scene)
         return W, scene.reliability if scene else None
 
-    def solve(self, W: Job, clusters: RegionObjects | None) -> tuple[Tensor, SplatSupport]:
-        job = _with_clusters(W, clusters)
+    def solve(self, W: Job) -> tuple[Tensor, SplatSupport]:
+        job = W
         self.run("solve", steps.solve, job, job.splat_pieces)
         sums, total_weight = _column(job, "rows", "sums"), _column(job, "rows", "total_weight")
         view_consistency, robust = _column(job, "columns", "view_consistency"), job.settings.robust_steps
         confidence = torch.from_numpy(_column(job, "columns", "confidence")) if robust else None
         support = SplatSupport(sums, torch.from_numpy(total_weight), torch.from_numpy(view_consistency), confidence)
-        return _mapped(job, job.solved_file), support
+        return _mapped(job, job.features_file), support
 
     def solve_least_squares(self, W: Job, X: Tensor, visible: np.ndarray) -> NoReturn:
         """See the protocol; `LiftSettings.check_blocks` rejects settings that need it."""
@@ -343,25 +339,9 @@ class InBlocks(LiftSteps[Job]):
         """See the protocol; `LiftSettings.check_blocks` rejects settings that need it."""
         raise AssertionError("the graph of neighbours crosses blocks")
 
-    def aggregate(self, W: Job, X: Tensor, clusters: RegionObjects | None) -> tuple[Tensor, Aggregation]:
-        """See the protocol: clusters of masks alone."""
-        assert clusters is not None, "check_blocks rejects clusters of features"
-        job = _with_clusters(W, clusters)
-        merged, merged_mask, guard_mask = (
-            torch.zeros(0, job.channels, dtype=job.dtype),
-            torch.zeros(job.splats, dtype=torch.bool),
-            None,
-        )
-        if job.clusters:
-            merged = cluster_means(_sums(job, "columns", (job.channels + 1, job.clusters)), job.dtype)
-            steps.write_piece(job.folder / steps.MERGED, {"merged": merged})
-            self.run("aggregate", steps.spread, job, job.splat_pieces)
-            merged_mask = torch.from_numpy(_column(job, "merged", "merged_mask"))
-            guard_mask = torch.from_numpy(_column(job, "merged", "guard_mask")) if job.has_guard else None
-            X = _mapped(job, job.features_file)
-        clustering = Clustering(torch.from_numpy(clusters.labels), job.clusters, {"clustered_by": "graph"})
-        facts = (MASKS_MADE if job.clusters else {}) | aggregation_facts(clustering, merged, merged_mask, guard_mask)
-        return X, Aggregation(clustering.labels, merged, facts, ~merged_mask, (None,) * len(job.names))
+    def aggregate(self, W: Job, X: Tensor) -> NoReturn:
+        """See the protocol; `LiftSettings.check_blocks` rejects settings that need it."""
+        raise AssertionError("clusters need all features in one place")
 
     def measure(self, W: Job, X: Tensor) -> ViewMeasures:
         """See the protocol: a view at a time."""
@@ -373,14 +353,6 @@ class InBlocks(LiftSteps[Job]):
         columns = {name: part for name, part in vars(lift).items() if isinstance(part, Tensor) and name != "features"}
         write_index(W.folder / "lift", columns, W.splat_pieces, lift.metadata.model_dump_json())
         return load_lift(W.folder / "lift")
-
-
-def _with_clusters(job: Job, clusters: RegionObjects | None) -> Job:
-    """Return the job in which splats may take the features of clusters."""
-    if clusters is None:
-        return job
-    has_guard = bool(job.settings.aggregation_guard and job.settings.robust_steps)
-    return replace(job, clusters=clusters.count, has_guard=has_guard)
 
 
 def _pieces(job: Job, step: str) -> Iterator[dict[str, np.ndarray]]:

@@ -12,7 +12,6 @@ them up and writes the totals as files too. So the result is bitwise identical t
     share     views      the consensus of other views about their entries (`liftcore.solve.consensus`)
     compare   splats     cosines of regions with the other views (`liftcore.solve.reweight`)
     solve     splats     X, view consistency and confidence
-    spread    splats     X with the features of clusters (`liftcore.solve.aggregate`)
 
 A worker holds one piece: W of some views or of a block, in mapped files where it is large, and tables of size M, of
 which those of codebooks and directions take at most TABLE_BYTES.
@@ -21,7 +20,7 @@ which those of codebooks and directions take at most TABLE_BYTES.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache, wraps
 from itertools import pairwise
 from pathlib import Path
@@ -32,12 +31,10 @@ import torch
 from torch import Tensor
 
 from liftcore.io.safetensors_file import map_tensors, write_tensors
-from liftcore.io.shards import shard_at, write_rows
+from liftcore.io.shards import write_rows
 from liftcore.lifting.engines import blocks
 from liftcore.lifting.engines.blocks import Job, file_version, read_weights, scene_of
 from liftcore.runtime.one_thread import one_thread
-from liftcore.solve.aggregate import assign_features as give_features
-from liftcore.solve.aggregate import cluster_sums, guard, with_feature
 from liftcore.solve.closed_form import solve_rows
 from liftcore.solve.codebook import Codebook, ViewCodebook
 from liftcore.solve.consensus import SplatTuples, along_curve, region_shares, splat_tuples, with_mean
@@ -67,8 +64,6 @@ TUPLES = "tuples.safetensors"  # bases [pieces] i64, parents and members [T] i32
 CURVE = "curve.safetensors"  # bounds [2, 3] f64 of the splats with weight
 NODES = "nodes.safetensors"  # nodes and other_masks, i64
 TREE = "tree-{}.safetensors"  # of regions (`RegionTree`), by the step of `label`
-OBJECTS = "objects.safetensors"  # object [N + 1] i32, the object that each node of the tree is of
-MERGED = "merged.safetensors"  # merged [K, F], the features of the aggregation
 SCENE_CONSISTENCY = (
     "consistency-{}.safetensors"  # regions [M] f32, mean_cosine and power [K] f64, reliability [1] f64
 )
@@ -329,12 +324,6 @@ def label(job: Job, piece: int, threads: int | None) -> Piece:
     return {"labels": labels}, list(sums)
 
 
-def labels_of(job: Job, piece: int) -> np.ndarray:
-    """Return [n] i32: the object of each splat of a block, as the driver numbers them; -1 for none."""
-    labels = map_tensors(job.piece_file("labels-1", piece))[0]["labels"]
-    return mapped(job.folder / OBJECTS)["object"][labels]
-
-
 def _consensus(job: Job, block: SplatBlock, threads: int | None) -> Tensor | None:
     """Compute c_jm of the entries of a block [nnz] f32; None if no view has masks."""
     if job.usual_share is None:
@@ -380,12 +369,12 @@ def compared_levels(job: Job) -> np.ndarray | None:
 def _factors_after(
     job: Job, piece: int, block: SplatBlock, reweighter: BlockReweighter, step: int, threads: int | None
 ) -> tuple[Tensor, Tensor]:
-    """Compute the factors after ``step`` steps, at least one, and the scores of splats."""
+    """Compute the factors after ``step`` steps, at least one, and the confidence of splats."""
     cosines = torch.from_numpy(map_tensors(job.piece_file(f"cosines-{step - 1}", piece))[0]["cosines"])
     before = _before(job, piece, step - 1)
     factors = values_of(cosines.shape[0], torch.float32).copy_(cosines)
-    scores = reweighter.weigh(factors, before, scene_consistency(job, step - 1), _consensus(job, block, threads))
-    return factors, scores
+    confidence = reweighter.weigh(factors, before, scene_consistency(job, step - 1), _consensus(job, block, threads))
+    return factors, confidence
 
 
 def _before(job: Job, piece: int, step: int) -> Tensor | None:
@@ -408,57 +397,27 @@ def compare(job: Job, piece: int, threads: int | None) -> Piece:
 
 
 def _reweighted(job: Job, piece: int, block: SplatBlock, threads: int | None) -> tuple[RegionWeights, Tensor | None]:
-    """Compute W of a block after all robust steps, and the scores of splats [2, n]; None without a step."""
+    """Compute W of a block after all robust steps, and the confidence of splats [n]; None without a step."""
     if not job.settings.robust_steps:
         return block.W, None
     reweighter = _block_reweighter(job, block, threads)
-    factors, scores = _factors_after(job, piece, block, reweighter, job.settings.robust_steps, threads)
-    return scale_weights(block.W, factors), scores
+    factors, confidence = _factors_after(job, piece, block, reweighter, job.settings.robust_steps, threads)
+    return scale_weights(block.W, factors), confidence
 
 
 @one_thread()
 def solve(job: Job, piece: int, threads: int | None) -> None:
     """Write X of a block of splats with view consistency and confidence."""
-    columns_file, features_file = job.columns_file(piece), job.solved_file(piece)
+    columns_file, features_file = job.columns_file(piece), job.features_file(piece)
     if columns_file.exists() and features_file.exists():
         return
-    block, codebook, settings = _splat_block(job, piece), codebook_of(job), job.settings
-    W, scores = _reweighted(job, piece, block, threads)
+    block, codebook = _splat_block(job, piece), codebook_of(job)
+    W, confidence = _reweighted(job, piece, block, threads)
     X = torch.zeros(block.last - block.first, job.channels, dtype=job.dtype)
     rows = torch.nonzero(W.indptr.diff())[:, 0]
     squares = solve_rows(X, rows, W, codebook, means=block.means, threads=threads)
     write_rows(features_file, X)
     columns = {"view_consistency": squares.sqrt().clamp(0.0, 1.0).float()}
-    if scores is not None:
-        columns["confidence"] = scores[0]
-    parts = list[PieceSums]()
-    if job.clusters:
-        labels = labels_of(job, piece)
-        parts = list(cluster_sums(X, block.arrays["total_weight"], labels, job.clusters, threads))
-        if settings.aggregation_guard and scores is not None:
-            write_piece(job.piece_file("guard", piece), {"weight": W.weight, "consistency": scores[1]})
-    write_piece(columns_file, columns, parts)
-
-
-@one_thread()
-def spread(job: Job, piece: int, threads: int | None) -> None:
-    """Write X in which splats take the features of their clusters, and the mask of these splats."""
-    path = job.piece_file("merged", piece)
-    if path.exists() and job.features_file(piece).exists():
-        return
-    block, labels = _splat_block(job, piece), torch.from_numpy(labels_of(job, piece))
-    merged = torch.from_numpy(map_tensors(job.folder / MERGED)[0]["merged"])
-    shard = shard_at(job.solved_file(piece))
-    X = torch.from_numpy(np.fromfile(shard.path, shard.dtype, offset=shard.begin).reshape(shard.shape))
-    merged_mask = with_feature(labels, merged)
-    columns = dict[str, Tensor]()
-    if job.has_guard:
-        arrays = map_tensors(job.piece_file("guard", piece))[0]
-        weight, consistency = torch.from_numpy(arrays["weight"]), torch.from_numpy(arrays["consistency"])
-        W = replace(block.W, weight=weight)
-        columns["guard_mask"] = guard(
-            merged_mask, labels, merged, W, StoredDirections(job.folder), consistency, threads
-        )
-        merged_mask = merged_mask & ~columns["guard_mask"]
-    write_rows(job.features_file(piece), give_features(X, labels, merged, merged_mask))
-    write_piece(path, columns | {"merged_mask": merged_mask})
+    if confidence is not None:
+        columns["confidence"] = confidence
+    write_piece(columns_file, columns)

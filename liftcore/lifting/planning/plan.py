@@ -35,6 +35,7 @@ from liftcore.scene.cameras import Camera, Cameras, distortion_warning
 from liftcore.scene.compositing import TILE
 from liftcore.scene.render_mode import rendering_reason, rendering_warnings
 from liftcore.scene.splats import Splats
+from liftcore.solve.clusters import SAMPLE
 from liftcore.solve.codebook import LEAST_CHANNELS, TABLE_BYTES
 from liftcore.solve.consensus import BLOCK_ENTRIES
 from liftcore.solve.diagnostics import shape_warnings
@@ -64,7 +65,6 @@ BLOCK_BYTES = 9  # of an entry that lies by region
 OBJECT_BYTES = 12  # of an entry: the membership of its splat, the node, its place in the node's list
 CG_VECTORS, CG_CHANNELS = 14, 32  # [P, 32] f32 of conjugate gradients, with the images of a view
 CLUSTERING = 80_000_000  # of hdbscan and its dependencies
-TOUCHING_BYTES = 1_000  # of a splat, for the graph of splats that touch
 SMOOTHING_BYTES = 2_100  # of a splat: the graph while it is built, or with a block of channels
 SPARE = 0.9  # of the free memory: 10 % are left to other processes
 DEVICE_SPARE = 0.8  # of a GPU's free memory, which is fragmented
@@ -439,13 +439,9 @@ def memory_phases(
     if settings.smoothness:
         phases["smoothing"] = solved | {"smoothing": SMOOTHING_BYTES * splats.count}
     if settings.aggregation:
-        clusters = CLUSTERING + 24 * channels * min(splats.count, settings.aggregation_sample)
-        if settings.aggregation_clusters in ("auto", "touching"):  # afterwards, and of one cluster at a time
-            clusters = max(clusters, TOUCHING_BYTES * splats.count)
-        if settings.aggregation_resolve:
-            clusters += int(FACTOR_BYTES * of_all)  # W of kept regions alone
+        clusters = CLUSTERING + 24 * channels * min(splats.count, SAMPLE)
         phases["aggregation"] = solved | {"aggregation": clusters}
-        if masks and not settings.clusters_by_masks:  # regions are compared with rendered clusters
+        if masks:  # regions are compared with rendered clusters
             phases["aggregation"]["view"] = view
     return phases
 

@@ -116,7 +116,7 @@ def assert_same_metadata(left: lc.LiftResult, right: lc.LiftResult) -> None:
     [
         {"preset": "row-sum", "objects": True},
         {"preset": "default", "robust_steps": 2},
-        {"preset": "default", "aggregation": True, "dtype": "float32"},
+        {"preset": "default", "dtype": "float32"},
     ],
 )
 def test_blocks_give_the_bits_of_a_lift_in_memory(scene: dict[str, Any], overrides: dict[str, Any]) -> None:
@@ -128,9 +128,6 @@ def test_blocks_give_the_bits_of_a_lift_in_memory(scene: dict[str, Any], overrid
         result = in_blocks(engine, scene, settings)
         assert_same(result, expected)
         assert_same_metadata(result, expected)
-    if settings.aggregation:
-        assert result.cluster is not None and int(result.cluster.max()) >= 0
-        assert 0 < result.diagnostics["aggregation"]["changed"] < 1
 
 
 def test_worker_holds_the_splats_that_its_views_see(scene: dict[str, Any], tmp_path: Path) -> None:
@@ -258,7 +255,7 @@ def test_other_engines_go_on_from_the_pieces_of_each_stage(scene: dict[str, Any]
 @pytest.mark.parametrize(
     ("overrides", "got"),
     [
-        ({"aggregation": True, "aggregation_clusters": "hdbscan"}, "aggregation_clusters=hdbscan"),
+        ({"aggregation": True}, "aggregation=True"),
         ({"cg_steps": 2}, "cg_steps=2"),
         ({"reference_channels": 1}, "reference_channels=1"),
     ],
@@ -268,9 +265,6 @@ def test_what_needs_all_rays_or_features_is_refused_before(
 ) -> None:
     with pytest.raises(lc.InvalidSettings, match=f"engine: expected settings that work on blocks.*got {got}; set"):
         lc.lift(*scene.values(), engine=LocalEngine(), **overrides)
-    grids = {name: view for name, view in scene["views"].items() if isinstance(view, lc.FeatureGrid)}
-    with pytest.raises(lc.InvalidSettings, match="aggregation_clusters=auto of grids; set"):
-        lc.lift(scene["splats"], scene["cameras"], grids, aggregation=True, engine=LocalEngine())
 
 
 @pytest.fixture(scope="module")

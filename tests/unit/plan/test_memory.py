@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import pytest
 import torch
 
@@ -68,14 +65,8 @@ def test_clusters_that_are_rendered_are_planned_with_a_view() -> None:
     (camera,) = room_cameras(1, WIDTH, HEIGHT)
     views = {camera.name: DENSE["a region a pixel"]}
 
-    def aggregation(**settings: Any) -> Mapping[str, int]:
-        plan = lc.plan(room_splats(300), {camera.name: camera}, views, aggregation=True, **settings)
-        return plan.memory_phases["aggregation"]
-
-    by_masks, by_features = aggregation(), aggregation(aggregation_clusters="hdbscan")
-    assert "view" not in by_masks and by_features["view"] > 16 * WIDTH * HEIGHT
-    resolved = aggregation(aggregation_clusters="hdbscan", aggregation_resolve=True)
-    assert resolved["aggregation"] > by_features["aggregation"]
+    plan = lc.plan(room_splats(300), {camera.name: camera}, views, aggregation=True)
+    assert plan.memory_phases["aggregation"]["view"] > 16 * WIDTH * HEIGHT
 
 
 def test_a_worker_holds_some_views_or_splats() -> None:

@@ -11,20 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from liftcore.errors import InvalidLift
-from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.splats import read_splats, write_splats
+from liftcore.io.splats import write_splats
 from liftcore.lifting.files import lift_files
 from liftcore.query.result import load_lift
-from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import ReferenceRaster, dense_view
 from liftcore.runtime.progress import silent
 from liftcore.scene.cameras import Cameras
-from liftcore.solve.aggregate import (
-    LEAST_KEPT,
-    filter_regions,
-    weighted_means,
-)
+from liftcore.solve.aggregate import filter_regions, weighted_means
 from liftcore.solve.clusters import Clustering
 from liftcore.values.lift_file import CLUSTER_TENSORS, save_lift
 from liftcore.values.lift_views import LiftViews
@@ -138,69 +132,10 @@ def test_a_lift_with_aggregation_has_one_feature_a_cluster_and_says_so(tmp_path,
     assert float(agree.float().mean()) > 0.95
 
 
-def weights_of(splats, cameras, maps, settings) -> np.ndarray:
-    """[P] f64, the sum of each splat's weights on the labelled rays of all views."""
-    raster, views = CpuRaster(read_splats(splats)), read_cameras(cameras)
-    total = np.zeros(raster.splats.count)
-    for name in maps.keys() & views.keys():
-        weights = raster.region_weights(views[name], maps[name], settings.lift_params, settings.weighting)
-        total[weights.splats.numpy()] += weights.row_sums().numpy()
-    return total
-
-
-@pytest.mark.parametrize("least", [LEAST_KEPT, 0.0])
-def test_what_takes_no_cluster_is_solved_again_as_if_the_other_regions_had_never_been(tmp_path, monkeypatch, least):
-    monkeypatch.setattr("liftcore.solve.aggregate.LEAST_KEPT", least)
-    (splats, cameras, features), _ = write_scene(tmp_path, "regions")
-    # A tenth of the first view is a region that no cluster confirms.
-    packs = read_features(features)
-    maps = {name: packs[name] for name in packs.views}
-    first = maps["v0"]
-    assert isinstance(first, Regions)
-    labels = first.labels.clone()
-    labels[:, :, 9:11] = 2
-    wrong = Regions(labels, torch.cat([first.codebook, torch.eye(6)[5:].to(first.codebook.dtype)]))
-    write_pack(features, maps | {"v0": wrong}, {"encoder": "random"})
-    knobs = KNOBS | {"dtype": "float32"}
-    result = lift_files(
-        splats, cameras, [features], LiftSettings.of(aggregation=True, aggregation_resolve=True, **knobs)
-    )
-    facts = result.metadata.diagnostics["aggregation"]
-    assert facts["kept_regions"] < facts["regions"] and facts["resolved"] > 0
-    baseline = lift_files(splats, cameras, [features], LiftSettings.of(aggregation=True, **knobs))
-    weights = weights_of(splats, cameras, maps | {"v0": wrong}, baseline.metadata.settings)
-
-    settings, raster = LiftSettings.of(aggregation=True, **knobs), CpuRaster(read_splats(splats))
-    lifted = LiftViews.of(read_features(features), read_cameras(cameras), settings)
-    assert result.cluster is not None and result.cluster_features is not None
-    clustering = clustering_of(result.cluster.numpy(), result.cluster_features.shape[0])
-    kept_masks = filter_regions(clustering, 6, raster, lifted, settings, silent).masks
-    for name, observation in (maps | {"v0": wrong}).items():
-        if name in kept_masks and isinstance(observation, Regions):
-            excluded = torch.from_numpy(~kept_masks[name])
-            observation.labels[(observation.labels >= 0) & excluded[observation.labels.clamp_min(0).long()]] = -1
-            maps[name] = observation
-    write_pack(tmp_path / "kept.safetensors", maps, {"encoder": "random"})
-    without = lift_files(
-        splats, cameras, [tmp_path / "kept.safetensors"], LiftSettings.of(**(knobs | {"aggregation_iou": 0.75}))
-    )
-    unclustered = ~(result.cluster_features != 0).any(dim=1)[result.cluster.long()] | (result.cluster < 0)
-    share = weights_of(splats, cameras, maps, baseline.metadata.settings) / np.maximum(weights, 1e-30)
-    has_most = torch.from_numpy(share >= least)
-    solved_again, not_solved = (
-        unclustered & without.has_feature & has_most,
-        unclustered & without.has_feature & ~has_most,
-    )
-    assert not_solved.any() == (least > 0)
-    assert torch.equal(result.features[not_solved], baseline.features[not_solved])
-    assert facts["resolved"] == pytest.approx(float(solved_again.float().mean()))
-    assert torch.allclose(result.features[solved_again], without.features[solved_again], atol=1e-6)
-
-
 def test_a_lift_without_clusters_is_the_lift_without_aggregation_and_says_so(tmp_path):
     (splats, cameras, features), _ = write_scene(tmp_path, "regions")
     baseline = lift_files(splats, cameras, [features], LiftSettings.of(diagnostic_rays=10))
-    settings = LiftSettings.of(aggregation=True, aggregation_clusters="hdbscan", diagnostic_rays=10)
+    settings = LiftSettings.of(aggregation=True, diagnostic_rays=10)
     none = lift_files(splats, cameras, [features], settings)
     assert none.metadata.diagnostics["aggregation"]["clusters"] == 0
     assert none.metadata.diagnostics["aggregation"]["changed"] == 0
@@ -236,8 +171,7 @@ def test_one_splat_is_aggregated_without_harm(tmp_path):
     write_inria_cameras(Cameras((camera,)), tmp_path / "cameras.json")
     write_pack(tmp_path / "f.safetensors", {"v0": random_regions(0, F=3)}, {"encoder": "random"})
     paths = tmp_path / "splats.ply", tmp_path / "cameras.json"
-    for clusters, number in (("hdbscan", -1), ("touching", -1), ("graph", 0)):
-        settings = LiftSettings.of(aggregation=True, aggregation_clusters=clusters, diagnostic_rays=10)
-        result = lift_files(*paths, [tmp_path / "f.safetensors"], settings)
-        assert result.cluster is not None and result.cluster.tolist() == [number]
-        assert bool(torch.isfinite(result.features).all())
+    settings = LiftSettings.of(aggregation=True, diagnostic_rays=10)
+    result = lift_files(*paths, [tmp_path / "f.safetensors"], settings)
+    assert result.cluster is not None and result.cluster.tolist() == [-1]
+    assert bool(torch.isfinite(result.features).all())

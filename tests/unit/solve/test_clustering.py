@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.solve.clusters import NO_CLUSTER, Clustering, cluster_splats, draw, principal_axes, split_by_touch
+from liftcore.solve.clusters import NO_CLUSTER, cluster_splats, draw, principal_axes
 from liftcore.values.settings import LiftSettings
-from tests.scenes import random_splats
 
-SETTINGS = LiftSettings.of(aggregation=True, aggregation_cluster_size=20, aggregation_neighbours=5)
+SETTINGS = LiftSettings.of(aggregation=True, aggregation_cluster_size=20)
 
 
 def planted(count: int, channels: int = 24, groups: int = 4, seed: int = 0) -> tuple[torch.Tensor, np.ndarray]:
@@ -36,9 +35,10 @@ def test_planted_clusters_are_found_whatever_the_lengths_of_the_features():
     assert same_partition(labels[labels >= 0], group[labels >= 0])
 
 
-def test_splats_outside_the_sample_join_their_cluster():
+def test_splats_outside_the_sample_join_their_cluster(monkeypatch):
+    monkeypatch.setattr("liftcore.solve.clusters.SAMPLE", 400)
     features, group = planted(5_000)
-    few = SETTINGS.model_copy(update={"aggregation_sample": 400, "aggregation_cluster_size": 250})
+    few = SETTINGS.model_copy(update={"aggregation_cluster_size": 250})
     clustering = cluster_splats(features, np.ones(5_000), few)
     labels = clustering.labels.numpy()
     assert (clustering.facts["sample"], clustering.facts["smallest_in_sample"]) == (400, 20)
@@ -101,21 +101,3 @@ def test_wide_features_have_the_same_axes_as_by_all_eigenvectors(monkeypatch):
     axes = principal_axes(rows, 5)
     assert np.abs(np.abs((exact * axes).sum(axis=0)) - 1).max() < 1e-4
     assert np.abs(axes.T @ axes - np.eye(5)).max() < 1e-5
-
-
-def test_groups_that_lie_apart_are_clusters_of_their_own_unless_few() -> None:
-    splats = random_splats(3, 120, 0.05)
-    place = np.random.default_rng(0).permutation(np.repeat([0, 1, 2, 3], [50, 40, 25, 5]))
-    splats.means[:, 0] += torch.from_numpy(100.0 * place).float()
-    labels = np.where(place < 2, 0, np.where(place == 2, 2, 0)).astype(np.int32)  # no splat in cluster 1
-    labels[np.flatnonzero(place == 2)[:4]] = NO_CLUSTER
-    clustering = split_by_touch(Clustering(torch.from_numpy(labels), 3, {}), splats, 6)
-    numbers = clustering.labels.numpy()
-    assert clustering.count == 3
-    assert (numbers[(place == 3) | (labels == NO_CLUSTER)] == NO_CLUSTER).all()
-    elsewhere_mask = (place < 3) & (labels != NO_CLUSTER)
-    assert same_partition(numbers[elsewhere_mask], place[elsewhere_mask]) and set(numbers[elsewhere_mask]) == {
-        0,
-        1,
-        2,
-    }

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from liftcore.lifting.files import lift_files
-from liftcore.solve.aggregate import cluster_consistency
 from liftcore.solve.directions import RegionDirections
 from liftcore.solve.reweight import NO_CONSENSUS, reweighting_factors, scale_weights
 from liftcore.solve.shared_rows import LONG, MOST_COMPARED
@@ -167,30 +166,6 @@ def test_principal_directions_have_the_cosines_of_all_channels(channels: int) ->
     offsets = unit - totals.numpy() @ unit / totals.sum().item()
     e = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
     np.testing.assert_allclose((principal @ principal.T).numpy(), e @ e.T, atol=2e-6)
-
-
-@pytest.mark.parametrize("table_bytes", [None, 1])
-def test_consistency_of_a_cluster_is_its_mean_cosine_in_float64(monkeypatch, table_bytes):
-    if table_bytes:
-        monkeypatch.setattr("liftcore.solve.aggregate.TABLE_BYTES", table_bytes)
-        monkeypatch.setattr("liftcore.solve.directions.TABLE_BYTES", table_bytes)
-    scene, rng = random_scene(1, count=700, channels=40), np.random.default_rng(2)
-    merged, labels = scene.books[0][:5].double().numpy(), rng.integers(-1, 5, 700)
-    merged[3] = 0  # a cluster without a feature explains nothing
-    W, clusters = scene.stacked(), (torch.from_numpy(labels).int(), torch.from_numpy(merged).float())
-    directions = RegionDirections.of_weights(W, codebook_of(scene.books))
-    consistency = cluster_consistency(W, directions, *clusters, threads=1)
-    assert torch.equal(consistency, cluster_consistency(W, directions, *clusters, threads=3))
-    mean, e = defined_directions(scene)
-    away = np.where(
-        merged.any(axis=1, keepdims=True), over(merged, np.linalg.norm(merged, axis=1)[:, None]) - mean, 0
-    )
-    cosines = np.concatenate(e) @ over(away, np.linalg.norm(away, axis=1, keepdims=True)).T
-    matrix = np.concatenate(scene.weights, axis=1).astype(np.float64)
-    expected = over((matrix @ np.maximum(cosines, 0))[np.arange(700), labels], scene.denominators)
-    expected[labels < 0] = 0
-    assert expected.max() > 0.2
-    np.testing.assert_allclose(consistency.numpy(), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(("views", "steps"), [(2, 1), (4, 2), (7, 3)])
