@@ -78,7 +78,7 @@ Sets = Annotated[
     list[Annotated[str, Field(min_length=1, max_length=120, description=SETS)]],
     BeforeValidator(_several),
 ]
-Method = Literal["auto", "valley", "paper", "otsu", "stability"]
+Method = Literal["auto", "paper"]
 METHODS: tuple[str, ...] = get_args(Method)
 Score = Annotated[float, Field(ge=-1, le=1), NoBoolean]  # a cosine, which NaN is not
 Cut = Annotated[Method | Score, takes(f"{', '.join(METHODS)}, or a number from -1 to 1")]

@@ -7,31 +7,23 @@ threshold is equivariant: ``threshold(a s + b) = a threshold(s) + b`` for a > 0,
 | method | the threshold |
 |---|---|
 | `auto` | where the selected share changes least, in log-odds; not below ``least`` |
-| `valley` | the paper's appendix: from the top, the first local maximum, then the minimum before it |
-| `paper` | the paper's main text, literally: the largest peak, then the adjacent smaller valley |
-| `otsu` | the split with the largest variance between its sides (Otsu 1979) |
-| `stability` | the least sensitive stretch of a sweep (Occam's LGS) |
+| `paper` | *Splat Feature Solver*, main text, literally: the largest peak, then the adjacent smaller valley |
 | a number | itself (`fixed`) |
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.question import Threshold
+from liftcore.query.question import METHODS, Threshold
 
-BINS = 300  # a multiple of the sweep's 100 steps
+BINS = 300
 SMOOTHING = BINS / 64  # bins, standard deviation of the Gaussian that removes a histogram's ripples
 LEAST_SHARE = 3e-4  # of the scores: a smaller share above a threshold is noise (SAM drops masks this small)
 MOST_SHARE = 0.8  # queries that select four fifths of a scene are rare; .5 to .9 give equal results (docs/method.md)
-DEPTH = 0.6  # a valley must fall to this share of its peak, else it is a ripple; tuned on one scene's masks
-# The sweep of Occam's LGS: number of thresholds, length of the median filter of slopes, least length of a stable
-# stretch, its largest slope, and the range of its shares.
-STEPS, FILTER, LEAST_STEPS, MOST_SLOPE, SHARES = 100, 5, 5, 0.4, (0.005, 0.9)
 
 
 @dataclass(frozen=True)
@@ -84,8 +76,7 @@ def find_threshold(
     """Find a threshold on scores by one of the methods above.
 
     Degenerate inputs have a defined result. Without scores it is infinity: nothing is selected. Equal scores give
-    that score: a query then selects nothing (`explain_no_selection`). Where a method finds no clear result, Otsu's
-    split is taken, and the explanation has it.
+    that score: a query then selects nothing (`explain_no_selection`).
 
     Args:
         scores: [n] f32, finite.
@@ -112,7 +103,7 @@ def find_threshold(
     if histogram is None:
         sentence = f"All scores are {low:.4g}: the histogram has no valley."
         return Threshold(value=low, method=method, explanation=sentence, clear=False)
-    value, explanation, clear = steady(histogram, least) if method == "auto" else METHODS[method](histogram)
+    value, explanation, clear = steady(histogram, least) if method == "auto" else paper(histogram)
     value = min(max(value, low), high)
     above = np.append(histogram.above(), 0.0)
     share = float(np.interp((value - low) / histogram.width, np.arange(len(above)), above))
@@ -195,27 +186,8 @@ def steady(histogram: Histogram, least: float = -math.inf) -> Result:
     return value, f"{sentence}, {lack}.", False
 
 
-def valley(histogram: Histogram) -> Result:
-    """Find the valley below the first large enough hill from the top whose valley is deep.
-
-    The paper's code goes on to as many hills as the ground truth has instances. Similar objects share a hill, so here
-    a user's count selects objects (`liftcore.query.objects`).
-    """
-    smooth, above = histogram.smoothed(), histogram.above()
-    peaks, valleys = _extrema(smooth)
-    for peak in reversed(peaks):
-        place = max((place for place in valleys if place < peak), default=None)
-        if place is None:
-            break
-        if above[place] >= LEAST_SHARE and smooth[place] <= DEPTH * smooth[peak]:
-            value = histogram.edge(place)
-            lies = f"lies at {histogram.edge(peak):.4g} and the valley before it at {value:.4g}"
-            return value, f"From the top down, the histogram's first hill {lies}.", True
-    return _otsu_instead(histogram, "no hill with a valley before it")
-
-
 def paper(histogram: Histogram) -> Result:
-    """Find the largest peak, then the adjacent smaller valley above it."""
+    """Find the largest peak, then the adjacent smaller valley above it; without one Otsu's split (Otsu 1979)."""
     smooth = histogram.smoothed()
     peaks, valleys = _extrema(smooth)
     peak = max(peaks, key=lambda place: smooth[place])
@@ -224,43 +196,8 @@ def paper(histogram: Histogram) -> Result:
             value = histogram.edge(place)
             lies = f"lies at {histogram.edge(peak):.4g} and the next valley above it at {value:.4g}"
             return value, f"The histogram's largest peak {lies}.", True
-    return _otsu_instead(histogram, "no valley above its largest peak")
-
-
-def otsu(histogram: Histogram) -> Result:
-    """Find the edge that maximises the variance between its sides."""
     value = histogram.edge(_split(histogram.mass))
-    return value, f"Otsu's split at {value:.4g} separates the scores best into two groups.", True
-
-
-def stability(histogram: Histogram) -> Result:
-    """Find the middle of the sweep's least sensitive stable stretch, after the evaluation of Occam's LGS.
-
-    The released code compares label levels and takes the least sensitive one. We have one map, so its least
-    sensitive stable stretch counts.
-    """
-    step = len(histogram.mass) // STEPS
-    shares = histogram.above()[step::step]  # at thresholds 0.01..0.99 of the range
-    around = np.pad(np.abs(np.gradient(shares, 1 / STEPS)), FILTER // 2, mode="edge")
-    slopes = np.median(np.lib.stride_tricks.sliding_window_view(around, FILTER), axis=1)
-    stable = (slopes < MOST_SLOPE) & (shares >= SHARES[0]) & (shares <= SHARES[1])
-    stretches = [run for run in _runs(stable) if len(run) >= LEAST_STEPS]
-    if not stretches:
-        return _otsu_instead(histogram, "no stretch over which the share found is stable")
-    run = min(stretches, key=lambda run: float(slopes[run].mean()))
-    first, last = (histogram.edge((int(place) + 1) * step) for place in (run[0], run[-1]))
-    sentence = f"The share found is stable from {first:.4g} to {last:.4g}, and its middle is taken."
-    return (first + last) / 2, sentence, True
-
-
-METHODS: dict[str, Callable[[Histogram], Result]] = {
-    "auto": steady, "valley": valley, "paper": paper, "otsu": otsu, "stability": stability,
-}  # fmt: skip
-
-
-def _otsu_instead(histogram: Histogram, lack: str) -> Result:
-    """Return Otsu's split in place of a method without a result; ``lack`` completes "the histogram has"."""
-    value = histogram.edge(_split(histogram.mass))
+    lack = "no valley above its largest peak"
     return value, f"The histogram has {lack}; Otsu's split at {value:.4g} stands in.", False
 
 

@@ -20,7 +20,7 @@ from liftcore.evaluate.inspect import describe_cameras, describe_packs, describe
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.splats import write_splats
 from liftcore.lifting.files import lift_files
-from liftcore.query.threshold import METHODS
+from liftcore.query.question import METHODS
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import DenseView, dense_view, projected_gaussian, reading_matrix
 from liftcore.scene.compositing import NEAR_PLANE, Weighting

@@ -19,8 +19,8 @@ from liftcore.cli import reply
 from liftcore.cli.lift import pairs_of
 from liftcore.errors import InvalidFeatures, InvalidSettings, SplatliftError, Unavailable
 from liftcore.lifting.files import lift_files
+from liftcore.query.question import METHODS
 from liftcore.query.result import load_lift
-from liftcore.query.threshold import METHODS
 from liftcore.runtime import plugins
 from liftcore.runtime.progress import progress_bars
 from liftcore.values.pack import write_pack

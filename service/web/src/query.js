@@ -494,12 +494,9 @@ function thresholdReason({ answer, threshold, showsClosest, sets }) {
   return rule ? `Automatic threshold: ${rule}.` : explanation;
 }
 
-// How the methods find a threshold; where one finds no clear result, the scores are split into two groups.
+// How the methods find a threshold; where `paper` finds no valley, the scores are split into two groups.
 const THRESHOLD_RULES = {
   auto: "a small change of it changes the selection least",
-  valley: "the first deep valley of the scores, from the top down",
   paper: "the valley above the largest peak of the scores",
-  otsu: "it separates the scores best into two groups",
-  stability: "the middle of the range over which the selection changes least",
   none: "there is no clear gap, so it splits the scores into two groups",
 };

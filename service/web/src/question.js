@@ -32,9 +32,8 @@ export function linkFields(questions) {
 export function readFields(pairs, index) {
   const values = {};
   for (const [name, field] of FIELDS) {
-    const texts = [name, ...(field.old_names || [])].map(key => pairs.getAll(key)).find(list => list.length) ?? []; // old links have old names
-    const oldText = texts[index] ?? texts[0];
-    const text = field.old_values?.[oldText] ?? oldText;
+    const texts = pairs.getAll(name);
+    const text = texts[index] ?? texts[0];
     const number = text && alternatives(field).some(({ type }) => ["number", "integer"].includes(type)) ? Number(text) : NaN;
     if (isList(field) || text === undefined) continue;
     if (alternatives(field).some(part => part.enum?.includes(text))) values[name] = text;

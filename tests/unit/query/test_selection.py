@@ -10,10 +10,10 @@ import torch
 
 from liftcore.query.ask import answers, ask, resolve_query
 from liftcore.query.presence import References
-from liftcore.query.question import Query
+from liftcore.query.question import METHODS, Query
 from liftcore.query.scene import Scene
 from liftcore.query.selection import CompetingWords, correct_by_objects, part_nodes, parts_of_words
-from liftcore.query.threshold import METHODS, find_threshold
+from liftcore.query.threshold import find_threshold
 from liftcore.text import LVIS_TABLE
 from liftcore.text.table import TableEncoder
 
@@ -73,7 +73,7 @@ def test_query_of_a_thin_object_does_not_select_the_scene(thin: Scene, table: Ta
     assert answer.selected[OBJECTS == 0].mean() > 0.4
     assert answer.selected.sum() < 3 * CAT
     assert "other words are nearer" in answer.threshold.explanation
-    for method in ("otsu", 0.0):  # an explicit method or threshold is applied as it is
+    for method in ("paper", 0.0):  # an explicit method or threshold is applied as it is
         by_method = ask(thin, Query.of(("cat",), threshold=method), table)
         assert np.array_equal(by_method.selected, by_method.scores >= np.float32(by_method.threshold.value))
 

@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.threshold import METHODS, find_threshold
+from liftcore.query.question import METHODS
+from liftcore.query.threshold import find_threshold
 
-SEARCHED = tuple(METHODS)  # every method that looks at the scores
+SEARCHED = METHODS  # every method that looks at the scores
 
 
 def hills(*parts: tuple[float, float, int], seed: int = 0) -> torch.Tensor:
@@ -63,8 +64,7 @@ def test_paper_takes_the_valley_next_to_the_largest_peak_and_auto_the_topmost() 
 
 def test_a_few_stray_scores_are_no_object() -> None:
     scores = torch.cat([hills((0.2, 0.01, 50_000), (0.3, 0.01, 5000)), torch.tensor([0.5, 0.51])])
-    for method in ("auto", "valley"):
-        assert 0.22 < find_threshold(scores, method).value < 0.29
+    assert 0.22 < find_threshold(scores, "auto").value < 0.29
 
 
 def test_auto_takes_no_score_below_least() -> None:
@@ -74,13 +74,7 @@ def test_auto_takes_no_score_below_least() -> None:
     assert 0.4 < above.value < 0.6 and above.explanation.startswith("Above 0.4 the share")
     for least in (-0.9, 2.0):  # below all, or where there is nothing
         assert find_threshold(scores, least=least) == anywhere
-    assert find_threshold(scores, "valley", least=0.6) == find_threshold(scores, "valley")
-
-
-def test_the_valley_lies_below_the_first_hill_from_above() -> None:
-    scores = hills((0.2, 0.01, 50_000), (0.3, 0.01, 3000), (0.4, 0.01, 2000), (0.6, 0.01, 1000))
-    threshold = find_threshold(scores, "valley")
-    assert 0.45 < threshold.value < 0.55 and "first hill" in threshold.explanation
+    assert find_threshold(scores, "paper", least=0.6) == find_threshold(scores, "paper")
 
 
 def test_auto_says_when_nothing_stands_apart() -> None:
@@ -100,12 +94,6 @@ def test_a_given_threshold_is_kept_where_a_score_can_be_it() -> None:
         find_threshold(torch.tensor([0.1, math.nan]), "auto")
 
 
-def test_the_stable_stretch_lies_between_the_hills() -> None:
-    scores = hills((0.2, 0.02, 9000), (0.5, 0.02, 3000))
-    threshold = find_threshold(scores, "stability")
-    assert 0.27 < threshold.value < 0.43 and "stable from" in threshold.explanation
-
-
 @pytest.mark.parametrize("method", SEARCHED)
 def test_scores_that_are_equal_or_none_say_so(method: str) -> None:
     for count in (1, 1000):
@@ -114,12 +102,9 @@ def test_scores_that_are_equal_or_none_say_so(method: str) -> None:
     assert find_threshold(torch.empty(0), method).value == math.inf
 
 
-@pytest.mark.parametrize("method", ["paper", "valley", "stability"])
-def test_one_hill_falls_back_to_otsu_and_says_so(method: str) -> None:
-    rising = torch.linspace(0, 1, 10_000)  # is nowhere stable, and its square root's histogram only rises
-    rising = rising if method == "stability" else rising**0.5
-    threshold = find_threshold(rising, method)
-    assert threshold.value == find_threshold(rising, "otsu").value and "stands in" in threshold.explanation
+def test_paper_splits_scores_without_a_valley_and_says_so() -> None:
+    threshold = find_threshold(torch.linspace(0, 1, 10_000) ** 0.5, "paper")  # the histogram only rises
+    assert 0.4 < threshold.value < 0.8 and "Otsu's split" in threshold.explanation and not threshold.clear
 
 
 def test_weights_count_like_repeated_scores() -> None:
