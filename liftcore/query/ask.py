@@ -128,12 +128,11 @@ def ask(scene: OpenedLift, query: Query | str, encoder: TextEncoder | None = Non
     """Score every splat for a query and select those that answer it.
 
     The threshold `auto` comes from a histogram of scores, in which each splat counts by its total weight, as splats
-    hit by few rays have noisy scores; ``weight_by="confidence"`` multiplies it by the confidence. The selection uses
-    the score alone. The threshold is compared with other words, and objects of the region graph may be selected
-    as a whole (`liftcore.query.selection`). Any other threshold selects by the score alone. Scores that are all equal
-    or zero select nothing. Absent words (`liftcore.query.presence`) are left out of the scores, and without another
-    positive nothing is selected, unless the query keeps absent words. The presence of negatives and examples is not
-    estimated.
+    hit by few rays have noisy scores. The selection uses the score alone. The threshold is compared with other words,
+    and objects of the region graph may be selected as a whole (`liftcore.query.selection`). Any other threshold
+    selects by the score alone. Scores that are all equal or zero select nothing. Absent words
+    (`liftcore.query.presence`) are left out of the scores, and without another positive nothing is selected, unless
+    the query keeps absent words. The presence of negatives and examples is not estimated.
 
     Args:
         scene: an opened lift.
@@ -141,8 +140,7 @@ def ask(scene: OpenedLift, query: Query | str, encoder: TextEncoder | None = Non
         encoder: the text encoder of the lifted features' space; examples and the lift's own words need none.
 
     Raises:
-        InvalidQuery: a text without an encoder of the lift's space, a term that has no feature, or a lift without
-            the confidence that the query needs.
+        InvalidQuery: a text without an encoder of the lift's space, or a term that has no feature.
         NotFound: an example names a view or a region that does not exist.
         InvalidLift: an example needs the scene's files, and they moved or changed.
     """
@@ -224,9 +222,7 @@ def resolve_query(
     phrase = part_phrase(scene, query, encoder)
     if phrase is None:
         return replace(_resolve(scene, query, encoder, names), unknown_part=unknown_part(scene, query, encoder))
-    object_query = _resolve(
-        scene, Query(text=[phrase.object_phrase], weight_by=query.weight_by, absent=query.absent), encoder
-    )
+    object_query = _resolve(scene, Query(text=[phrase.object_phrase], absent=query.absent), encoder)
     request = _resolve(scene, query, encoder, names) if not phrase.sure else replace(object_query, query=query)
     return replace(request, part=PartQuery(phrase, object_query, _resolve(scene, query, encoder, names, phrase)))
 
@@ -250,7 +246,6 @@ def _resolve(
     rows = directions(scene, query, encoder, names, asked_as)
     if phrase is not None:
         asked_as = asked_as | {0: Wording(query.text[0], str(phrase), "part")}
-    scene.splat_weights(query.weight_by)  # raises InvalidQuery now if the lift has no confidence
     encoder = encoder or scene.table
     if encoder is None or not words[: len(query.positives)].any():
         return ResolvedQuery(query, rows, words, "", asked_as, candidates=candidates(scene, query))
@@ -361,7 +356,7 @@ def _answer(scene: OpenedLift, request: ResolvedQuery, similarities: np.ndarray)
         threshold = Threshold(value=math.inf, method=method, explanation=presence.reason, clear=False)
         selected = np.zeros_like(has_feature)
     else:
-        threshold, selected = _select(scene, request, mask, scores, scene.splat_weights(query.weight_by))
+        threshold, selected = _select(scene, request, mask, scores)
     clear = threshold.clear and presence.present is not False and bool(selected.any())
     least = LEAST_RIVAL_OF_CLEAR if clear and presence.present is not None else LEAST_RIVAL
     competitors = _nearer_words(scene, request, scores, selected, least)
@@ -429,13 +424,12 @@ def _set_answer(scene: OpenedLift, query: Query) -> Answer:
 
 
 def _select(
-    scene: OpenedLift, request: ResolvedQuery, mask: np.ndarray, scores: np.ndarray, weights: np.ndarray
+    scene: OpenedLift, request: ResolvedQuery, mask: np.ndarray, scores: np.ndarray
 ) -> tuple[Threshold, np.ndarray]:
     """Return the threshold of a query and the selected splats, [P] bool.
 
     Args:
-        mask: [n] bool, the terms that take part in the scores. scores: [P] f32. weights: [P] f32, total weight, or
-            that times confidence.
+        mask: [n] bool, the terms that take part in the scores. scores: [P] f32.
     """
     query, positives = request.query, len(request.query.positives)
     valid_scores = scores if scene.all_have_features else scores[scene.has_feature]
@@ -446,16 +440,14 @@ def _select(
         return threshold, np.zeros_like(scene.has_feature)
     in_words = (request.by_cosine & mask)[:positives]
     least = -math.inf if in_words.any() else LEAST_LIKENESS
-    weight_name = "total weight" if query.weight_by == "total_weight" else "total weight times confidence"
-    feature_weights = scene.weights if query.weight_by == "total_weight" else scene.weights_with_feature(weights)
-    threshold = find_threshold(valid_scores, query.threshold, feature_weights, least, weight_name)
+    threshold = find_threshold(valid_scores, query.threshold, scene.weights, least)
     selected = scene.has_feature & (scores >= np.float32(threshold.value))
     competitors = _competing_words(request, request.rows[:positives][in_words])
     if query.threshold != "auto" or not competitors or in_words.sum() < mask[:positives].sum():
         return threshold, selected
-    comparison = compare_ranks(scene, scores, weights, threshold.value, competitors[0])
+    comparison = compare_ranks(scene, scores, threshold.value, competitors[0])
     if comparison.lowest > threshold.value:
-        retry = find_threshold(valid_scores, "auto", feature_weights, comparison.lowest, weight_name)
+        retry = find_threshold(valid_scores, "auto", scene.weights, comparison.lowest)
         value = max(retry.value, comparison.lowest)
         explanation = f"Below {comparison.lowest:.4g} other words are nearer. {retry.explanation}"
         threshold = retry.model_copy(
@@ -470,7 +462,7 @@ def _select(
         selected = scene.has_feature & np.logical_or.reduce([scene.members(node) for node in parts])
         addition = f"levels differ in meaning, so the named parts are selected: {', '.join(map(str, parts))}"
     else:
-        selected, addition = correct_by_objects(scene, selected, weights, competitors[0])
+        selected, addition = correct_by_objects(scene, selected, competitors[0])
     if addition:
         threshold = threshold.model_copy(
             update={"explanation": f"{threshold.explanation.removesuffix('.')}; {addition}."}

@@ -46,7 +46,7 @@ def objects(scene: OpenedLift, answer: Answer) -> Objects:
     numbers = np.full(len(answer.scores), -1, np.int32)
     if not len(rows):
         return Objects.of((), numbers, 0, scene.world)
-    weights = scene.splat_weights(answer.query.weight_by)[rows].astype(np.float64)
+    weights = scene.total_weight[rows].astype(np.float64)
     weights = weights if weights.any() else np.ones(len(rows))
     groups = _set_numbers(scene, sets)[rows] if sets else touching(scene.splats, rows)
     sums = np.bincount(groups, weights)

@@ -235,25 +235,8 @@ class OpenedLift:
 
     @cached_property
     def weights(self) -> np.ndarray | None:
-        """Weights in histograms of the splats with a feature, their total weights; None if all are zero."""
-        return self.weights_with_feature(self.total_weight)
-
-    def splat_weights(self, weight_by: str) -> np.ndarray:
-        """Return the weight of each splat, [P] f32: its total weight, or that times its confidence.
-
-        Raises:
-            InvalidQuery: the lift has no confidence.
-        """
-        if weight_by == "total_weight":
-            return self.total_weight
-        if self.confidence is None:
-            hint, got = "lift again with the preset default, or with robust_steps", "a lift that was not reweighted"
-            raise InvalidQuery("weight_by", expected="a lift with confidence", got=got, hint=hint)
-        return self.total_weight * self.confidence
-
-    def weights_with_feature(self, weights: np.ndarray) -> np.ndarray | None:
-        """Return the weights [P] of the splats with a feature; None, which means equal ones, if all are zero."""
-        weights = weights if self.all_have_features else weights[self.has_feature]
+        """[n] f32, total weights of the splats with a feature; None, which means equal ones, if all are zero."""
+        weights = self.total_weight if self.all_have_features else self.total_weight[self.has_feature]
         return weights if weights.max(initial=0.0) > 0 else None
 
     @cached_property

@@ -198,11 +198,6 @@ class Query(Viewpoint):
     absent: Literal["drop", "keep"] = Field(
         default="drop", description="words for what is not there: select nothing for them, or what is most like them"
     )
-    weight_by: Literal["total_weight", "confidence"] = Field(
-        default="total_weight",
-        description="the weight of a splat in the threshold's histogram and in objects: its `total_weight`, or that "
-        "times its `confidence`",
-    )
     top: Annotated[int, Field(ge=0, le=1000), NoBoolean] = Field(
         default=10, description="number of best splats to list"
     )
@@ -494,7 +489,7 @@ class SelectedObject(Value):
     """A group of touching selected splats."""
 
     splats: int = Field(description="number of splats")
-    share: float = Field(description="of the total weight of all selected splats, or of the weights of `weight_by`")
+    share: float = Field(description="of the total weight of all selected splats")
     score: float = Field(description="the mean of its splats' scores, by the same")
     centre: Point = Field(description="the middle of its box: x y z, world frame")
     box: Box = Field(description="of its splats' centres, but for a thousandth of the total weight at each end")

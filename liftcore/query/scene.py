@@ -78,7 +78,7 @@ class Scene(OpenedLift):
 
         Raises:
             InvalidQuery: a text that the encoder cannot encode or no encoder of the lift's space, a term that has no
-                feature, or a lift without the confidence that the query needs.
+                feature.
             NotFound: an example names a view or a region that does not exist.
             InvalidLift: an example or ``places`` need the scene's files, and they moved or changed.
             Unavailable: the encoder's weights are not on this machine.

@@ -93,7 +93,7 @@ class RankComparison:
 
 
 def compare_ranks(
-    scene: OpenedLift, scores: np.ndarray, weights: np.ndarray, threshold: float, competitors: CompetingWords
+    scene: OpenedLift, scores: np.ndarray, threshold: float, competitors: CompetingWords
 ) -> RankComparison:
     """Compare the splats of a ranking with competing words, from the highest score down.
 
@@ -102,10 +102,10 @@ def compare_ranks(
     number of nearer words over its best splats: then only the splats most similar to it are selected.
 
     Args:
-        scene: an opened lift. scores: [P] f32. weights: [P] f32 of the splats. threshold: on the scores.
+        scene: an opened lift. scores: [P] f32. threshold: on the scores.
     """
     rows, widths = _octaves(_from_the_best(scores, np.flatnonzero(scene.has_feature)))
-    counts = weights[rows] * widths
+    counts = scene.total_weight[rows] * widths
     if not counts.any():
         counts = widths
     nearer, sums = competitors.count_nearer(scene, rows), np.cumsum(counts)
@@ -142,12 +142,12 @@ def nearest_to_query(scene: OpenedLift, selected: np.ndarray, competitors: Compe
 
 
 def correct_by_objects(
-    scene: OpenedLift, selected: np.ndarray, weights: np.ndarray, competitors: CompetingWords
+    scene: OpenedLift, selected: np.ndarray, competitors: CompetingWords
 ) -> tuple[np.ndarray, str]:
     """Correct a selection [P] bool by the objects of the region graph.
 
     Args:
-        scene: an opened lift. selected: [P] bool. weights: [P] f32 of the splats. competitors: competing words.
+        scene: an opened lift. selected: [P] bool. competitors: competing words.
 
     Returns:
         The corrected selection [P] bool, and a clause for the user on the changes, "" if there are none.
@@ -155,7 +155,7 @@ def correct_by_objects(
     if scene.object is None or scene.object_views is None or len(scene.object) != len(selected):
         return selected, ""
     count, objects = len(scene.object_views), np.where(scene.has_feature, scene.object, -1)
-    in_object = objects >= 0
+    in_object, weights = objects >= 0, scene.total_weight
     totals = np.bincount(objects[in_object], weights[in_object], count)
     inside = np.bincount(objects[in_object & selected], weights[in_object & selected], count)
     shares = inside / np.where(totals > 0, totals, 1.0)

@@ -71,7 +71,6 @@ def find_threshold(
     method: str | float = "auto",
     weights: ArrayLike | None = None,
     least: float = -math.inf,
-    weight_name: str = "total weight",
 ) -> Threshold:
     """Find a threshold on scores by one of the methods above.
 
@@ -83,7 +82,6 @@ def find_threshold(
         method: one of ``METHODS``, or a number to use as it is.
         weights: [n] f32, weight of each score, at least zero: the total weight of splats; None: equal ones, as of the
             pixels of a view.
-        weight_name: of the weights, for the explanation.
         least: ``auto`` takes no lower score, unless too few lie above it.
 
     Raises:
@@ -107,7 +105,7 @@ def find_threshold(
     value = min(max(value, low), high)
     above = np.append(histogram.above(), 0.0)
     share = float(np.interp((value - low) / histogram.width, np.arange(len(above)), above))
-    sentence = f"{share:.1%} of the {'pixels' if weights is None else weight_name} at or above {value:.4g}"
+    sentence = f"{share:.1%} of the {'pixels' if weights is None else 'total weight'} at or above {value:.4g}"
     explanation = f"{explanation.removesuffix('.')}; {sentence}."
     return Threshold(value=value, method=method, explanation=explanation, clear=clear)
 

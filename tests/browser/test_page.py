@@ -415,7 +415,7 @@ def test_link_opens_question_layer_and_camera_again(page: Browser, server: PageS
     page.until(FIND_COLOUR)
     assert page.value(WORDS) == ["apple", "lamp"] and page.value("splatlift.layers.layerName") == "pca"
     assert page.value("splatlift.viewer.place3d") == pytest.approx(place, rel=1e-3, abs=1e-3)
-    rest = "instances=2&keep=largest&weight_by=odd"
+    rest = "instances=2&keep=largest&odd=1"
     page.open(f"{server.address}/?lift={server.lift}&view=right&text=apple&threshold=0.5&what=odd&show=odd&{rest}")
     page.until(READY)
     page.until(FIND_COLOUR)
@@ -428,7 +428,7 @@ def test_link_opens_question_layer_and_camera_again(page: Browser, server: PageS
         "absent": "keep",
     }  # a cut holds all the same
     assert fields == {"lift": server.lift, "text": "apple", **parameters}
-    assert "instances=2" in page.value("location.search") and "weight_by" not in page.value("location.search")
+    assert "instances=2" in page.value("location.search") and "odd=1" not in page.value("location.search")
     assert page.value("[splatlift.layers.layerName, splatlift.layers.mode]") == ["rgb", "scene"]
 
 

@@ -155,14 +155,11 @@ def test_every_term_and_option_is_part_of_the_query(
     for options in (
         [],
         ["--threshold", "0.25", "--keep", "largest"],
-        ["--instances", "3", "--weight-by", "confidence"],
+        ["--instances", "3"],
     ):
         assert run(capsys, *question, *options)[0] == cli.INTERRUPTED
-    choices = [(query.threshold, query.keep, query.instances, query.weight_by) for query in queries]
-    default = "total_weight"
-    assert choices == [
-        ("auto", "all", None, default), (0.25, "largest", None, default), ("auto", "all", 3, "confidence"),
-    ]  # fmt: skip
+    choices = [(query.threshold, query.keep, query.instances) for query in queries]
+    assert choices == [("auto", "all", None), (0.25, "largest", None), ("auto", "all", 3)]
     assert {tuple(map(str, query.terms)) for query in queries} == {("splat:1", "splat:0")}
 
 

@@ -89,8 +89,7 @@ def test_negatives_take_away_and_unseen_splats_are_never_selected(exact: Scene) 
         assert all_seen.count == COUNT - 1
 
 
-@pytest.mark.parametrize("weight_by", ["total_weight", "confidence"])
-def test_splats_without_weight_or_confidence_do_not_decide_the_threshold(exact: Scene, weight_by: str) -> None:
+def test_splats_without_weight_do_not_decide_the_threshold(exact: Scene) -> None:
     reference = ask(exact, "x", Axes())
     outliers = np.zeros((COUNT, CHANNELS))
     outliers[:, 0], outliers[:, 1] = 1.0, np.linspace(0.0, 3.0, COUNT)  # scores all over the range
@@ -98,14 +97,9 @@ def test_splats_without_weight_or_confidence_do_not_decide_the_threshold(exact: 
     crowd = of(
         exact,
         np.concatenate([exact.features, outliers]),
-        **{weight_by: weights},
+        total_weight=weights,
     )
-    answer = ask(crowd, Query.of(("x",), weight_by=weight_by), Axes())
-    by_total_weight = ask(crowd, Query.of(("x",)), Axes())
-    assert np.array_equal(answer.scores, by_total_weight.scores)
-    # It has the share above the threshold.
-    is_same = answer.threshold.explanation == by_total_weight.threshold.explanation
-    assert is_same == (weight_by == "total_weight")
+    answer = ask(crowd, "x", Axes())
     assert np.array_equal(answer.selected[:COUNT], reference.selected)
     assert answer.selected[COUNT] and answer.count > reference.count  # the outliers are selected even so
 
@@ -151,11 +145,7 @@ def test_what_cannot_be_asked_is_refused(scene: Scene) -> None:
         (lambda: ask(scene, "x", Axes(5)), r"8 channels.*axes with 5"),
         (lambda: ask(of_space(""), "x"), r"text space: not named\), got no encoder"),
         (lambda: ask(of_space("axes"), "x"), r"text space: axes\), got no encoder"),
-        (
-            lambda: resolve_query(scene, Query.of(("x",), weight_by="confidence"), Axes()),
-            "a lift with confidence.*preset default",
-        ),
-        (lambda: Query.of(("x",), weight_by="light"), "weight_by: expected one of total_weight, confidence"),
+        (lambda: Query.of(("x",), weight_by="confidence"), "weight_by: expected"),
         (lambda: Query.of(()), "query: expected a text or an example"),
         (lambda: Query.of(("a",) * 65), "at most 64"),
         (lambda: Query.of(("a",), keep="some"), "keep: expected"),
@@ -163,14 +153,6 @@ def test_what_cannot_be_asked_is_refused(scene: Scene) -> None:
     ):
         with pytest.raises(InvalidQuery, match=message):
             request()
-    sure = LiftResult.of(replace(scene.lift, confidence=torch.ones(len(scene.features))))
-    by_confidence, by_total_weight = (
-        sure.query(np.eye(CHANNELS)[0], weight_by=weight_by) for weight_by in ("confidence", "total_weight")
-    )
-    assert (
-        torch.equal(by_confidence.splats, by_total_weight.splats)
-        and by_confidence.threshold == by_total_weight.threshold
-    )
 
 
 def test_vectors_are_asked_as_their_words_are(scene: Scene) -> None:

@@ -35,14 +35,11 @@ def means(scene: Scene, cluster: int) -> np.ndarray:
     return scene.splats.means.numpy()[cluster * SPLATS_A_CLUSTER : (cluster + 1) * SPLATS_A_CLUSTER]
 
 
-@pytest.mark.parametrize("weight_by", ["total_weight", "confidence"])
-def test_clusters_that_are_apart_are_objects_with_their_boxes(weight_by: str, scene: Scene) -> None:
-    confidence = torch.rand(len(scene.features), generator=torch.Generator().manual_seed(0))
+def test_clusters_that_are_apart_are_objects_with_their_boxes(scene: Scene) -> None:
     answer = of(scene, 0, 2)
-    answer = answer_with(answer, weight_by=weight_by)
-    grouping = objects(Scene(replace(scene.lift, confidence=confidence), scene.splats), answer)
+    grouping = objects(scene, answer)
     assert len(grouping.objects) == 2 and grouping.unassigned_splats == 0
-    total_weight = scene.total_weight * (confidence.numpy() if weight_by == "confidence" else 1)
+    total_weight = scene.total_weight
     for number, obj in enumerate(grouping.objects):
         rows = np.flatnonzero(grouping.numbers == number)
         cluster = rows[0] // SPLATS_A_CLUSTER

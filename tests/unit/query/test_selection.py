@@ -158,7 +158,7 @@ def test_word_near_to_all_of_a_scene_keeps_no_rest_from_its_thing(scene: Scene, 
     subject = lifted(scene, rows + bias, object=numbers, object_views=views)
     remainder = subject.mean_of(np.arange(130, 300))
     assert remainder @ boat > remainder @ cat
-    answer, _ = correct_by_objects(subject, cats, np.ones(700, np.float32), rivals)
+    answer, _ = correct_by_objects(subject, cats, rivals)
     assert np.array_equal(answer, np.arange(700) < 300)
 
 
