@@ -530,10 +530,6 @@ class CoveringRegions(OfLift):
     regions: list[CoveringRegion] = Field(description="one a level at most, the smallest first")
 
 
-NUMBER = r"[+-]?(\d{1,20}(\.\d{0,20})?|\.\d{1,20})([eE][+-]?\d{1,3})?"
-UP = rf"^(cameras|{NUMBER},{NUMBER},{NUMBER})$"
-
-
 class NodesRequest(BaseModel):
     """Nodes of a lift's tree to list, and words to name them."""
 
@@ -544,18 +540,6 @@ class NodesRequest(BaseModel):
     cursor: int = Field(0, ge=0, le=10**9, description="the `next` of the page before")
 
 
-class TreeRequest(NodesRequest):
-    """Nodes to list, with or without relations of objects."""
-
-    relations: bool = Field(False, description="relations of the objects in space, with numbers")
-    up: str | None = Field(
-        None,
-        pattern=UP,
-        description="with relations: the direction against gravity in the frame of the splats, x,y,z, or cameras, "
-        "where photos were taken upright; left out, that of the lift, without which nothing is on, under or beside",
-    )
-
-
 class SceneObjectsRequest(NodesRequest):
     """Objects to list, and words to name them."""
 
@@ -564,10 +548,7 @@ class SceneObjectsRequest(NodesRequest):
 
 
 class LiftTree(SceneTree, OfLift):
-    """Some of the nodes of a lift's tree: objects first, those with the largest total weight first.
-
-    Of the relations those whose `node` is on the page.
-    """
+    """Some of the nodes of a lift's tree: objects first, those with the largest total weight first."""
 
     encoder: str | None = Field(description="the text encoder of their names, without its file; null if unnamed")
     next: NextNumber

@@ -213,10 +213,8 @@ class Answers:
 
     def _named_tree(self, request: Request) -> SceneTree:
         words, encoder = self._words(request)
-        options = {"relations": request.get("relations", False), "up": _direction(request.get("up"))}
         return self._cache.get(
-            _key(request, "world", "relations", "up"),
-            lambda: self._scene(request).tree(words, encoder=encoder, **options),
+            _key(request, "world", "tree"), lambda: self._scene(request).tree(words, encoder=encoder)
         )
 
     # Documents
@@ -265,10 +263,7 @@ class Answers:
 
     def _tree(self, request: Request) -> dict[str, Any]:
         tree, first, last = self._named_tree(request), request["first"], request["first"] + request["count"]
-        nodes = tree.nodes[first:last]
-        ids = {item.id for item in nodes}
-        relations = tuple(item for item in tree.relations if item.node in ids)
-        page = tree.model_copy(update={"nodes": nodes, "relations": relations})
+        page = tree.model_copy(update={"nodes": tree.nodes[first:last]})
         return page.model_dump(mode="json") | {"next": last if last < tree.count else None}
 
     def _regions(self, request: Request) -> dict[str, Any]:
@@ -359,10 +354,6 @@ def _select(scene: Scene, name: str, bits: str) -> Any:
     """Return a selection of these splats; drop the history of a selection with the same name."""
     scene.selections.pop(name, None)
     return scene.select(name).edit(Edit(operation="set", bits=bits))
-
-
-def _direction(up: str | None) -> Any:
-    return up if up is None or up == "cameras" else tuple(map(float, up.split(",")))
 
 
 def _object_label(label: list[Any] | None) -> dict[str, Any]:

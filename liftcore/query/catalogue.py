@@ -16,16 +16,14 @@ import io
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from liftcore.errors import InvalidQuery
 from liftcore.query.objects import object_box, size_of
 from liftcore.query.opened import OpenedLift, as_numpy
-from liftcore.query.question import ListedObjects, Point, SceneNode, SceneObject, SceneTree
-from liftcore.query.relations import relations as related
-from liftcore.query.relations import upright
+from liftcore.query.question import ListedObjects, SceneNode, SceneObject, SceneTree
 from liftcore.query.scores import cosines, norms_of
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.origin import MAP_REACH
@@ -90,22 +88,14 @@ def catalogue(scene: OpenedLift, words: Sequence[str] = (), vectors: Any = None)
     return Catalogue(objects, explanation, features[[fields["id"] for fields in facts]], scene.world)
 
 
-def tree(
-    scene: OpenedLift,
-    words: Sequence[str] = (),
-    vectors: Any = None,
-    *,
-    relations: bool = False,
-    up: Point | Literal["cameras"] | None = None,
-) -> SceneTree:
+def tree(scene: OpenedLift, words: Sequence[str] = (), vectors: Any = None) -> SceneTree:
     """List the objects of a lift with their parts and groups, named by the nearest of some words.
 
     Args:
-        scene, words, vectors: as of `catalogue`. relations, up: as of `Scene.tree`.
+        scene, words, vectors: as of `catalogue`.
 
     Raises:
-        InvalidQuery, InvalidLift: as `catalogue`; or the cameras have no up in common.
-        InvalidInput: up has no direction.
+        InvalidQuery, InvalidLift: as `catalogue`.
     """
     measured: dict[str, Any] = {"world": scene.world, "unit": scene.world.unit}
     if scene.object is None or scene.object_views is None:
@@ -130,14 +120,7 @@ def tree(
         confidence = float(scene.node_confidence[node])
         nodes.append(SceneNode(**fields | tree_fields, parent=parent, confidence=confidence))
     explanation = _counts(nodes) if nodes else NONE_FOUND
-    answer = SceneTree(explanation=explanation, count=len(nodes), nodes=tuple(nodes), **measured)
-    if not relations:
-        return answer
-    up_axis = upright(scene.cameras.values()) if up == "cameras" else up
-    world = WorldFrame(up=up_axis).known_or(scene.world)
-    members = [np.flatnonzero(scene.members(node)) for node in range(objects)]
-    node_relations = related(scene.splats, members, scene.total_weight, world)
-    return answer.model_copy(update={"world": world, "relations": node_relations})
+    return SceneTree(explanation=explanation, count=len(nodes), nodes=tuple(nodes), **measured)
 
 
 def _counts(nodes: Sequence[SceneNode]) -> str:

@@ -593,23 +593,12 @@ class SceneNode(SceneObject):
     confidence: float = Field(description="of the views that see it, the share that has a mask of the whole")
 
 
-class Relation(Value):
-    """A spatial relation of two objects (`liftcore.query.relations`)."""
-
-    node: int
-    relation: Literal["touching", "inside", "on", "under", "beside"]
-    other: int
-    gap: float = Field(description="in `unit`; below zero where one sinks into the other")
-    overlap: float | None = Field(description="0 to 1, of what it comes from; null of touching")
-
-
 class SceneTree(WithUnits):
     """Objects, their parts and groups of them, or some of these; the first are the objects."""
 
     explanation: str = Field(description="why there are so many; or why there are none")
     count: int = Field(description="of all pages")
     nodes: tuple[SceneNode, ...]
-    relations: tuple[Relation, ...] = Field(default=(), description="of the objects, if requested")
 
 
 class CoveringRegion(Value):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from liftcore.errors import InvalidLift
 from liftcore.query.opened import OpenedLift
@@ -217,22 +217,17 @@ class Scene(OpenedLift):
         vectors: Any = None,
         *,
         encoder: TextEncoder | str | Path | None = None,
-        relations: bool = False,
-        up: tuple[float, float, float] | Literal["cameras"] | None = None,
     ) -> SceneTree:
         """List the objects of `catalogue` with their parts and groups of them: a node's parts are nodes, too.
 
         Args:
             words, vectors, encoder: as in `catalogue`.
-            relations: True to add spatial relations of the objects (`liftcore.query.relations`).
-            up: in place of the axis of ``world``: the direction against gravity in the frame of the splats, or
-                ``cameras`` if photos were taken upright. Without an up axis no object is on another.
         """
         from liftcore.query.catalogue import tree
 
         if words and vectors is None:
             vectors = self.encoder(encoder).encode(words)
-        return tree(self, words, vectors, relations=relations, up=up)
+        return tree(self, words, vectors)
 
     def segment(
         self,

@@ -53,16 +53,6 @@ def touching_pairs(splats: Splats, rows: np.ndarray, threads: int | None = None)
     return np.concatenate(index), np.concatenate(near)
 
 
-def touch_pairwise(splats: Splats, first_rows: np.ndarray, second_rows: np.ndarray) -> np.ndarray:
-    """Return [n] bool, whether the splats of rows [n] i64 touch those of other rows [n] i64, each its own."""
-    means = [splats.means.cpu().numpy()[rows].astype(np.float64) for rows in (first_rows, second_rows)]
-    first, second = (
-        np.concatenate([places, _covariances(splats, rows)], axis=1)
-        for places, rows in zip(means, (first_rows, second_rows), strict=True)
-    )
-    return _touch(first, second[:, None])[:, 0]
-
-
 def _touch(splat_shapes: np.ndarray, near: np.ndarray) -> np.ndarray:
     """Return [m, k] bool, True where a splat [m, 9] touches a neighbour [m, k, 9]; each is centre and Sigma."""
     splat_shapes = splat_shapes[:, None]

@@ -253,15 +253,10 @@ def list_objects(
 
 @router.get("/lifts/{lift}/tree", response_model=models.LiftTree)
 def get_tree(
-    lift: str, request: Request, deps: Deps, owner: Caller, options: Annotated[models.TreeRequest, Query()]
+    lift: str, request: Request, deps: Deps, owner: Caller, options: Annotated[models.NodesRequest, Query()]
 ) -> Response:
-    """Get the objects with their parts and their groups, objects first; nodes have splats as objects have.
-
-    With `relations`, how the objects lie to each other.
-    """
-    record = deps.store.lift(owner, lift)
-    fields = {"relations": options.relations or options.up is not None, "up": options.up}
-    return respond(request, deps, _nodes("tree", record, deps, owner, options) | fields)
+    """Get the objects with their parts and their groups, objects first; nodes have splats as objects have."""
+    return respond(request, deps, _nodes("tree", deps.store.lift(owner, lift), deps, owner, options))
 
 
 def _nodes(operation: str, lift: Lift, deps: Parts, owner: Owner, options: models.NodesRequest) -> dict[str, Any]:
