@@ -19,10 +19,11 @@ Every error names the argument, the expected value and the actual one, and has a
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
 __all__ = [
     "InvalidCameras", "InvalidFeatures", "InvalidInput", "InvalidLift", "InvalidMasks", "InvalidPhotos",
@@ -71,6 +72,26 @@ def _rebuild(
     error = cls(argument, expected=expected, got=got, hint=hint)
     error.nearest = None if nearest is None else tuple(nearest)
     return error
+
+
+@contextmanager
+def reading(source: object, error: type[SplatliftError], expected: str, hint: str = "") -> Iterator[None]:
+    """Raise ``error`` about a file or a value for what its reader raises.
+
+    A reader's ``ValueError`` says ``X, got Y; do W``. Where it says less, ``expected`` and ``hint`` are taken.
+    """
+    try:
+        yield
+    except SplatliftError:
+        raise
+    except OSError as fault:
+        raise error(str(source), expected=expected, got=str(fault.strerror or fault)[:120], hint=hint) from None
+    except (ValueError, TypeError, LookupError, OverflowError, RecursionError, EOFError, SyntaxError) as fault:
+        seen, separator, got = str(fault).partition(", got ")
+        got, _, remedy = got.partition("; ") if separator else (seen, "", "")
+        raise error(
+            str(source), expected=seen if separator else expected, got=got[:160], hint=remedy or hint
+        ) from None
 
 
 class InvalidInput(SplatliftError):

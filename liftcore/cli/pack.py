@@ -26,7 +26,7 @@ MASK_LAYOUTS = """\
 layouts of FOLDER: vectors IMG.npy [M, F] of each image, unless --encoder
 computes them, with one of
   IMG.json              SAM's generator with output_mode uncompressed_rle or
-                        coco_rle, SA-1B's files, or polygons
+                        coco_rle, or SA-1B's files
   IMG_masks.npy (.npz)  booleans [M, H, W] or [M, 1, H, W], or ids [H, W] or
                         [L, H, W] with -1 for none
   IMG.png               a label picture of 8 or 16 bits or a palette: value v is
@@ -47,26 +47,21 @@ PROMPT_LAYOUTS = """\
 layouts of FOLDER, with sub-folders if names of views have some:
   PHRASE/VIEW.png       binary pictures, or arrays [h, w] in .npy or .npz; with
                         --folders views VIEW/PHRASE.png. _ is a space
-  *.json of COCO        images, annotations and categories (CVAT, Label Studio,
-                        Roboflow), LVIS, SA-Co's text_input, YouTube-VIS
-  *.json, one an image  records with a phrase, label or class_name and run
-                        lengths, polygons or pictures: Grounded SAM 2, LabelMe,
-                        ISAT, Supervisely, Darwin. The view is that of the
-                        image_path, or else of the file's name
+  *.json of COCO        images, annotations and categories: run lengths or
+                        polygons. CVAT, Label Studio, Roboflow, LabelMe and
+                        others export it
+  *.json, one an image  Grounded SAM 2: records with a class_name, phrase or
+                        label and run lengths or polygons. The view is that of
+                        the image_path, or else of the file's name
   json_data, mask_data  the tracking of Grounded SAM 2: pictures of ids and
-                        their class names; also DEVA, COCO's panoptic pictures
-  VIEW.png (.npy)       label pictures. Those of 'segment --labels' contain
-                        their names; for others --names FILE: JSON from values
-                        to names or from names to values (id2label, COCO's
-                        categories), .csv or .tsv of values and names, one name
-                        a line (a first "background" is 0), "1 name" or "1,name"
-                        a line, CVAT's labelmap.txt
+                        their class names
+  VIEW.png              label pictures. Those of 'segment --labels' contain
+                        their names; for others --names FILE
 
 Masks of one phrase in a view are merged. Polygons are filled within a pixel of
 pycocotools, at the image's width and height. In a view with a file, pixels
-outside of all masks show none of the phrases. If SA-Co or LVIS say that the
-image was not searched for every phrase, they have no label. Annotations with
-only a box are counted in a warning, and their pixels have no label.
+outside of all masks show none of the phrases. Annotations with only a box are
+counted in a warning, and their pixels have no label.
 """
 
 
@@ -105,7 +100,7 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
         "--names",
         type=Path,
         metavar="FILE",
-        help="names of label pictures, JSON from values to names, or one name a line",
+        help='names of label pictures, JSON from values to names: {"1": "red mug"}',
     )
     folders_help = "names of folders of binary PNGs: phrases (PHRASE/VIEW.png) or views (VIEW/PHRASE.png)"
     prompts.add_argument("--folders", choices=("phrases", "views"), default="phrases", help=folders_help)

@@ -13,12 +13,12 @@ from typing import Any, Protocol
 import numpy as np
 from PIL import Image, ImageDraw, UnidentifiedImageError
 
-from liftcore.errors import InvalidInput
+from liftcore.errors import InvalidInput, reading
 from liftcore.features.mask_files import read_polygons
-from liftcore.features.mask_json import ISAT_BACKGROUND
 from liftcore.io.files import is_system_file, visible_files
 from liftcore.scene.views import composed
 
+ISAT_BACKGROUND = "__background__"
 Box = tuple[int, int, int, int]  # x1 y1 x2 y2, pixels, both ends inside
 
 
@@ -137,7 +137,8 @@ def _list(value: object, path: Path) -> list[Any]:
 
 def _polygons(segmentation: object, scale: tuple[float, float], path: Path) -> list[Polygon]:
     """Read the parts of a polygon, in pixels of the camera."""
-    parts = read_polygons(segmentation, str(path))
+    with reading(path, InvalidInput, "polygons"):
+        parts = read_polygons(segmentation)
     return [[(math.floor(x * scale[0]), math.floor(y * scale[1])) for x, y in part.tolist()] for part in parts]
 
 

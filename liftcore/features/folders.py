@@ -13,11 +13,11 @@ from typing import Literal, TypeVar
 
 import numpy as np
 
-from liftcore.errors import InvalidFeatures
+from liftcore.errors import InvalidFeatures, reading
 from liftcore.io.files import visible_files
-from liftcore.io.npy import ARRAYS, TENSORS, open_npy, read_floats, without_unit_axes
+from liftcore.io.npy import ARRAYS, TENSORS, open_npy, read_floats
 from liftcore.scene.views import composed, without_image_suffix
-from liftcore.values.views import NO_LABEL, FeatureGrid, Regions, ViewFeatures
+from liftcore.values.views import FeatureGrid, Regions, ViewFeatures
 
 PICKLED = (".pt", ".pth", ".pkl")
 # The suffix of feature-3dgs after the name of an image, for its layout [F, h, w].
@@ -44,7 +44,8 @@ class ViewFolder(Mapping[str, V_co]):
         self._load = load
 
     def __getitem__(self, view: str) -> V_co:
-        return self._load(view)
+        with reading(self.files[view], InvalidFeatures, "features of a view"):
+            return self._load(view)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.files)
@@ -112,41 +113,21 @@ def langsplat_views(folder: Path) -> ViewFolder[Regions]:
 
     def read(view: str) -> Regions:
         codebook = read_floats(codebooks[view], "M, F")
-        ids = mask_ids(open_npy(labels[view]), len(codebook), labels[view])
+        ids = whole_numbers(open_npy(labels[view]))
         return Regions(ids, codebook, context=f"view {view!r}")
 
     return ViewFolder(labels, read, codebooks.values())
 
 
-def mask_ids(stored: np.ndarray, rows: int, path: Path) -> np.ndarray:
-    """Convert stored integers or floats to mask ids [L, H, W] i32, -1 for none.
-
-    Args:
-        stored: [L, H, W], or [H, W] for one level; leading axes of length 1 are removed.
-        rows: number of vectors. path: of the file, for errors.
-
-    Raises:
-        InvalidFeatures: other axes, an id without a vector, or an id that is not a whole number.
-    """
-    shape, stored = list(stored.shape), without_unit_axes(stored, 3)
-    if stored.ndim == 3 and stored.shape[-1] == 1 < len(stored):  # [H, W, 1], as no photo is one pixel wide
-        stored = stored[..., 0]
-    if stored.ndim not in (2, 3):
-        raise InvalidFeatures(str(path), expected="mask ids [L, H, W]", got=str(shape))
-    low, high = float(stored.min()), float(stored.max())
-    # NaN fails every comparison, so it raises here too.
-    if not (low >= NO_LABEL and high < rows):
-        got = f"ids from {low:g} to {high:g}"
-        hint = "number ids through all levels: add the number of masks of the levels before"
-        if low == 0 and high == rows:
-            hint = "id k is row k of the vectors, and -1 is none: if 0 means none in this file, save ids - 1"
-        elif float(stored.max()) == 255 and len(np.unique(stored)) == 2:
-            hint = "masks with one plane each must be booleans: numpy.save(name, masks > 0)"
-        raise InvalidFeatures(str(path), expected=f"ids in -1..{rows - 1}", got=got, hint=hint)
-    labels = stored.astype(np.int32)
-    if stored.dtype.kind == "f" and not np.array_equal(labels, stored):
-        raise InvalidFeatures(str(path), expected="whole numbers as mask ids", got="fractions")
-    return labels if labels.ndim == 3 else labels[None]
+def whole_numbers(stored: np.ndarray) -> np.ndarray:
+    """Return mask ids as integers, which `Regions` checks; LangSplat and others store them as floats."""
+    if stored.dtype.kind != "f":
+        return stored
+    with np.errstate(invalid="ignore"):
+        labels = stored.astype(np.int32)
+    if not np.array_equal(labels, stored):
+        raise ValueError("whole numbers as mask ids, got fractions or numbers beyond 2^31")
+    return labels
 
 
 def files_below(folder: Path) -> list[Path]:

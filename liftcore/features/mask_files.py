@@ -6,19 +6,14 @@ lowest first, each a character from ``0`` on: bit 32 means that more groups foll
 the number is negative. From the fourth on, a number is the difference to the one two before it. The format is that of
 cocodataset/cocoapi, ``common/maskApi.c`` (``rleToString``, ``rleFrString``).
 
-A polygon is a list of parts, ``[[x1, y1, x2, y2, ...], ...]`` in pixels of the image, whose union is the mask; or the
-points ``[[x, y], ...]`` of one part (LabelMe, ISAT); or several rings, where a pixel is inside the mask if it is
-inside an odd number of rings (``exterior`` and ``interior`` of Supervisely, ``paths`` of Darwin).
+A polygon is a list of parts, ``[[x1, y1, x2, y2, ...], ...]`` in pixels of the image, whose union is the mask.
 
-LabelMe and Supervisely also store pictures of a part of the image, as PNGs in base64 with the position of a corner.
+Readers raise ``ValueError`` (`liftcore.errors.reading`).
 """
 
-import base64
-import io
 import json
 import warnings
-import zlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import accumulate
@@ -28,22 +23,14 @@ from typing import Any, overload
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from liftcore.errors import InvalidFeatures
 from liftcore.scene.compositing import MAX_SIDE
 
 LABELS = "a PNG of one channel, 8 or 16 bits of grey or a palette"
-BINARY = "a PNG without transparent pixels, with one value besides black"
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_HEADER_BYTES = 26  # up to the bit depth and the colour type
-PNG_KINDS = {
-    0: "grey",
-    2: "red, green and blue",
-    3: "a palette",
-    4: "grey with transparency",
-    6: "colours with transparency",
-}
+GREY, PALETTE = 0, 3  # colour types of a PNG
 MAX_JSON_BYTES = 1 << 28  # of a file: some thousand masks of a large photo as plain numbers
-MASK_LIST = "a list of masks, or {'annotations': [...]}"
+AS_COCO = "export COCO's JSON (instances) from the program that wrote it"
 GROUP_BITS = 5
 CONTINUATION, SIGN, VALUE = 32, 16, 31
 LOWEST, HIGHEST = ord("0"), ord("0") + 63  # the characters of a group
@@ -51,98 +38,61 @@ MAX_GROUPS = 7  # 35 bits: differences of lengths in an image of MAX_SIDE square
 MAX_PIXELS = 178_956_970  # as many as Pillow opens
 MAX_CROSSINGS = 1 << 24  # of columns of pixels by the edges of a polygon
 MAX_COORDINATE = 1e6  # pixels
-CIRCLE_CORNERS = 64
-OVERHANG = 0.02  # of the image's sides, by which polygons drawn by hand may extend beyond it
-TOO_LARGE = Image.DecompressionBombError
-MAX_PICTURE_BYTES = 64 << 20  # of a PNG of a mask
-RECORD_LISTS = ("annotations", "shapes", "objects", "predictions")  # COCO's, LabelMe's, ISAT's, Roboflow's
-SEGMENTATIONS = ("segmentation", "polygon", "points", "segments", "rle", "mask")  # of a record
 
 
 def label_png(path: Path) -> tuple[np.ndarray, dict[str, str]]:
-    """Read the stored values [h, w] i32 of a label picture, and its texts.
-
-    Raises:
-        InvalidFeatures: not a PNG of one channel whose values Pillow reads unchanged.
-    """
-    with _open_png(path, LABELS, _check_label_depth) as image:
+    """Read the stored values [h, w] i32 of a label picture, and its texts."""
+    with _open_png(path) as (image, depth, kind):
+        if kind != PALETTE and not (kind == GREY and depth in (8, 16)):  # Pillow scales grey values of few bits
+            raise ValueError(f"{LABELS}, got a picture in colours or of {depth} bits; move photos to another folder")
         texts = {name: str(text) for name, text in getattr(image, "text", {}).items()}
         return np.asarray(image).astype(np.int32), texts
 
 
-def panoptic_png(path: Path) -> np.ndarray:
-    """Read the ids [h, w] i32 of a picture of numbers, or of colours, R + 256 G + 65536 B (COCO).
-
-    Raises:
-        InvalidFeatures: not a PNG, or one with transparency.
-    """
-    with _open_png(path, BINARY, _check_opaque) as image:
-        values = np.asarray(image).astype(np.int32)
-    return values if values.ndim == 2 else values @ np.array([1, 256, 65_536], np.int32)
-
-
 def binary_picture(path: Path, unlabelled: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Read a picture of one value besides black: [h, w] bool, where it has this value, and where ``unlabelled``.
+    """Read a picture of one value besides black: [h, w] bool, where it has this value, and where ``unlabelled``."""
+    with _open_png(path) as (image, _, _):
+        if image.mode in ("RGBA", "LA") and image.getchannel("A").getextrema()[0] != 255:
+            hint = "write only the mask: cv2.imwrite(name, 255 * mask.astype(numpy.uint8))"
+            raise ValueError(f"a PNG without transparent pixels, got colours with transparency; {hint}")
+        values = np.asarray(image.convert("RGB") if "A" in image.mode else image)
+    return binary_mask(values.max(axis=2) if values.ndim == 3 else values, unlabelled)
 
-    Raises:
-        InvalidFeatures: not a PNG, or one with transparency or more values.
-    """
-    with _open_png(path, BINARY, lambda *_: None) as image:
-        is_opaque = image.mode in ("RGBA", "LA") and image.getchannel("A").getextrema()[0] == 255
-        if not is_opaque:
-            _check_opaque(0, "colours with transparency" if image.mode in ("RGBA", "LA") else "", path)
-        values = np.asarray(image.convert("RGB") if is_opaque else image)
-    grey = values.max(axis=2) if values.ndim == 3 else values
-    void = np.zeros(grey.shape, bool) if unlabelled is None else grey == unlabelled
-    inside = (grey != 0) & ~void
-    inside_values = grey[inside]
-    if len(inside_values) and inside_values.min() != inside_values.max():
-        got = f"values from {inside_values.min()} to {inside_values.max()} besides 0"
-        names_hint = "give the names of label pictures (--names, in Python names=)"
-        hint = f"{names_hint}; save a mask with soft edges as values of at least one half"
-        raise InvalidFeatures(str(path), expected="one value besides 0, a mask", got=got, hint=hint)
+
+def binary_mask(values: np.ndarray, unlabelled: int | None) -> tuple[np.ndarray, np.ndarray]:
+    """Split values [h, w] in two masks [h, w] bool: those besides 0, and the unlabelled ones."""
+    void = np.zeros(values.shape, bool) if unlabelled is None else values == unlabelled
+    inside = (values != 0) & ~void
+    inside_values = values[inside]
+    if len(inside_values) and (low := inside_values.min()) != (high := inside_values.max()):
+        hint = "give the names of label pictures (--names, in Python names=); save soft edges or scores as a mask"
+        raise ValueError(f"one value besides 0, a mask, got values from {low} to {high} besides 0; {hint}")
     return inside, void
 
 
 @contextmanager
-def _open_png(path: Path, expected: str, check: Callable[[int, str, Path], None]) -> Iterator[Image.Image]:
-    """Open a PNG with Pillow after a check of its bit depth and colour type."""
+def _open_png(path: Path) -> Iterator[tuple[Image.Image, int, int]]:
+    """Open a PNG with Pillow, with its bit depth and colour type."""
+    with path.open("rb") as handle:
+        header = handle.read(PNG_HEADER_BYTES)
+    if len(header) < PNG_HEADER_BYTES or not header.startswith(PNG_SIGNATURE):
+        raise ValueError("a PNG, got a file that is not a PNG")
     try:
-        with path.open("rb") as handle:
-            header = handle.read(PNG_HEADER_BYTES)
-        if len(header) < PNG_HEADER_BYTES or not header.startswith(PNG_SIGNATURE):
-            raise InvalidFeatures(str(path), expected=expected, got="a file that is not a PNG")
-        check(header[24], PNG_KINDS.get(header[25], "an unknown kind"), path)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # Pillow raises at twice the limit
             with Image.open(path, formats=["PNG"]) as image:
                 image.load()
-                yield image
+                yield image, header[24], header[25]
     except Image.DecompressionBombError:
-        limit = 2 * (Image.MAX_IMAGE_PIXELS or 0)
-        raise InvalidFeatures(str(path), expected=f"at most {limit} pixels", got="a larger picture") from None
+        raise ValueError(f"at most {2 * (Image.MAX_IMAGE_PIXELS or 0)} pixels, got a larger picture") from None
     except UnidentifiedImageError:
-        raise InvalidFeatures(str(path), expected=expected, got="one that Pillow cannot identify") from None
-    except (OSError, SyntaxError, ValueError, EOFError) as error:  # Pillow's errors for truncated or broken files
-        got = f"one that does not open ({str(error)[:120]})"
-        raise InvalidFeatures(str(path), expected=expected, got=got, hint="write it again") from None
-
-
-def _check_label_depth(depth: int, kind: str, path: Path) -> None:
-    """Check that Pillow reads the stored values unchanged: it scales grey values of few bits to 0 to 255."""
-    if kind != "a palette" and not (kind == "grey" and depth in (8, 16)):
-        hint = "move photos to another folder; save a picture of colours with one number for each colour"
-        raise InvalidFeatures(str(path), expected=LABELS, got=f"{kind} of {depth} bits", hint=hint)
-
-
-def _check_opaque(_: int, kind: str, path: Path) -> None:
-    if "transparency" in kind:
-        hint = "write only the mask: cv2.imwrite(name, 255 * mask.astype(numpy.uint8))"
-        raise InvalidFeatures(str(path), expected=BINARY, got=kind, hint=hint)
+        raise ValueError("a PNG, got one that Pillow cannot identify") from None
+    except OSError as error:  # also of truncated or broken files
+        raise ValueError(f"a PNG, got one that does not open ({error}); write it again") from None
 
 
 @dataclass(frozen=True)
-class RunMask:
+class StoredMask:
     """A mask as run lengths."""
 
     size: tuple[int, int]  # h, w
@@ -150,36 +100,13 @@ class RunMask:
 
     def pixels(self) -> np.ndarray:
         """Decode the mask, [h, w] bool."""
-        return mask_of_runs(self.size, self.lengths)
+        height, width = self.size
+        inside = np.arange(len(self.lengths)) % 2 == 1
+        return np.repeat(inside, self.lengths).reshape(width, height).T
 
     def is_empty(self) -> bool:
         """Return True if no pixel is inside."""
         return not self.lengths[1::2].any()
-
-
-@dataclass(frozen=True)
-class PolygonMask:
-    """A mask as the union of polygons."""
-
-    size: tuple[int, int]  # h, w
-    parts: tuple[np.ndarray, ...]  # [n, 2] f64 each, x and y in pixels
-
-    def pixels(self) -> np.ndarray:
-        """Fill the mask, [h, w] bool."""
-        return fill_polygons(self.size, self.parts)
-
-    def is_empty(self) -> bool:
-        """Return True if no pixel is inside."""
-        return not self.pixels().any()
-
-    def reaches_beyond(self, size: tuple[int, int]) -> bool:
-        """Return True if a corner is further outside an image (h, w) than rounding and drawing by hand explain."""
-        height, width = size
-        corner_limit = np.array([width, height]) * (1 + OVERHANG) + 1
-        return any((part > corner_limit).any() for part in self.parts)
-
-
-StoredMask = RunMask | PolygonMask
 
 
 @dataclass(frozen=True)
@@ -200,155 +127,65 @@ class StoredMasks(Sequence[np.ndarray]):
 
 
 def read_mask_json(path: Path) -> Any:
-    """Read the content of a JSON file of masks.
-
-    Raises:
-        InvalidFeatures: not JSON, or larger than MAX_JSON_BYTES.
-    """
+    """Read the content of a JSON file of masks."""
+    if (size := path.stat().st_size) > MAX_JSON_BYTES:
+        hint = "write compressed counts (coco_rle), which are smaller"
+        raise ValueError(f"at most {MAX_JSON_BYTES} bytes, got {size} bytes; {hint}")
     try:
-        if path.stat().st_size > MAX_JSON_BYTES:
-            got, hint = f"{path.stat().st_size} bytes", "write compressed counts (coco_rle), which are smaller"
-            raise InvalidFeatures(str(path), expected=f"at most {MAX_JSON_BYTES} bytes", got=got, hint=hint)
         return json.loads(path.read_bytes())
-    except OSError as error:
-        raise InvalidFeatures(str(path), expected=MASK_LIST, got=f"no such file ({error.strerror})") from None
     except (ValueError, RecursionError) as error:
-        got = f"invalid JSON ({str(error)[:120]})"
-        raise InvalidFeatures(str(path), expected=MASK_LIST, got=got, hint="write it with json.dump") from None
+        raise ValueError(f"JSON, got one that does not parse ({str(error)[:80]}); write it with json.dump") from None
 
 
-def mask_records(content: Any, path: Path) -> list[Any]:
-    """Return the records of masks of a document: a list, or the list under one of RECORD_LISTS.
-
-    Raises:
-        InvalidFeatures: there is no such list.
-    """
-    candidates = (content.get(key) for key in RECORD_LISTS) if isinstance(content, dict) else iter([content])
-    records = next((records for records in candidates if isinstance(records, list)), None)
-    if records is None:
-        got = f"an object of {', '.join(map(repr, list(content)[:3]))}"[:120] if isinstance(content, dict) else "none"
-        raise InvalidFeatures(str(path), expected=MASK_LIST, got=got, hint="move files without views out of it")
+def mask_records(content: Any) -> list[Any]:
+    """Return the records of masks of a document: a list, or the list under ``annotations``."""
+    records = content.get("annotations") if isinstance(content, dict) else content
+    if not isinstance(records, list):
+        got = f"an object of {', '.join(map(repr, list(content)[:3]))}" if isinstance(content, dict) else "none"
+        raise ValueError(f"a list of masks, or {{'annotations': [...]}}, got {got[:120]}; {AS_COCO}")
     return records
 
 
-def read_mask(record: Any, size: tuple[int, int] | None, location: str) -> StoredMask | None:
-    """Read the mask of a record, run lengths or polygons; None if it has no mask, or polygons without a part.
+def read_mask(segmentation: Any, size: tuple[int, int] | None) -> StoredMask | None:
+    """Read run lengths or polygons; None if there is neither.
 
     Args:
         size: (h, w) of the image, needed for polygons; None: unknown.
-        location: of the record in its file, for errors.
-
-    Raises:
-        InvalidFeatures: as in `read_runs` and `read_polygons`, or polygons of an image of unknown size.
     """
-    fields = record if isinstance(record, dict) else {}
-    bitmap, shape = fields.get("bitmap"), fields.get("shape_type")
-    if shape == "mask" or isinstance(bitmap, dict):
-        corner = bitmap.get("origin") if isinstance(bitmap, dict) else (fields.get("points") or [None])[0]
-        content = bitmap.get("data") if isinstance(bitmap, dict) else fields.get("mask")
-        return _read_bitmap(content, corner, _known_size(size, location), location)
-    segmentation = next((fields[key] for key in SEGMENTATIONS if fields.get(key) is not None), None)
     if segmentation is None or segmentation == []:
         return None
-    rings = _rings(segmentation)
-    if rings is None and not isinstance(segmentation, list):
-        return RunMask(*read_runs(segmentation, location))
-    parts = read_polygons(segmentation, location) if rings is None else [_join_rings(rings, location)]
-    parts = [_circle_outline(parts[0])] if shape == "circle" and parts and len(parts[0]) == 2 else parts
-    corners = np.concatenate([part.reshape(-1) for part in parts])
-    if len(corners) >= 6 and 0 <= corners.min() <= corners.max() <= 1 and (size is None or max(size) > 2):
-        hint = "multiply x by the image's width and y by its height"
-        raise InvalidFeatures(
-            location, expected="a polygon in pixels", got="one in fractions of the image", hint=hint
-        )
-    return PolygonMask(_known_size(size, location), tuple(parts))
+    if isinstance(segmentation, list):
+        return stored_mask(fill_polygons(_known_size(size), read_polygons(segmentation)))
+    return read_runs(segmentation)
 
 
-def _known_size(size: tuple[int, int] | None, location: str) -> tuple[int, int]:
+def _known_size(size: tuple[int, int] | None) -> tuple[int, int]:
     if size is None:
         hint = "give the image's width and height, or masks as run lengths"
-        raise InvalidFeatures(location, expected="the size of the image of a polygon", got="none", hint=hint)
-    check_size(size, location)
-    return size
+        raise ValueError(f"the size of the image of a polygon, got none; {hint}")
+    return check_size(size)
 
 
-def _rings(segmentation: Any) -> list[Any] | None:
-    """Return the rings of a record of rings, the outer one first; None for other records."""
-    if not isinstance(segmentation, dict):
-        return None
-    if isinstance(segmentation.get("paths"), list):
-        return segmentation["paths"]
-    if all(isinstance(segmentation.get(axis), list) for axis in "xy"):  # of Ultralytics
-        return [[list(point) for point in zip(segmentation["x"], segmentation["y"], strict=False)]]
-    inner = segmentation.get("interior")
-    return (
-        [segmentation["exterior"], *(inner if isinstance(inner, list) else [])]
-        if "exterior" in segmentation
-        else None
-    )
-
-
-def _join_rings(rings: Sequence[Any], location: str) -> np.ndarray:
-    """Join rings to one outline [n, 2] f64, with lines between them in both directions, which cancel."""
-    outlines = [part for ring in rings for part in read_polygons(ring, location) if len(part)]
-    closed = [np.concatenate([part, part[:1], outlines[0][:1]]) for part in outlines]
-    return np.concatenate(closed) if closed else np.zeros((0, 2))
-
-
-def _circle_outline(points: np.ndarray) -> np.ndarray:
-    """Return the outline [n, 2] f64 of a circle from its centre and a point on it [2, 2]."""
-    centre, rim = points
-    angles = np.linspace(0, 2 * np.pi, CIRCLE_CORNERS, endpoint=False)
-    return centre + np.hypot(*(rim - centre)) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-
-
-def _read_bitmap(content: Any, corner: Any, size: tuple[int, int], location: str) -> RunMask:
-    """Read the mask of a PNG in base64, possibly deflated, with its corner (x, y) in pixels of the image."""
-    try:
-        packed = base64.b64decode(content, validate=True)
-        unpacker = zlib.decompressobj()
-        png = packed if packed.startswith(PNG_SIGNATURE) else unpacker.decompress(packed, MAX_PICTURE_BYTES)
-        with Image.open(io.BytesIO(png), formats=["PNG"]) as image:
-            if image.width * image.height > MAX_PIXELS:
-                raise ValueError(f"{image.width}x{image.height} pixels")
-            is_alpha = image.mode in ("LA", "RGBA")
-            inside = np.asarray(image.getchannel("A") if is_alpha else image.convert("L")) > 0
-        left, top = (round(float(place)) for place in corner)
-    except (TypeError, ValueError, OverflowError, zlib.error, OSError, SyntaxError, TOO_LARGE) as error:
-        got, expected = str(error)[:80] or "none", "a PNG in base64 and its corner (x, y)"
-        raise InvalidFeatures(location, expected=expected, got=got) from None
-    height, width = size
-    if not (top >= 0 and top + inside.shape[0] <= height and left >= 0 and left + inside.shape[1] <= width):
-        got = f"{inside.shape[1]} x {inside.shape[0]} pixels at ({left}, {top})"
-        raise InvalidFeatures(location, expected=f"a picture within {width} x {height} pixels", got=got)
-    full_image = np.zeros(size, bool)
-    full_image[top : top + inside.shape[0], left : left + inside.shape[1]] = inside
-    flat = np.concatenate([[False], full_image.T.reshape(-1)])
-    changes = np.flatnonzero(flat[1:] != flat[:-1])
-    return RunMask(size, np.diff(np.concatenate([[0], changes, [full_image.size]])))
-
-
-def read_polygons(segmentation: Any, location: str) -> list[np.ndarray]:
+def read_polygons(segmentation: Any) -> list[np.ndarray]:
     """Read the parts of a polygon, [n, 2] f64 each: x and y in pixels.
 
     Args:
-        segmentation: one list x1, y1, x2, y2, ... for each part, or for the only one; or the points of one part, as
-            lists [x, y] or objects of x and y.
-
-    Raises:
-        InvalidFeatures: another structure, or a coordinate that is not a finite number within MAX_COORDINATE.
+        segmentation: one list x1, y1, x2, y2, ... for each part, or for the only one; or the points [x, y] of one.
     """
-    items = segmentation if isinstance(segmentation, list) else [segmentation]
-    points = [[point.get("x"), point.get("y")] if isinstance(point, dict) else point for point in items]
-    if points and all(isinstance(point, list) and len(point) == 2 for point in points):
-        points = [[number for point in points for number in point]]
-    elif points and not isinstance(points[0], list):
-        points = [points]
-    for part in points:
+    parts = segmentation if isinstance(segmentation, list) else [segmentation]
+    if parts and all(isinstance(point, list) and len(point) == 2 for point in parts):
+        parts = [[number for point in parts for number in point]]
+    elif parts and not isinstance(parts[0], list):
+        parts = [parts]
+    for part in parts:
         if not isinstance(part, list) or len(part) % 2 or not all(map(_is_coordinate, part)):
-            expected = "parts [x1, y1, x2, y2, ...] of a polygon, or its points [x, y], in pixels"
-            raise InvalidFeatures(location, expected=expected, got=repr(part)[:80])
-    return [np.array(part, np.float64).reshape(-1, 2) for part in points]
+            expected = "parts [x1, y1, x2, y2, ...] of a polygon, in pixels"
+            raise ValueError(f"{expected}, got {repr(part)[:80]}; {AS_COCO}")
+    corners = [number for part in parts for number in part]
+    if len(corners) >= 6 and 0 <= min(corners) <= max(corners) <= 1:
+        hint = "multiply x by the image's width and y by its height"
+        raise ValueError(f"a polygon in pixels, got one in fractions of the image; {hint}")
+    return [np.array(part, np.float64).reshape(-1, 2) for part in parts]
 
 
 def _is_coordinate(value: Any) -> bool:
@@ -360,9 +197,6 @@ def fill_polygons(size: tuple[int, int], parts: Iterable[np.ndarray]) -> np.ndar
 
     Polygons are clipped to the image. cocodataset/cocoapi (``rleFrPoly``) rounds corners to fifths of a pixel first,
     so its outlines differ by a fraction of a pixel.
-
-    Raises:
-        InvalidFeatures: a part's edges cross more than MAX_CROSSINGS columns of pixels.
     """
     height, width = size
     inside = np.zeros(size, bool)
@@ -371,8 +205,8 @@ def fill_polygons(size: tuple[int, int], parts: Iterable[np.ndarray]) -> np.ndar
         low, high = np.minimum(part, ends)[:, 0], np.maximum(part, ends)[:, 0]
         first, last = (np.clip(np.ceil(side - 0.5), 0, width).astype(np.int64) for side in (low, high))
         if (crossed := int((last - first).sum())) > MAX_CROSSINGS:
-            expected = f"at most {MAX_CROSSINGS} crossings of its edges with columns of pixels"
-            raise InvalidFeatures("polygon", expected=expected, got=f"{crossed} by {len(part)} corners")
+            expected = f"a polygon whose edges cross at most {MAX_CROSSINGS} columns of pixels"
+            raise ValueError(f"{expected}, got {crossed} by {len(part)} corners; write run lengths")
         edges = np.repeat(np.arange(len(part)), last - first)  # an entry for each column whose centre an edge crosses
         if not len(edges):
             continue
@@ -387,53 +221,40 @@ def fill_polygons(size: tuple[int, int], parts: Iterable[np.ndarray]) -> np.ndar
     return inside
 
 
-def check_size(size: tuple[int, int], location: str) -> None:
-    """Check that a size of masks (h, w) is within bounds.
-
-    Raises:
-        InvalidFeatures: a side below 1 or above MAX_SIDE, or more than MAX_PIXELS pixels.
-    """
+def check_size(size: tuple[int, int]) -> tuple[int, int]:
+    """Return a size of masks (h, w) if it is within bounds."""
     height, width = size
     if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE and height * width <= MAX_PIXELS):
-        expected = f"sides in 1..{MAX_SIDE} and at most {MAX_PIXELS} pixels"
-        raise InvalidFeatures(location, expected=expected, got=f"size {height} x {width}"[:80])
+        raise ValueError(f"sides in 1..{MAX_SIDE} and at most {MAX_PIXELS} pixels, got size {height} x {width}"[:160])
+    return size
 
 
-def read_runs(segmentation: Any, location: str) -> tuple[tuple[int, int], np.ndarray]:
-    """Read size and run lengths of a mask in JSON, ``{"size": [h, w], "counts": ...}``.
+def stored_mask(mask: np.ndarray) -> StoredMask:
+    """Encode a mask [h, w] bool."""
+    flat = mask.T.ravel()
+    changes = np.flatnonzero(np.diff(flat, prepend=False))
+    return StoredMask((mask.shape[0], mask.shape[1]), np.diff(changes, prepend=0, append=flat.size))
 
-    Returns:
-        (h, w), and the lengths [n] i64, whose sum is h w.
 
-    Raises:
-        InvalidFeatures: another structure, a size out of bounds, a string that is truncated or has other characters,
-            or lengths that do not cover the image exactly. The error starts with ``location``.
-    """
+def read_runs(segmentation: Any) -> StoredMask:
+    """Read the run lengths of a mask in JSON, ``{"size": [h, w], "counts": ...}``."""
     if not isinstance(segmentation, dict) or not {"size", "counts"} <= segmentation.keys():
-        hint = "segment-anything writes them with output_mode='uncompressed_rle' or 'coco_rle'"
-        raise InvalidFeatures(location, expected="run lengths {size, counts}", got=repr(segmentation)[:80], hint=hint)
+        hint = f"segment-anything writes them with output_mode='uncompressed_rle' or 'coco_rle'; {AS_COCO}"
+        raise ValueError(f"run lengths {{size, counts}}, got {repr(segmentation)[:80]}; {hint}")
     size, counts = segmentation["size"], segmentation["counts"]
     if not (isinstance(size, list) and len(size) == 2 and all(type(side) is int for side in size)):
-        raise InvalidFeatures(location, expected="size [h, w]", got=repr(size)[:80])
-    height, width = size
-    check_size((height, width), location)
-    lengths = _decompress_counts(counts, location) if isinstance(counts, str) else counts
+        raise ValueError(f"size [h, w], got {repr(size)[:80]}")
+    height, width = check_size((size[0], size[1]))
+    lengths = _decompress_counts(counts) if isinstance(counts, str) else counts
     if not isinstance(lengths, list) or not all(type(length) is int for length in lengths):
-        raise InvalidFeatures(location, expected="counts, a list of whole numbers or a string", got=repr(counts)[:80])
+        raise ValueError(f"counts, a list of whole numbers or a string, got {repr(counts)[:80]}")
     if min(lengths, default=0) < 0:
-        raise InvalidFeatures(location, expected="counts from 0 on", got=f"a run of {min(lengths)}"[:80])
+        raise ValueError(f"counts from 0 on, got a run of {min(lengths)}"[:120])
     if sum(lengths) != height * width:
         expected = f"counts that sum up to {height} x {width} = {height * width}"
         hint = "the file is truncated, or size is not [h, w] of the mask"
-        raise InvalidFeatures(location, expected=expected, got=f"a sum of {sum(lengths)}"[:80], hint=hint)
-    return (height, width), np.array(lengths, np.int64)
-
-
-def mask_of_runs(size: tuple[int, int], lengths: np.ndarray) -> np.ndarray:
-    """Decode valid run lengths to a mask [h, w] bool."""
-    height, width = size
-    inside = np.arange(len(lengths)) % 2 == 1
-    return np.repeat(inside, lengths).reshape(width, height).T
+        raise ValueError(f"{expected}, got a sum of {str(sum(lengths))[:40]}; {hint}")
+    return StoredMask((height, width), np.array(lengths, np.int64))
 
 
 def _without_bytes_notation(text: str) -> str:
@@ -445,14 +266,13 @@ def _without_bytes_notation(text: str) -> str:
     return text[2:-1].replace("\\\\", "\\") if is_bytes else text
 
 
-def _decompress_counts(text: str, location: str) -> list[int]:
-    text = _without_bytes_notation(text)
+def _decompress_counts(text: str) -> list[int]:
     numbers: list[int] = []
     number = groups = 0
-    for character in text:
+    for character in _without_bytes_notation(text):
         if not LOWEST <= ord(character) <= HIGHEST or groups == MAX_GROUPS:
             expected = f"counts of characters {chr(LOWEST)!r} to {chr(HIGHEST)!r}, {MAX_GROUPS} at most for a number"
-            raise InvalidFeatures(location, expected=expected, got=f"{character!r} in number {len(numbers)}")
+            raise ValueError(f"{expected}, got {character!r} in number {len(numbers)}")
         group = ord(character) - LOWEST
         number |= (group & VALUE) << GROUP_BITS * groups
         groups += 1
@@ -461,7 +281,7 @@ def _decompress_counts(text: str, location: str) -> list[int]:
         numbers.append(number - (1 << GROUP_BITS * groups) if group & SIGN else number)
         number = groups = 0
     if groups:
-        raise InvalidFeatures(location, expected="complete counts", got="a string that ends within a number")
+        raise ValueError("complete counts, got a string that ends within a number")
     # Numbers are differences to the one two before, so there are two cumulative sums, of odd and of even positions.
     lengths = numbers[:1] + [0] * (len(numbers) - 1)
     lengths[1::2] = accumulate(numbers[1::2])

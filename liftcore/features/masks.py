@@ -20,15 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
-from liftcore.errors import InvalidFeatures
-from liftcore.features.folders import ViewFolder, files_below, files_by_view, mask_ids, npy_files
-from liftcore.features.mask_files import (
-    StoredMasks,
-    label_png,
-    mask_records,
-    read_mask,
-    read_mask_json,
-)
+from liftcore.errors import InvalidFeatures, reading
+from liftcore.features.folders import ViewFolder, files_below, files_by_view, npy_files, whole_numbers
+from liftcore.features.mask_files import AS_COCO, StoredMasks, label_png, mask_records, read_mask, read_mask_json
 from liftcore.features.mask_json import declared_size
 from liftcore.io.npy import NUMBERS, open_array, read_floats, without_unit_axes
 from liftcore.values.views import NO_LABEL, Regions, label_levels
@@ -67,21 +61,11 @@ def labels_alone(path: Path, unlabelled: int = 0) -> tuple[np.ndarray, int]:
     Raises:
         InvalidFeatures: as in `mask_views`.
     """
-    if path.suffix.lower() == RUNS:
-        rows = len(mask_records(read_mask_json(path), path))
-    elif path.suffix.lower() == PICTURE:
-        values = label_png(path)[0]
-        high = int(values.max(initial=0, where=values != unlabelled))
-        rows = high + (unlabelled != 0 and bool((values != unlabelled).any()))
-    else:
-        stored = _planes(open_array(path, kinds=NUMBERS + "b"))
-        high = float(stored.max())
-        if not np.isfinite(high):
-            raise InvalidFeatures(str(path), expected="mask ids, or booleans", got="non-finite numbers")
-        rows = len(stored) if stored.dtype.kind == "b" else max(-1, int(high)) + 1
-    if not rows:
-        raise InvalidFeatures(str(path), expected="one mask or more", got="none", hint="remove views without masks")
-    return _labels(path, rows, unlabelled), rows
+    with reading(path, InvalidFeatures, "masks"):
+        labels, rows = _labels(path, None, unlabelled)
+        if not rows:
+            raise ValueError("one mask or more, got none; remove views without masks")
+        return Regions(labels, np.zeros((rows, 1), np.float32), context=str(path)).labels.numpy(), rows
 
 
 def mask_views(
@@ -102,7 +86,7 @@ def mask_views(
         by_view = mask_files(folder)
 
         def add_masks(view: str) -> Regions:
-            labels = _labels(by_view[view], len(mask_vectors[view]), unlabelled)
+            labels, _ = _labels(by_view[view], len(mask_vectors[view]), unlabelled)
             return Regions(labels, mask_vectors[view], context=f"view {view!r}")
 
         return ViewFolder(by_view, add_masks)
@@ -125,7 +109,9 @@ def mask_views(
 
     def read(view: str) -> Regions:
         codebook = read_floats(vectors[view], "M, F")
-        return Regions(_labels(masks[view], len(codebook), unlabelled), codebook, context=f"view {view!r}")
+        with reading(masks[view], InvalidFeatures, "masks"):
+            labels, _ = _labels(masks[view], len(codebook), unlabelled)
+        return Regions(labels, codebook, context=f"view {view!r}")
 
     return ViewFolder(vectors, read, masks.values())
 
@@ -134,54 +120,49 @@ def _pictures(folder: Path) -> list[Path]:
     return [path for path in files_below(folder) if path.suffix.lower() in (RUNS, PICTURE)]
 
 
-def _labels(path: Path, rows: int, unlabelled: int) -> np.ndarray:
-    """Read labels [L, h, w] i32 of a view's masks, which are rows of its vectors."""
-    if path.suffix.lower() == PICTURE:
-        return picture_labels(path, rows, unlabelled)
-    if path.suffix.lower() == RUNS:
-        return label_levels(sam_masks(path, rows), str(path))
-    stored = _planes(open_array(path, kinds=NUMBERS + "b"))
-    got = f"{stored.dtype} {list(stored.shape)}"
-    if stored.dtype.kind != "b":
-        # Planes of zeros and ones are meant as masks; read as ids, all would belong to the first two vectors.
-        if stored.ndim == 3 and len(stored) == rows > 1 and float(stored.min()) >= 0 and float(stored.max()) <= 1:
-            hint = "masks that may overlap must be booleans: numpy.save(name, masks.astype(bool))"
-            got = f"{got} of zeros and ones"
-            raise InvalidFeatures(str(path), expected="mask ids, or booleans", got=got, hint=hint)
-        return mask_ids(stored, rows, path)
-    if stored.ndim != 3:
-        raise InvalidFeatures(str(path), expected="booleans [M, H, W]", got=got)
-    if len(stored) != rows:
-        hint = "row k of the vectors belongs to mask k, and masks are the first axis: [M, H, W]"
-        raise InvalidFeatures(str(path), expected=f"{rows} masks, one a vector", got=got, hint=hint)
-    return label_levels(list(stored), str(path))  # planes of the mapped file, not read yet
-
-
-def picture_labels(path: Path, rows: int, unlabelled: int) -> np.ndarray:
-    """Read labels [1, h, w] i32 of a label picture, -1 for none.
+def _labels(path: Path, rows: int | None, unlabelled: int) -> tuple[np.ndarray, int]:
+    """Read labels [L, h, w] of a view's masks, which are rows of its vectors, and the number of masks.
 
     Args:
-        path: of the picture. rows: number of vectors. unlabelled: value of pixels without a mask.
+        rows: number of vectors. Masks and vectors can be matched only if there are equally many. None: not known.
+    """
+    if path.suffix.lower() == PICTURE:
+        return _picture_labels(path, rows, unlabelled)
+    if path.suffix.lower() == RUNS:
+        masks = _stored_masks(path, rows)
+        return label_levels(masks, str(path)), len(masks)
+    stored = _planes(open_array(path, kinds=NUMBERS + "b"))
+    if stored.dtype.kind != "b":
+        ids = whole_numbers(stored)
+        return ids, int(ids.max()) + 1
+    if stored.ndim != 3:
+        raise ValueError(f"booleans [M, H, W], got {stored.dtype} {list(stored.shape)}")
+    _check_count(len(stored), rows)
+    return label_levels(list(stored), str(path)), len(stored)  # planes of the mapped file, not read yet
 
-    Raises:
-        InvalidFeatures: the file is not such a PNG, or a value has no vector; with 0 for unlabelled also if the last
-            vectors have no value.
+
+def _check_count(count: int, rows: int | None) -> None:
+    if rows is not None and count != rows:
+        raise ValueError(f"{rows} masks, one a vector, got {count}; row k of the vectors belongs to mask k")
+
+
+def _picture_labels(path: Path, rows: int | None, unlabelled: int) -> tuple[np.ndarray, int]:
+    """Read labels [1, h, w] i32 of a label picture, -1 for none, and the number of masks.
+
+    With 0 for unlabelled, the largest value is the number of vectors.
     """
     values = label_png(path)[0]
     labelled = values != unlabelled
     high = int(values.max(initial=0, where=labelled))
-    if unlabelled == 0 and high != rows:
-        if high < rows:
-            hint = "remove a vector for 0, or give another value of unlabelled pixels (--unlabelled 255)"
-        else:
-            hint = "give the value of unlabelled pixels with --unlabelled (255, 65535), in Python unlabelled="
-        expected = f"values 1..{rows} for {rows} vectors, and 0 for none"
-        raise InvalidFeatures(str(path), expected=expected, got=f"values up to {high}", hint=hint)
-    if unlabelled and high >= rows:
+    count = high + (unlabelled != 0 and bool(labelled.any()))
+    if rows is not None and unlabelled == 0 and high != rows:
+        hint = "give the value of unlabelled pixels with --unlabelled (255, 65535), in Python unlabelled="
+        raise ValueError(f"values 1..{rows} for {rows} vectors, and 0 for none, got values up to {high}; {hint}")
+    if rows is not None and high >= rows and unlabelled:
         expected = f"values 0..{rows - 1} for {rows} vectors, and {unlabelled} for none"
         hint = "if 0 means unlabelled and value 1 has the first vector, give --unlabelled 0, in Python unlabelled=0"
-        raise InvalidFeatures(str(path), expected=expected, got=f"the value {high}", hint=hint)
-    return np.where(labelled, values - (unlabelled == 0), NO_LABEL).astype(np.int32)[None]
+        raise ValueError(f"{expected}, got the value {high}; {hint}")
+    return np.where(labelled, values - (unlabelled == 0), NO_LABEL).astype(np.int32)[None], count
 
 
 def _planes(stored: np.ndarray) -> np.ndarray:
@@ -192,34 +173,18 @@ def _planes(stored: np.ndarray) -> np.ndarray:
     return without_unit_axes(planes, 3)
 
 
-def sam_masks(path: Path, count: int) -> StoredMasks:
-    """Read the masks of a file, in its order.
-
-    Args:
-        path: of the file. count: number of vectors. Masks and vectors can be matched only if there are equally many,
-            so this is checked before masks are decoded.
-
-    Raises:
-        InvalidFeatures: not such a JSON, not ``count`` masks, a record without a mask, masks of several sizes, or as
-            `read_mask` says.
-    """
+def _stored_masks(path: Path, rows: int | None) -> StoredMasks:
+    """Read the masks of a list of segment-anything, in its order."""
     content = read_mask_json(path)
-    records, size_in_file = mask_records(content, path), declared_size(content)
-    if len(records) != count:
-        hint = "row k of the vectors belongs to mask k of the list" if records else "remove views without masks"
-        raise InvalidFeatures(str(path), expected=f"{count} masks, one a vector", got=str(len(records)), hint=hint)
+    records, size_in_file = mask_records(content), declared_size(content)
+    _check_count(len(records), rows)
     masks = []
     for number, record in enumerate(records):
-        if (mask := read_mask(record, size_in_file, f"{path} mask {number}")) is None:
-            hint = "segment-anything writes them with output_mode='uncompressed_rle' or 'coco_rle'"
-            expected = "a segmentation, run lengths {size, counts} or polygons"
-            raise InvalidFeatures(f"{path} mask {number}", expected=expected, got="none", hint=hint)
-        masks.append(mask)
-    size = masks[0].size
-    for number, mask in enumerate(masks):
-        if (other := mask.size) != size:
-            got = f"{size[0]} x {size[1]} of mask 0 and {other[0]} x {other[1]} of mask {number}"
-            raise InvalidFeatures(
-                str(path), expected="masks of one size", got=got, hint="write the masks of one photo"
-            )
+        with reading(f"{path} mask {number}", InvalidFeatures, "a segmentation", AS_COCO):
+            mask = read_mask(record["segmentation"], size_in_file)
+            if mask is None:
+                raise ValueError("a segmentation, run lengths {size, counts} or polygons, got none")
+            masks.append(mask)
+    if len(sizes := sorted({mask.size for mask in masks})) > 1:
+        raise ValueError(f"masks of one size, got {sizes[0]} and {sizes[1]}; write the masks of one photo")
     return StoredMasks(tuple(masks))

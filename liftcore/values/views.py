@@ -298,7 +298,8 @@ def _labels(values: object, rows: int, location: str) -> Tensor:
     if low < NO_LABEL or high >= rows:
         expected = f"rows of its codebook (0..{rows - 1}) or {NO_LABEL} for none"
         got = f"the label {low if low < NO_LABEL else high}"
-        raise InvalidFeatures(location, expected=expected, got=got)
+        hint = "label k is row k of the vectors, through all levels; where 0 means none, save labels - 1"
+        raise InvalidFeatures(location, expected=expected, got=got, hint=hint)
     return tensor.to(torch.int32).reshape(-1, *tensor.shape[-2:]).contiguous()
 
 

@@ -564,10 +564,10 @@ MASK_FOLDERS = [
     ("vectors of integers", {"a.npy": npy(np.zeros((3, 5), np.int32)), "a.png": png(GREY)}, "int32"),
     ("vectors of objects", {"a.npy": npy(OBJECTS), "a.png": png(GREY)}, "code"),
     ("vectors of NaN", {"a.npy": npy(VECTORS * np.nan), "a.png": png(GREY)}, "codebook"),
-    ("fewer vectors than ids", {"a.npy": npy(VECTORS[:2]), "a_masks.npy": npy(IDS)}, "ids"),
+    ("fewer vectors than ids", {"a.npy": npy(VECTORS[:2]), "a_masks.npy": npy(IDS)}, "labels"),
     ("fewer masks than vectors", with_vectors(a_masks_npy=npy(MASKS[:2])), "3 masks"),
     ("masks of no axis", with_vectors(a_masks_npy=npy(MASKS[0])), "[M, H, W]"),
-    ("ids beyond", with_vectors(a_masks_npy=npy(np.full((3, 4), 3))), "ids"),
+    ("ids beyond", with_vectors(a_masks_npy=npy(np.full((3, 4), 3))), "the label 3"),
     ("ids of halves", with_vectors(a_masks_npy=npy(np.full((3, 4), 0.5))), "whole numbers"),
     ("masks of objects", with_vectors(a_masks_npy=npy(OBJECTS)), "code"),
     ("masks of text", with_vectors(a_masks_npy=npy(np.array(["a"]))), "numbers"),
@@ -578,7 +578,7 @@ MASK_FOLDERS = [
     ("JSON of a number", with_vectors(a_json=b"3"), "list of masks"),
     ("picture of more values", with_vectors(a_png=png(GREY + 1)), "values"),
     ("picture of nothing", with_vectors(a_png=png(GREY * 0)), "values"),
-    ("picture in colours", with_vectors(a_png=png(Image.new("RGB", (4, 3)))), "red, green and blue"),
+    ("picture in colours", with_vectors(a_png=png(Image.new("RGB", (4, 3)))), "colours"),
     ("picture cut", with_vectors(a_png=png(GREY)[:40]), "PNG"),
 ]
 ARRAY_FOLDERS = [

@@ -119,8 +119,8 @@ def test_what_nobody_annotated_or_decided_is_reported_and_left_out(
     assert status == 0 and "3 views" in out and "instances.json" not in out
     (tmp_path / "labels").mkdir()
     Image.fromarray(np.array([[0, 1], [1, 255]], np.uint8)).save(tmp_path / "labels" / "a.png")
-    (tmp_path / "names.txt").write_text("mug", encoding="utf-8")
-    arguments = ["pack", "prompts", tmp_path / "labels", "--names", tmp_path / "names.txt", "-o", pack]
+    (tmp_path / "names.json").write_text('{"1": "mug"}', encoding="utf-8")
+    arguments = ["pack", "prompts", tmp_path / "labels", "--names", tmp_path / "names.json", "-o", pack]
     status, out, err = run(capsys, *arguments)
     assert (status, out) == (2, "") and "--unlabelled 255" in err
     assert run(capsys, *arguments, "--unlabelled", 255)[0] == 0

@@ -51,11 +51,11 @@ def test_langsplat_folder_becomes_a_pack(ids: str, features: str, tmp_path: Path
 @pytest.mark.parametrize(
     ("ids", "message"),
     [
-        (np.full((1, 2, 2), 4), r"ids in -1\.\.3, got ids from 4 to 4.*number ids through all levels"),
-        (np.full((1, 2, 2), -2), r"ids in -1\.\.3"),
-        (np.full((1, 2, 2), np.nan), r"ids from nan"),
+        (np.full((1, 2, 2), 4), r"\(0\.\.3\) or -1 for none, got the label 4.*through all levels"),
+        (np.full((1, 2, 2), -2), "the label -2"),
+        (np.full((1, 2, 2), np.nan), "whole numbers"),
         (np.full((1, 2, 2), 0.5), "whole numbers"),
-        (np.zeros((2, 2, 2, 2)), r"\[L, H, W\]"),
+        (np.zeros((2, 2, 2, 2)), r"\[L, h, w\]"),
     ],
 )
 def test_wrong_ids_are_refused(ids: np.ndarray, message: str, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from liftcore.errors import InvalidFeatures
-from liftcore.features.mask_files import mask_of_runs, read_runs
+from liftcore.features.mask_files import read_runs
 from liftcore.features.masks import mask_views
 from liftcore.values.pack import read_features, write_pack
 from liftcore.values.views import MAX_LEVELS, Regions, label_levels
@@ -144,7 +144,7 @@ def test_files_beyond_the_limits_are_refused(tmp_path: Path, monkeypatch: pytest
 
 
 def mask_of(segmentation: Any) -> np.ndarray:
-    return mask_of_runs(*read_runs(segmentation, "a.json mask 0"))
+    return read_runs(segmentation).pixels()
 
 
 @given(
@@ -162,8 +162,8 @@ def test_every_mask_comes_back_from_both_forms(columns: list[list[bool]]) -> Non
 @given(st.lists(st.integers(0, 1 << 20), min_size=1, max_size=40))
 def test_long_runs_come_back(lengths: list[int]) -> None:
     lengths = [*lengths, 5461 * 32768 - sum(lengths)]
-    size, runs = read_runs({"size": [5461, 32768], "counts": compressed(lengths)}, "a.json mask 0")
-    assert (size, runs.tolist()) == ((5461, 32768), lengths)
+    mask = read_runs({"size": [5461, 32768], "counts": compressed(lengths)})
+    assert (mask.size, mask.lengths.tolist()) == ((5461, 32768), lengths)
 
 
 @pytest.mark.parametrize(
@@ -208,9 +208,8 @@ def test_strings_that_coco_published_fill_the_boxes_that_it_published(
     ],
 )
 def test_what_is_no_mask_is_refused(segmentation: Any, message: str) -> None:
-    with pytest.raises(InvalidFeatures, match=message) as error:
-        read_runs(segmentation, "a.json mask 0")
-    assert str(error.value).startswith("a.json mask 0: ")
+    with pytest.raises(ValueError, match=message):
+        read_runs(segmentation)
 
 
 @st.composite

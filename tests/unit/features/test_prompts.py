@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import base64
 import io
 import json
 import os
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -74,21 +72,6 @@ def data_set() -> dict[str, Any]:
     return {"instances.json": {"images": images, "categories": categories, "annotations": masks}}
 
 
-def pairs() -> dict[str, Any]:
-    """Return a document like SA-Co's: an image for each photo and phrase."""
-    view_phrases = [(view, phrase) for view in MASKS for phrase in PHRASES.values()]
-    images = [
-        {"id": number, "file_name": f"{view}.jpg", "text_input": phrase}
-        for number, (view, phrase) in enumerate(view_phrases)
-    ]
-    masks = [
-        {"image_id": number, "category_id": 1, "segmentation": record["segmentation"]}
-        for number, record in enumerate(record for view in MASKS for record in records(view, "phrase"))
-    ]
-    categories = [{"id": 1, "name": "object"}]
-    return {"pairs.json": {"images": images, "categories": categories, "annotations": masks}}
-
-
 def numbered_masks(view: str) -> np.ndarray:
     return sum((7 * number * mask for number, mask in enumerate(MASKS[view].values(), 1)), np.zeros(())).astype("u1")
 
@@ -100,65 +83,6 @@ def with_legend(view: str) -> bytes:
     return content.getvalue()
 
 
-def corner_of(mask: np.ndarray) -> tuple[list[int], str]:
-    """Return the corner (x, y) of the smallest image of a mask, and this image as a PNG in base64."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    content = io.BytesIO()
-    Image.fromarray(mask[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]).save(content, "PNG")
-    return [int(columns[0]), int(rows[0])], base64.b64encode(content.getvalue()).decode()
-
-
-def frame(mask: np.ndarray) -> list[list[float]]:
-    """Return the outline of a mask that is a rectangle."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    (top, bottom), (left, right) = (rows[[0, -1]] + [0, 1]).tolist(), (columns[[0, -1]] + [0, 1]).tolist()
-    return [[left, top], [right, top], [right, bottom], [left, bottom]]
-
-
-def programs() -> dict[str, dict[str, Any]]:
-    """Return files of annotation programs, one for each image."""
-    files: dict[str, dict[str, Any]] = {"LabelMe": {}, "Supervisely": {}, "Darwin": {}, "Cityscapes": {}}
-    for view, masks in MASKS.items():
-        height, width = next(iter(masks.values())).shape
-        shapes, objects, annotations, polygons = [], [], [], []
-        for phrase, mask in masks.items():
-            corner, png = corner_of(mask)
-            shapes.append({"label": phrase, "shape_type": "mask", "points": [corner, corner], "mask": png})
-            packed = base64.b64encode(zlib.compress(base64.b64decode(png))).decode()
-            bitmap = {"geometryType": "bitmap", "bitmap": {"data": packed, "origin": corner}}
-            rings = {"geometryType": "polygon", "points": {"exterior": frame(mask), "interior": []}}
-            objects.append({"classTitle": phrase, **(rings if objects else bitmap)})
-            paths = [[{"x": x, "y": y} for x, y in frame(mask)]]
-            annotations.append({"name": phrase, "polygon": {"paths": paths}})
-            polygons.append({"label": phrase, "polygon": frame(mask)})
-        size = {"height": height, "width": width}
-        item = {"name": f"{view}.jpg", "slots": [size]}
-        files["LabelMe"][f"{view}.json"] = {"shapes": shapes, "imageHeight": height, "imageWidth": width}
-        files["Supervisely"][f"{view}.jpg.json"] = {"size": size, "objects": objects}
-        files["Darwin"][f"{view}.json"] = {"item": item, "annotations": annotations}
-        files["Cityscapes"][f"{view}.json"] = {"imgHeight": height, "imgWidth": width, "objects": polygons}
-    return files
-
-
-NAMES = {  # the same names for values 1 and 2
-    "labelmap.txt": "# label:color_rgb:parts:actions\nbackground:0,0,0::\nred_apple:128,0,0::\nLamp:0,128,0::\n",
-    "lines.txt": "red_apple\nLamp\n",
-    "labels.txt": "__ignore__\n_background_\nred_apple\nLamp\n",
-    "windows.txt": "\ufeffred_apple\r\nLamp\r\n",
-    "spaces.txt": "0 background\n1 red_apple\n2 Lamp\n",
-    "behind.txt": "red_apple: 1\nLamp: 2\n",
-    "numbers.csv": "id,name\n1,red_apple\n2,Lamp\n",
-    "behind.csv": '\ufeffname,id\n"red_apple",1\nLamp,2\n',
-    "_classes.csv": "Pixel Value, Class\n0, background\n1, red_apple\n2, Lamp\n",
-    "columns.csv": "Idx,Ratio,Train,Name\n1,0.2,20,red_apple\n2,0.1,10,Lamp\n",
-    "table.tsv": "1\tred_apple\n2\tLamp\n",
-    "list.json": ["background", "red_apple", "Lamp"],
-    "classes.json": {"classes": ["red_apple", "Lamp"]},
-    "objects.json": {"1": {"name": "red_apple"}, "2": {"name": "Lamp"}},
-    "inverse.json": {"red_apple": 1, "Lamp": 2},
-    "config.json": {"id2label": {"0": "background", "1": "red_apple", "2": "Lamp"}},
-    "categories.json": [{"id": 2, "name": "Lamp"}, {"id": 1, "name": "red_apple"}],
-}
 LABELS = {**{f"{view}.png": numbered_masks(view) for view in MASKS}, "names.json": {7: "red_apple", 14: "Lamp"}}
 COLOURS = {name: np.repeat(mask[..., None] // 255, 3, axis=2) for name, mask in binary("{view}/{phrase}").items()}
 KINDS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
@@ -167,12 +91,8 @@ KINDS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "run lengths": (run_lengths(), {}),
     "run lengths as strings": (run_lengths(as_string=True), {}),
     "COCO's data set": (data_set(), {}),
-    "SA-Co's pairs": (pairs(), {}),
     "label PNGs": (LABELS, {"names": "names.json"}),
     "label PNGs with a legend": ({f"{view}.png": with_legend(view) for view in MASKS}, {}),
-    **{name: (files, {}) for name, files in programs().items()},
-    **{name: ({**{f"{view}.png": numbered_masks(view) // 7 for view in MASKS}, name: names}, {"names": name})
-       for name, names in NAMES.items()},
 }  # fmt: skip
 
 
@@ -230,13 +150,6 @@ def test_phrases_of_a_mac_are_asked_as_they_are_typed(tmp_path: Path) -> None:
     assert prompts.table.encode(["K\u00fcche"]).tolist() == [[1, 0]]
 
 
-@pytest.mark.parametrize(("folders", "has_warning"), [("phrases", True), ("views", False)])
-def test_phrases_that_are_numbered_as_photos_give_a_warning(folders: Any, has_warning: bool, tmp_path: Path) -> None:
-    mask = MASKS["middle"]["Lamp"]
-    save(tmp_path, {f"IMG_{view}/{phrase}.png": mask for view in (7, 12) for phrase in ("lamp", "mug")})
-    assert ("--folders views" in " ".join(prompt_views(tmp_path, folders=folders).warnings)) is has_warning
-
-
 def test_masks_in_black_on_white_give_a_warning(tmp_path: Path) -> None:
     save(tmp_path / "black", {name: 255 - mask for name, mask in binary("{phrase}/{view}").items()})
     assert "black on white" in " ".join(prompt_views(tmp_path / "black").warnings)
@@ -284,25 +197,17 @@ def test_packs_of_other_words_make_no_lift(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("names", "message"), [("{}", "JSON of values"), ('{"7": 3}', "JSON of values"), ('["a"]', "the value 7")]
+    ("names", "message"),
+    [
+        ("{}", "JSON from values"),
+        ('{"7": 3}', "JSON from values"),
+        ("mug", "JSON from values"),
+        ('{"3": "a"}', "the value 7"),
+    ],
 )
 def test_names_that_do_not_fit_their_pictures_are_refused(names: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(InvalidFeatures, match=message):
         prompt_views(save(tmp_path, {**LABELS, "names.json": names}), tmp_path / "names.json")
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("data.yaml", "names:\n  0: mug\n", "JSON, a table"),
-        ("class_dict.csv", "name,r,g,b\nmug,9,9,9\nlamp,8,8,8\n", "columns name, r, g, b"),
-        ("pairs.csv", "mug,cup\nlamp,light\n", "columns mug, cup"),
-        ("empty.csv", "", "none in empty.csv"),
-    ],
-)
-def test_tables_without_values_are_no_names(name: str, content: str, message: str, tmp_path: Path) -> None:
-    with pytest.raises(InvalidFeatures, match=message):
-        prompt_views(save(tmp_path, {"a.png": numbered_masks("left"), name: content}), tmp_path / name)
 
 
 @pytest.mark.parametrize(
@@ -322,12 +227,16 @@ def test_tables_without_values_are_no_names(name: str, content: str, message: st
             "the size of the image of a polygon",
         ),
         (
-            {"a.json": [{"phrase": "mug", "segmentation": [[0, 0, 0.4, 0, 0.4, 0.4]]}]},
+            {
+                "a.json": {
+                    "width": 4,
+                    "height": 4,
+                    "annotations": [{"phrase": "mug", "segmentation": [[0, 0, 0.4, 0, 0.4, 0.4]]}],
+                }
+            },
             "a polygon in pixels, got one in fractions of the image",
         ),
         ({"a.json": [{"category_id": 1, "segmentation": [[0, 0, 4, 0, 4, 4]]}]}, "beside|its 'images'|size"),
-        ({"a.json": {"a.jpg1": {"filename": "a.jpg", "regions": []}}}, "VGG Image Annotator.*COCO"),
-        ({"a.json": [{"id": 1, "data": {}, "annotations": []}]}, "Label Studio.*COCO"),
         ({"lamp/a.jpg": "x"}, "1 of them .jpg; JPEG"),
         ({"a.json": '{"images": [{"id": 1}], "annotations": []}'}, "a file_name of each"),
         ({"a.json": '{"images": [{"id": 1, "file_name": "a"}], "annotations": [{}]}'}, "an image_id of the file"),
