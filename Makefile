@@ -14,7 +14,7 @@ CUDA_TORCH_PIP ?=
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 export PIP_ROOT_USER_ACTION = ignore
 
-.PHONY: demo test check coverage kernels contract gpu wheel lint format serve web bench docs sbom setup clean
+.PHONY: demo test check coverage kernels contract gpu wheel lint format serve web docs sbom setup clean
 
 demo: $(READY)  ## the whole job through the real service; SCENE=DIR takes a scene of your own, ASK=TEXT a question
 	$(BIN)/splatlift demo --out "$(OUT)" $(if $(SCENE),--scene "$(SCENE)") $(if $(ASK),--ask "$(ASK)")
@@ -102,9 +102,6 @@ docs: $(READY)  ## the docs site in build/site; a broken link or reference fails
 sbom: $(READY)  ## what is installed, as CycloneDX: sbom.json, by a tool in an environment of its own
 	$(PYTHON) -m venv .venv/sbom && .venv/sbom/bin/python -m pip install --quiet cyclonedx-bom==7.5.0
 	.venv/sbom/bin/cyclonedx-py environment --pyproject pyproject.toml --output-file sbom.json $(BIN)/python
-
-bench: $(READY)
-	$(BIN)/splatlift bench $(if $(SCENE),--scene "$(SCENE)")
 
 setup: $(READY)
 

@@ -33,7 +33,6 @@ COMMANDS = {
     "encode": "encode images as a feature pack",
     "inspect": "describe a file and its problems",
     "evaluate": "evaluate lifts on labelled datasets",
-    "bench": "measure the speed of lifts on this machine",
     "tradeoff": "compare speed and accuracy on a scene",
 }
 SERVICE_COMMANDS = {  # modules of another package, which are entry points in splatlift.commands

@@ -1,7 +1,7 @@
 """Public: what users run on their files and scenes.
 
 - ``inspect_file``: the content of a file; ``check_scene``: a check that files belong together
-- ``run_bench``: the speed of this machine; ``compare_speeds`` of `SceneFiles`: accuracy against speed on a scene
+- ``compare_speeds`` of `SceneFiles`: accuracy against speed on a scene
 - ``evaluate_lifts``: the accuracy of lifts by the labels of LeRF-OVS and 3D-OVS
 """
 

@@ -1,6 +1,5 @@
 """The names of liftcore.evaluate, and where they live."""
 
-from liftcore.evaluate.bench import run_bench as run_bench
 from liftcore.evaluate.check import CheckReport as CheckReport
 from liftcore.evaluate.check import check_scene as check_scene
 from liftcore.evaluate.inspect import inspect_file as inspect_file

@@ -2,9 +2,7 @@
 
 import platform
 import sys
-import time
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +11,6 @@ import torch
 
 from liftcore.runtime.cores import cores
 from liftcore.runtime.device import processor
-
-COPIED, SIDE, TRIES = 1 << 25, 1 << 10, 5  # float32 that are copied, of a matrix's side, and times that each is done
 
 
 def hardware() -> dict[str, Any]:
@@ -34,37 +30,6 @@ def hardware() -> dict[str, Any]:
         "numba": numba.__version__,
         "numpy": np.__version__,
     }
-
-
-def machine_speed(threads: int | None = None) -> dict[str, float]:
-    """Measure bytes read and written a second by all threads, and float32 operations a second: the best of TRIES.
-
-    Args:
-        threads: None uses the cores that this process may use.
-    """
-    count = threads or cores()
-    ends = [(at * COPIED // count, (at + 1) * COPIED // count) for at in range(count)]
-    source, target = np.ones(COPIED, np.float32), np.zeros(COPIED, np.float32)
-
-    def copy(first: int, last: int) -> None:
-        np.copyto(target[first:last], source[first:last])
-
-    left, right = torch.rand(2, SIDE, SIDE, dtype=torch.float32)
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        with ThreadPoolExecutor(count) as pool:
-            copying = min(_seconds(lambda: list(pool.map(copy, *zip(*ends, strict=True)))) for _ in range(TRIES))
-        multiplying = min(_seconds(lambda: left @ right) for _ in range(TRIES))
-    finally:
-        torch.set_num_threads(before)
-    return {"memory_bytes_per_s": 2 * source.nbytes / copying, "float32_flops": 2 * SIDE**3 / multiplying}
-
-
-def _seconds(work: Callable[[], object]) -> float:
-    begin = time.perf_counter()
-    work()
-    return time.perf_counter() - begin
 
 
 def machine_line(facts: Mapping[str, Any]) -> str:

@@ -24,18 +24,15 @@ from torch import Tensor
 from torch.nn.functional import cosine_similarity, embedding_bag
 
 import liftcore as lc
-from liftcore.evaluate.bench import run_bench, weigh_regions
 from liftcore.evaluate.hardware import hardware, machine_line
-from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
 from liftcore.lifting.files import lift_files
-from liftcore.raster import open_raster
 from liftcore.runtime.device import CPU, Device, choose_device
-from liftcore.scene.compositing import Weighting
-from liftcore.solve.closed_form import solve
 from liftcore.values.lift_file import TENSORS, save_lift
+from liftcore.values.settings import Preset
 from liftcore.values.views import cells_under
-from tests.benchmarks.base import read_pack, scene_files, table_of
-from tests.benchmarks.scenes import RoomSpec, write_bench_room
+from tests.benchmarks.base import read_pack, read_scene, scene_files, table_of
+from tests.benchmarks.room import room_cameras, room_regions, room_splats
+from tests.benchmarks.scenes import RoomSpec, write_voronoi_room
 from tests.benchmarks.tabletop import CASES, tabletop
 
 LARGE = RoomSpec(1_000_000, 300, (986, 728), 512)  # docs/results.md has it on an H100
@@ -45,7 +42,7 @@ SMALL = RoomSpec(200_000, 8, (640, 480), 512)  # to compare both devices on: the
 def whole_lift(size: RoomSpec, device: Device, preset: str) -> tuple[list[dict[str, Any]], list[str]]:
     """Seconds of a lift from files to a file by stage, the second of two; the tensors that differ between the two."""
     with tempfile.TemporaryDirectory(prefix="splatlift-room-") as folder:
-        files = write_bench_room(Path(folder), size)
+        files = write_voronoi_room(Path(folder), size)
         settings, lifts = lc.LiftSettings.of(preset=preset, device=device.kind), []
         start = 0.0
         for _ in range(2):  # the first compiles kernels, and leaves the files in the memory of the machine
@@ -76,19 +73,17 @@ def differing(a: lc.LiftResult, b: lc.LiftResult) -> list[str]:
     return [name for name in TENSORS if not torch.equal(bits(a, name), bits(b, name))]
 
 
-def views_of(device: Device, shared: Path) -> Iterator[dict[str, Any]]:
-    """Run ``splatlift bench`` on the device for the room and for plush."""
-    for scene in (None, shared / "plush"):
-        if scene is None or scene.is_dir():
-            size: dict[str, Any] = {
-                "splats": LARGE.splats,
-                "size": "x".join(map(str, LARGE.size)),
-                "channels": LARGE.channels,
-            }
-            figures = run_bench(scene, device=device.kind, views=12, **size)
-            for preset, row in figures["presets"].items():
-                head = {"scene": figures["workload"], "splats": figures["splats"], "preset": preset}
-                yield head | {f"{key}, ms a view": 1e3 * row[f"{key}_s_per_view"] for key in ("geometry", "solve")}
+def views_of(device: Device, plush: Path) -> Iterator[dict[str, Any]]:
+    """Milliseconds a view of plush by every preset: medians of three lifts after one that compiles."""
+    splats, cameras = read_scene(plush)
+    views = read_pack(plush, "regions")
+    for preset in Preset:
+        lifts = [lc.lift(splats, cameras, views, preset, device=device.kind).metadata for _ in range(4)][1:]
+        figures = {
+            f"{stage}, ms a view": 1e3 * statistics.median(each.timings[stage] for each in lifts) / len(views)
+            for stage in ("geometry", "solve")
+        }
+        yield {"preset": preset, **figures}
 
 
 def beside_processor(files: Sequence[Path], device: Device) -> dict[str, Any]:
@@ -153,12 +148,12 @@ def at_pixels(regions: lc.Regions, camera: lc.Camera) -> lc.Regions:
 
 
 def splatlift_features(splats: lc.Splats, views: Views, device: Device) -> tuple[Tensor, Tensor]:
-    """X [P, F] f32 as ``splatlift lift --preset row-sum --set dtype=float32`` has it, and total weights [P] f64."""
-    looking = (lc.CompositingParams(), Weighting())
-    W, codebook = weigh_regions(open_raster(splats, device), views, looking, splats.count)
-    W = W.cpu()
-    solution = solve(W, codebook, torch.float32, means=splats.means)
-    return solution.features, W.row_sums()
+    """X [P, F] f32 and total weights [P] f64, by ``row-sum``."""
+    cameras = {camera.name: camera for camera, _ in views}
+    observed = {camera.name: regions for camera, regions in views}
+    settings = {"dtype": "float32", "diagnostic_rays": 0, "device": device.kind}
+    lifted = lc.lift(splats, cameras, observed, "row-sum", **settings).to(CPU.place)
+    return lifted.features, lifted.total_weight.double()
 
 
 def gsplat_features(rasterization: Any, place: torch.device, splats: lc.Splats, views: Views) -> Tensor:
@@ -212,9 +207,10 @@ def main() -> int:
         broken += differences
         title = f"A whole lift by {preset}, files to file ({LARGE}); tensors that differ when repeated"
         _section(f"{title}: {differences or 'none'}", rows)
-    _section("A view", views_of(device, options.shared))
+    if (options.shared / "plush").is_dir():
+        _section("A view of plush", views_of(device, options.shared / "plush"))
     with tempfile.TemporaryDirectory(prefix="splatlift-room-") as folder:
-        near = [{"scene": "room", **beside_processor(write_bench_room(Path(folder), SMALL), device)}]
+        near = [{"scene": "room", **beside_processor(write_voronoi_room(Path(folder), SMALL), device)}]
     for name, pack in (("plush", "regions"), ("tabletop", "features")):
         if (options.shared / name).is_dir():
             near.append({"scene": name, **beside_processor(scene_files(options.shared / name, pack), device)})

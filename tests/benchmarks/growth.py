@@ -20,12 +20,12 @@ import torch
 
 import liftcore as lc
 from liftcore.evaluate.hardware import peak_memory
-from liftcore.evaluate.synthetic import room_cameras, room_splats
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.runtime.device import give_back_memory
 from liftcore.runtime.progress import Timings
 from liftcore.values.views import ViewFeatures
 from tests.benchmarks.base import command_line, print_rows
+from tests.benchmarks.room import room_cameras, room_splats
 from tests.benchmarks.scenes import RoomSpec, observed_views
 
 LEAST = 0.05  # CPU seconds that are measurable

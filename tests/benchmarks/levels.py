@@ -23,11 +23,11 @@ import numpy as np
 import torch
 
 import liftcore as lc
-from liftcore.evaluate.synthetic import room_cameras, room_parts, room_splats
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.solve.reweight import Reweighting, reweighting_factors
 from liftcore.values.views import NO_LABEL, ViewFeatures
 from tests.benchmarks.base import command_line, print_rows
+from tests.benchmarks.room import room_cameras, room_parts, room_splats
 from tests.benchmarks.tabletop import Truth, evaluated_splats
 from tests.still_life import surfaces
 from tests.still_life.masks import Mistakes, mistaken_regions

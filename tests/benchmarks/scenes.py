@@ -17,12 +17,12 @@ import numpy as np
 import torch
 
 import liftcore as lc
-from liftcore.evaluate.synthetic import PART_LEVELS, room_cameras, room_parts, room_regions, room_splats
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.splats import write_splats
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.values.pack import as_views, write_pack
 from liftcore.values.views import NO_LABEL, ViewFeatures
+from tests.benchmarks.room import PART_LEVELS, room_cameras, room_parts, room_regions, room_splats
 
 NOISE = 0.45
 WRONG, MERGED = 0.1, 0.3  # shares of a view's regions
@@ -102,8 +102,8 @@ def _shrunk(camera: lc.Camera) -> lc.Camera:
     return camera.replace(**sizes, **lengths)
 
 
-def write_bench_room(folder: Path, size: RoomSpec, different: int = 12) -> tuple[Path, Path, Path]:
-    """The room of ``splatlift bench`` as files: Voronoi regions over random vectors, and no part is seen twice.
+def write_voronoi_room(folder: Path, size: RoomSpec, different: int = 12) -> tuple[Path, Path, Path]:
+    """The room as files: Voronoi regions over random vectors, and no part is seen twice.
 
     Args:
         different: label maps that views take in turn, as making one takes longer than lifting it.

@@ -109,11 +109,8 @@ CHOICES: list[tuple[str, Call]] = [
     (r"kind: expected one of splats, ply", lambda: files.check_output("new.npy", [], "foo")),
     (r"kind: expected one of splats, cameras", lambda: evaluate.inspect_file("splats.ply", "foo")),
     (r"settings: expected LiftSettings, or None", lambda: lift({"quality": "fast"})),
-    (r"splats: expected a whole number of one or more, got -1", lambda: evaluate.run_bench(splats=-1)),
-    (r"threads: .* or None for all cores", lambda: evaluate.run_bench(threads=0)),
     (r"files: expected SceneFiles", lambda: evaluate.compare_speeds("splats.ply")),  # pyright: ignore
     (r"splats: expected the path", lambda: evaluate.SceneFiles(None, "cameras.json", ())),  # pyright: ignore
-    (r"size: expected WIDTHxHEIGHT", lambda: evaluate.run_bench(size="0x9")),
     (
         r"settings: expected settings that are the same in all runs, got quality",
         lambda: evaluate.compare_speeds(speeds(str, list_of), settings={"quality": "fast"}),

@@ -32,7 +32,7 @@ from .command_line import assert_one_line, lift_arguments, run, write_toy_scene
 if TYPE_CHECKING:
     from pathlib import Path
 
-COMMANDS = ["demo", "serve", "lift", "plan", "query", "pack", "encode", "inspect", "evaluate", "bench"]
+COMMANDS = ["demo", "serve", "lift", "plan", "query", "pack", "encode", "inspect", "evaluate"]
 
 
 @pytest.fixture
@@ -178,7 +178,7 @@ def test_every_command_has_help_and_names_its_choices(command: str, capsys: pyte
 
 @pytest.mark.parametrize(
     "arguments",
-    [[], ["dance"], ["lift"], ["lift", "a", "b", "c"], ["bench", "--splats", "-3"], ["inspect", "a", "b"]],
+    [[], ["dance"], ["lift"], ["lift", "a", "b", "c"], ["inspect", "a", "b"]],
 )
 def test_wrong_arguments_exit_2_with_one_line(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     status, out, err = run(capsys, *arguments)

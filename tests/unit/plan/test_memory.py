@@ -6,12 +6,12 @@ import pytest
 import torch
 
 import liftcore as lc
-from liftcore.evaluate.synthetic import room_cameras, room_splats
 from liftcore.lifting.planning.plan import check_memory, features_room
 from liftcore.raster.cpu import weights
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.compositing import CompositingParams, Weighting
 from liftcore.values.region_weights import MEMORY_LIMIT
+from tests.benchmarks.room import room_cameras, room_splats
 from tests.scenes import random_camera, random_regions, random_splats
 
 WIDTH, HEIGHT, CHANNELS = 416, 320, 2  # 133,120 pixels
