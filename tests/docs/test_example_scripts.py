@@ -123,10 +123,3 @@ def test_lift_and_mask_writes_masks_of_all_views_and_the_scores(tmp_path: Path) 
         assert mask.shape == (camera.height, camera.width) and set(np.unique(mask)) <= {0, 255}
     columns = lc.read_splats(tmp_path / "out" / "scores.ply").extras
     assert set(columns["selected"].tolist()) <= {0, 1} and columns["score"].shape == (50,)
-
-
-@pytest.mark.slow
-def test_an_encoder_of_ones_own_passes_the_suite() -> None:
-    suite = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "examples/test_my_encoder.py"]
-    output = subprocess.run(suite, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert output.returncode == 0 and "." * 5 in output.stdout, output.stdout

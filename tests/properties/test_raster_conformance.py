@@ -15,7 +15,9 @@ from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import ReferenceRaster, dense_view, reading_matrix, selected_weights
 from liftcore.scene.compositing import CompositingParams, Selection, Weighting
 from liftcore.scene.splats import Kernel, Splats
-from liftcore.testing.raster import (
+from liftcore.values.views import Regions, ViewFeatures
+from tests.backends import Backend, every_backend
+from tests.properties.oracle import (
     INSIDE,
     check_adjoint,
     check_footprints,
@@ -32,8 +34,6 @@ from liftcore.testing.raster import (
     random_image,
     same_bits,
 )
-from liftcore.values.views import Regions, ViewFeatures
-from tests.backends import Backend, every_backend
 from tests.scenes import look_at, random_camera, random_grid, random_regions, random_splats, scenes
 
 if TYPE_CHECKING:

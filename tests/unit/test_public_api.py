@@ -25,7 +25,7 @@ from tests.scenes import observed, random_splats, write_scene
 ROOT = Path(__file__).parents[2]
 MOST_NAMES = 60  # of `import liftcore`
 MOST_OF_ALL = 117  # with those of the public modules: each more must be worth its place
-MODULES = ("cli", "errors", "evaluate", "files", "models", "testing", "text", "text.table")
+MODULES = ("cli", "errors", "evaluate", "files", "models", "text", "text.table")
 USERS = [path for folder in ("liftcore/cli", "service") for path in sorted((ROOT / folder).rglob("*.py"))]
 
 

@@ -1,8 +1,7 @@
-"""Checks of a raster against the dense float64 reference (`liftcore.raster.reference`), and a suite for pytest."""
+"""Checks of a raster against the dense float64 reference (`liftcore.raster.reference`)."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -11,14 +10,11 @@ import torch
 
 from liftcore.raster.base import ViewRequest
 from liftcore.raster.reference import dense_view, reading_matrix, selected_weights, strided_rays
-from liftcore.scene.compositing import CompositingParams, Selection, Weighting
-from liftcore.scene.kernel import Kernel
-from liftcore.testing.scenes import random_camera, random_grid, random_regions, random_splats
+from liftcore.scene.compositing import CompositingParams, Weighting
 from liftcore.values.views import Regions
+from tests.scenes import random_camera, random_regions
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from torch import Tensor
 
     from liftcore.raster.base import Raster, RayRows
@@ -29,8 +25,6 @@ if TYPE_CHECKING:
 
 INSIDE = 1e-5  # absolute, on weights
 FLIPS = 1e-2  # of rays: on tiny random images one ray in a hundred may fall on the other side of a cut-off
-SEEDS = 3  # scenes per kernel
-SPLATS = 40  # per scene
 
 
 def check_render(raster: Raster, splats: Splats, camera: Camera, params: CompositingParams) -> None:
@@ -201,62 +195,3 @@ def same_bits(left: RegionWeights | RayRows, right: RegionWeights | RayRows) -> 
     """Return True if all tensors of both are bitwise identical."""
     parts = ([part for part in vars(of).values() if isinstance(part, torch.Tensor)] for of in (left, right))
     return all(map(torch.equal, *parts))
-
-
-class RasterConformance(ABC):
-    """Tests of a `Raster` for pytest: derive a class ``Test...`` and open your raster.
-
-    Scenes are small and seeded, for slow interpreters of kernels.
-    """
-
-    kernels: tuple[Kernel, ...] = tuple(Kernel)  # that the raster supports
-    params: tuple[CompositingParams, ...] = (CompositingParams(), CompositingParams(opacity_logit_scale=1.2))
-
-    @abstractmethod
-    def open_raster(self, splats: Splats) -> Raster:
-        """Open the raster of splats."""
-
-    def scenes(self) -> Iterator[tuple[Splats, Camera, CompositingParams]]:
-        """Yield splats of each kernel, a camera, and compositing parameters."""
-        for kernel in self.kernels:
-            for seed in range(SEEDS):
-                splats = random_splats(seed, SPLATS, kernel=kernel)
-                yield splats, random_camera(seed), self.params[seed % len(self.params)]
-
-    def test_renders_equal_the_oracle(self) -> None:
-        for splats, camera, params in self.scenes():
-            check_render(self.open_raster(splats), splats, camera, params)
-
-    def test_adjoints_equal_the_oracle(self) -> None:
-        for splats, camera, params in self.scenes():
-            check_adjoint(self.open_raster(splats), splats, camera, params)
-            check_inner_product(self.open_raster(splats), splats, camera, params)
-
-    def test_region_weights_equal_the_oracle(self) -> None:
-        for splats, camera, params in self.scenes():
-            for power, observation in enumerate((random_regions(1), random_grid(2), random_regions(3))):
-                raster = self.open_raster(splats)
-                check_region_weights(raster, splats, camera, observation, params, Weighting(power))
-
-    def test_selections_of_weights_equal_the_oracle(self) -> None:
-        selections = Weighting(1, Selection.TOP_K, count=3), Weighting(2, Selection.FRONT_MASS, mass=0.6)
-        for splats, camera, params in self.scenes():
-            for weighting in (*selections, Weighting(1, Selection.CENTRE)):
-                check_selected_weights(self.open_raster(splats), splats, camera, params, weighting)
-
-    def test_strides_leave_the_other_rays_out(self) -> None:
-        for splats, camera, params in self.scenes():
-            strided = replace(params, stride=3, offset=(1, 2))
-            check_selected_weights(self.open_raster(splats), splats, camera, strided, Weighting())
-
-    def test_rows_labels_and_footprints_equal_the_oracle(self) -> None:
-        for splats, camera, params in self.scenes():
-            raster = self.open_raster(splats)
-            check_ray_rows(raster, splats, camera, params)
-            check_strongest_labels(raster, splats, camera, params)
-            check_footprints(raster, splats, camera, params)
-
-    def test_views_in_a_row_are_those_alone_to_the_bit(self) -> None:
-        for kernel in self.kernels:
-            splats = random_splats(7, 12, kernel=kernel)
-            check_iterated_views(self.open_raster(splats), self.open_raster(splats), CompositingParams())
