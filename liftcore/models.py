@@ -2,7 +2,6 @@
 
 from liftcore.query.edits import Edit
 from liftcore.query.question import (
-    METHODS,
     BestWords,
     Box,
     LabelSummary,
@@ -18,6 +17,6 @@ from liftcore.query.terms import NOTATIONS
 from liftcore.runtime.fields import Body, NoBoolean, takes
 
 __all__ = [
-    "METHODS", "NOTATIONS", "BestWords", "Body", "Box", "Edit", "LabelSummary", "ListedObjects", "NoBoolean",
+    "NOTATIONS", "BestWords", "Body", "Box", "Edit", "LabelSummary", "ListedObjects", "NoBoolean",
     "Notation", "OwnCamera", "SceneTree", "SelectionSummary", "SuggestedWords", "Viewpoint", "takes",
 ]  # fmt: skip

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
 from safetensors.torch import save_file
 
 from liftcore.io.inria import write_inria_cameras
@@ -81,46 +80,3 @@ def truth(name: str, disparity: int = 0) -> np.ndarray:
     x1, y1, x2, y2 = OBJECTS[name]
     mask[y1:y2, x1 - disparity : x2 - disparity] = True
     return mask
-
-
-def rectangle(x1: float, y1: float, x2: float, y2: float) -> list[list[float]]:
-    """A polygon whose outline is the rectangle's outermost pixels."""
-    return [[x1, y1], [x2 - 1, y1], [x2 - 1, y2 - 1], [x1, y2 - 1]]
-
-
-def isat(objects: list[tuple[str, list[list[float]]]], scale: int = 1) -> dict[str, object]:
-    """Labels as ISAT writes them, of an image that is larger by a factor."""
-    entries = []
-    for category, points in objects:
-        scaled = [[x * scale, y * scale] for x, y in points]
-        entries.append({"category": category, "group": 1, "segmentation": scaled, "layer": 1.0, "iscrowd": False})
-    info = {"description": "ISAT", "name": "frame.jpg", "width": WIDTH * scale, "height": HEIGHT * scale, "depth": 3}
-    return {"info": info, "objects": entries}
-
-
-def write_lerf_labels(folder: Path, scene: str = "kitchen") -> Path:
-    """LeRF-OVS's layout: the apple in two polygons, the second frame labelled at twice the size."""
-    labels = folder / "lerf_ovs" / "label" / scene
-    labels.mkdir(parents=True)
-    for scale, (frame, disparity) in enumerate(FRAMES.items(), start=1):
-        x1, y1, x2, y2 = OBJECTS["red apple"]
-        halves = [(x1 - disparity, y1, x1 - disparity + 20, y2), (x1 - disparity + 20, y1, x2 - disparity, y2)]
-        book = OBJECTS["book"]
-        objects = [("red apple", rectangle(*half)) for half in halves]
-        objects.append(("book", rectangle(book[0] - disparity, book[1], book[2] - disparity, book[3])))
-        (labels / f"{frame}.json").write_text(json.dumps(isat(objects, scale)))
-    return folder / "lerf_ovs"
-
-
-def write_3d_ovs_labels(folder: Path, scene: str = "kitchen") -> Path:
-    """3D-OVS's layout: a mask a class; the unicorn, a class without masks, is nowhere."""
-    labels = folder / "3d_ovs" / scene / "segmentations"
-    labels.mkdir(parents=True)
-    (labels / "classes.txt").write_text("red apple\nbook\nunicorn\n")
-    for frame, disparity in FRAMES.items():
-        (labels / frame).mkdir()
-        for name in OBJECTS:
-            mask = Image.fromarray(truth(name, disparity).astype(np.uint8) * 255)
-            suffix = "png" if disparity else "jpg"
-            mask.resize((WIDTH * 2, HEIGHT * 2), Image.Resampling.NEAREST).save(labels / frame / f"{name}.{suffix}")
-    return folder / "3d_ovs"

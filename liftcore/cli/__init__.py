@@ -32,7 +32,7 @@ COMMANDS = {
     "pack": "convert features or masks to a feature pack",
     "encode": "encode images as a feature pack",
     "inspect": "describe a file and its problems",
-    "evaluate": "evaluate lifts on labelled datasets",
+    "evaluate": "evaluate a lift by labels of its views",
     "tradeoff": "compare speed and accuracy on a scene",
 }
 SERVICE_COMMANDS = {  # modules of another package, which are entry points in splatlift.commands

@@ -329,6 +329,11 @@ def whole_number(text: str) -> int:
     return int(text)
 
 
+def encoder_spec(options: argparse.Namespace) -> str | None:
+    """Return the specification of ``--table`` or ``--encoder``, None for the encoder of the lift."""
+    return f"table:{options.table}" if options.table else options.encoder or None
+
+
 def text_encoder(options: argparse.Namespace, scene: Scene, hint: str = "", *, stand_in: bool = False) -> TextEncoder:
     """Return the encoder of ``--table`` or ``--encoder``, or else the lift's words, or else that of its text space.
 
@@ -338,5 +343,6 @@ def text_encoder(options: argparse.Namespace, scene: Scene, hint: str = "", *, s
     Raises:
         InvalidQuery, Unavailable: as for `Scene.encoder`.
     """
-    spec = f"table:{options.table}" if options.table else options.encoder or None
-    return scene.encoder(spec, hint=f"--table FILE or --encoder NAME; {hint}".rstrip("; "), stand_in=stand_in)
+    return scene.encoder(
+        encoder_spec(options), hint=f"--table FILE or --encoder NAME; {hint}".rstrip("; "), stand_in=stand_in
+    )

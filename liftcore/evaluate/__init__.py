@@ -2,7 +2,7 @@
 
 - ``inspect_file``: the content of a file; ``check_scene``: a check that files belong together
 - ``compare_speeds`` of `SceneFiles`: accuracy against speed on a scene
-- ``evaluate_lifts``: the accuracy of lifts by the labels of LeRF-OVS and 3D-OVS
+- ``evaluate_lift``: the accuracy of a lift by masks of phrases in its views
 """
 
 from liftcore.runtime.lazy_names import lazy_names

@@ -101,11 +101,6 @@ CHOICES: list[tuple[str, Call]] = [
     (r"folder: expected the path", lambda: lc.pack_folder(None, "x.safetensors", "npy")),  # pyright: ignore
     (r"images: expected images", lambda: lc.encode_images([], "x.safetensors", "timm:resnet18")),
     (r"^encoder: expected one of maskclip", lambda: lc.encode_images("photos", "x.safetensors", "magic")),
-    (r"^dataset: expected one of lerf-ovs, 3d-ovs, got 'lerf'", lambda: evaluate_kitchen("lerf")),
-    (r"^protocols: expected one of P1, P2, P3, own, got 'P9'", lambda: evaluate_kitchen(protocols=["P9"])),
-    (r"^protocols: expected one of P1", lambda: evaluate_kitchen(protocols=[])),
-    (r"^held_out: expected a file of view names", lambda: evaluate_kitchen(held_out="nowhere.txt")),
-    (r"^data: expected LeRF-OVS", lambda: evaluate_kitchen(data="maps")),
     (r"kind: expected one of splats, ply", lambda: files.check_output("new.npy", [], "foo")),
     (r"kind: expected one of splats, cameras", lambda: evaluate.inspect_file("splats.ply", "foo")),
     (r"settings: expected LiftSettings, or None", lambda: lift({"quality": "fast"})),
@@ -120,10 +115,6 @@ CHOICES: list[tuple[str, Call]] = [
 
 def pack(kind: Any, **options: Any) -> Any:
     return lc.pack_folder("maps", "refused.safetensors", kind, **options)
-
-
-def evaluate_kitchen(dataset: Any = "lerf-ovs", data: str = ".", **options: Any) -> Any:
-    return evaluate.evaluate_lifts(dataset, Path("kitchen.safetensors"), data, **options)
 
 
 def lift(settings: Any) -> Any:
