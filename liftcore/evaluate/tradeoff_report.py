@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -21,7 +20,6 @@ from liftcore.runtime.progress import Progress, shown_progress
 from liftcore.scene.kernel import Kernel
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 HEADS = ("run", "views", "wall s", "CPU s", "faster by CPU", "peak MiB", "cosine", "5 %", "lost", "centred",
@@ -37,7 +35,6 @@ KEY = (
 )
 TITLE = "Speed against accuracy"
 LOST_SHARE = 0.001  # of the splats, above which the verdict mentions them
-LEAST_SHARE = 0.02  # of any run's seconds, for a stage that the chart shows
 
 
 @dataclass(frozen=True)
@@ -184,27 +181,17 @@ def _number(figure: float | None) -> str:
 
 
 COLOURS = {"dial": "#1b6ca8", "preset": "#b5651d"}
-SIZE = (13.0, 4.6)  # inches
-CLOSE, WIDE = 0.055, 0.22  # of the axes' height and width: labels nearer than both would meet
+SIZE = (7.0, 4.6)  # inches
+LABEL_OFFSETS = (7, -10)  # points above a run's place, in turns: names of neighbours do not meet
 
 
 def draw(figure: Figure, document: Mapping[str, Any]) -> None:
-    """Draw accuracy against seconds of all runs, the cosine of quality levels to the exact run, and their stages."""
+    """Draw the accuracy of all runs against their seconds."""
     figure.set_size_inches(*SIZE)
-    left, middle, right = figure.subplots(1, 3, width_ratios=(3, 2, 2))
-    choice = document["choice"]
-    _accuracy(left, document["runs"], choice)
-    _faithful(middle, document["runs"])
-    _stages(right, document["runs"])
-    views = document["views"]
-    verdict = f"take {choice['name']!r}" if choice["recommended"] else "nothing can be recommended"
-    figure.suptitle(f"{document['scene']}: {views['lifted']} views lifted, {verdict}", fontsize="medium")
-
-
-def _accuracy(axes: Axes, runs: Sequence[Mapping[str, Any]], choice: Mapping[str, Any]) -> None:
+    axes, runs, choice = figure.subplots(), document["runs"], document["choice"]
     accuracy = choice["accuracy"]
-    plotted = [run for run in runs if run[accuracy] is not None]
-    front = [run for name in choice["front"] for run in plotted if run["name"] == name]
+    plotted = sorted((run for run in runs if run[accuracy] is not None), key=lambda run: run["cpu_s"])
+    front = [run for run in plotted if run["name"] in choice["front"]]
     axes.plot([run["cpu_s"] for run in front], [run[accuracy] for run in front], color="#999999", lw=1, zorder=1)
     for kind, marker, label in (("dial", "o", "quality level"), ("preset", "s", "preset")):
         of_kind = [run for run in plotted if run["kind"] == kind]
@@ -213,82 +200,23 @@ def _accuracy(axes: Axes, runs: Sequence[Mapping[str, Any]], choice: Mapping[str
     recommended = [run for run in plotted if choice["recommended"] and run["name"] == choice["name"]]
     ring = {"facecolors": "none", "edgecolors": "#222222", "s": 130, "zorder": 3}
     axes.scatter([run["cpu_s"] for run in recommended], [run[accuracy] for run in recommended], label="taken", **ring)
+    for number, run in enumerate(plotted):
+        offset = {"xytext": (5, LABEL_OFFSETS[number % 2]), "textcoords": "offset points", "fontsize": 8}
+        axes.annotate(run["name"], (run["cpu_s"], run[accuracy]), color=COLOURS[run["kind"]], **offset)
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter(_few_ticks)
     axes.margins(x=0.22, y=0.12)
-    _label(axes, plotted, accuracy)
-    _finish(axes, "processor seconds of the lift, without reading", NAMES[accuracy])
+    axes.set_xlabel("processor seconds of the lift, without reading", fontsize="small")
+    axes.set_ylabel(NAMES[accuracy], fontsize="small")
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
     axes.legend(fontsize="small", loc="lower right", frameon=False)
-
-
-def _faithful(axes: Axes, runs: Sequence[Mapping[str, Any]]) -> None:
-    quality_runs = sorted((run for run in runs if run["kind"] == "dial"), key=lambda run: run["cpu_ratio"])
-    ratios = [run["cpu_ratio"] for run in quality_runs]
-    for name, label, style in (
-        ("cosine", "mean by total weight", "o-"),
-        ("cosine_plain", "mean over splats", "^--"),
-        ("cosine_q05", "5 % of splats below", "v:"),
-    ):
-        axes.plot(ratios, [run[name] for run in quality_runs], style, label=label, color=COLOURS["dial"], ms=5, lw=1)
-    for number, (run, ratio) in enumerate(zip(quality_runs, ratios, strict=True)):
-        place = {"textcoords": "offset points", "ha": "center", "fontsize": 8}
-        axes.annotate(run["name"], (ratio, run["cosine"]), (0, 7 + 11 * (number % 2)), **place)
-    axes.margins(x=0.14)
-    lowest = min((run[name] for run in quality_runs for name in ("cosine", "cosine_plain")), default=0.0)
-    margin = max(1.0 - lowest, 1e-3)
-    axes.set_ylim(lowest - 0.6 * margin, 1.0 + 0.3 * margin)  # the worst splats may lie far below
-    _finish(axes, "times less CPU time than exact", NAMES["cosine"])
-    axes.legend(fontsize="small", loc="lower left", edgecolor="none", framealpha=1.0)
-
-
-def _stages(axes: Axes, runs: Sequence[Mapping[str, Any]]) -> None:
-    """Draw the stages of the runs of quality levels as shares of their seconds, the fastest run above."""
-    quality_runs = sorted((run for run in runs if run["kind"] == "dial"), key=lambda run: -run["cpu_s"])
-    names = list(dict.fromkeys(name for run in quality_runs for name in run["timings"]))
-    begins = [0.0] * len(quality_runs)
-    for name in names:
-        totals = [sum(run["timings"].values()) or 1.0 for run in quality_runs]
-        shares = [run["timings"].get(name, 0.0) / total for run, total in zip(quality_runs, totals, strict=True)]
-        if max(shares) < LEAST_SHARE:
-            continue
-        axes.barh([run["name"] for run in quality_runs], shares, left=begins, label=name, height=0.7)
-        begins = [begin + share for begin, share in zip(begins, shares, strict=True)]
-    axes.set_xlim(0, 1)
-    _finish(axes, "share of the lift's seconds", "")
-    if begins:
-        axes.legend(fontsize="x-small", loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, frameon=False)
-
-
-def _label(axes: Axes, runs: Sequence[Mapping[str, Any]], accuracy: str) -> None:
-    """Write names beside their points, shifted where they would overlap."""
-    from matplotlib.patheffects import withStroke
-
-    halo = withStroke(linewidth=2.5, foreground="white")  # so that lines do not strike names out
-    low, high = axes.get_ylim()
-    left, right = axes.get_xlim()
-    positions: list[tuple[float, float]] = []
-    for run in sorted(runs, key=lambda run: -run[accuracy]):
-        across = math.log(run["cpu_s"] / left) / math.log(right / left)
-        at = (run[accuracy] - low) / (high - low)
-        height = at
-        while any(abs(height - y) < CLOSE and abs(across - x) < WIDE for x, y in positions):
-            height -= 0.2 * CLOSE
-        positions.append((across, height))
-        place = {"xycoords": "axes fraction", "textcoords": "axes fraction", "va": "center", "fontsize": 8}
-        line = {"arrowstyle": "-", "color": "#bbbbbb", "lw": 0.6} if height < at else None
-        spot = (across + 0.02, height)
-        name = axes.annotate(run["name"], (across, at), spot, color=COLOURS[run["kind"]], arrowprops=line, **place)
-        name.set_path_effects([halo])
+    verdict = f"take {choice['name']!r}" if choice["recommended"] else "nothing can be recommended"
+    title = f"{document['scene']}: {document['views']['lifted']} views lifted, {verdict}"
+    figure.suptitle(title, fontsize="medium")
 
 
 def _few_ticks(value: float, _: float) -> str:
     """Format twos and fives between the powers of ten."""
     return f"{value:g}" if f"{value:e}"[0] in "25" else ""
-
-
-def _finish(axes: Axes, x: str, y: str) -> None:
-    axes.set_xlabel(x, fontsize="small")
-    axes.set_ylabel(y, fontsize="small")
-    axes.grid(alpha=0.3)
-    axes.spines[["top", "right"]].set_visible(False)
