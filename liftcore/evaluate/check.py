@@ -5,9 +5,8 @@ photos too, the edges of masks with those of the mirrored masks, and features as
 does.
 
 Photos of another shape than their cameras are found by their headers, and compared no further. If renders do not
-match their photos, causes that photos can show are tried: turned or mirrored photos, shifted photos (a wrong
-principal point), photos of another exposure, positions in another scale. A cause is reported if it makes renders
-match their photos; else no cause is.
+match their photos, two causes are tried: turned or mirrored photos, and positions in another scale. A cause is
+reported if it makes renders match their photos; else none is.
 """
 
 from __future__ import annotations
@@ -60,7 +59,6 @@ from liftcore.values.views import FeatureGrid, Regions
 VIEWS = 12  # that are checked, evenly spread
 CONTROLS = 3  # photos of other views that a render is compared with
 LEAST_GAIN = 3.0  # dB, of a render over other views' photos to its own
-LEAST_SHIFT = 2.0  # pixels, beyond what a pinhole's rounding and a lens leave
 SCALED_VIEWS = 4  # that are rendered again for each scale
 LEAST_EDGES = 1.1  # of the photo's edges under masks, over those under mirrored ones
 
@@ -351,12 +349,7 @@ def _unlike_photos(
     finding = f"photos: renders are hardly more like their own photos ({_median(list(own_psnr.values())):.1f} dB)"
     finding = f"{finding} than like other views' ({gain:+.1f} dB)"
     floor = {name: max(psnrs[name]) for name in own_psnr}
-    cause = (
-        _turned_photos(floor, pictures, renders, headers)
-        or _shifted_photos(floor, pictures, renders)
-        or _exposed_photos(floor, pictures, renders)
-        or _scaled_positions(floor, pictures, scaled)
-    )
+    cause = _turned_photos(floor, pictures, renders, headers) or _scaled_positions(floor, pictures, scaled)
     unknown = "splats, cameras and photos are not of one scene in one frame, or photos and cameras not of each other"
     return [f"{finding}; {cause or unknown}"]
 
@@ -422,76 +415,6 @@ def _turn(picture: np.ndarray, way: Image.Transpose) -> np.ndarray:
         Image.Transpose.ROTATE_270: lambda image: np.rot90(image, 3),
     }
     return flips[way](picture)
-
-
-def _shifted_photos(
-    floor: Mapping[str, float], pictures: Mapping[str, np.ndarray], renders: Mapping[str, np.ndarray]
-) -> str:
-    """Report the shift of the photos that makes renders match; empty if none does."""
-    shifts = np.array([_shift(pictures[name], renders[name]) for name in floor])
-    down, across = np.median(shifts, axis=0)
-    if max(abs(down), abs(across)) < LEAST_SHIFT:
-        return ""
-    gains = []
-    for name, least in floor.items():
-        photo, render = _overlap(pictures[name], renders[name], int(down), int(across))
-        gains.append(_psnr(photo, render) - least if photo.size else -np.inf)
-    if _median(gains) < LEAST_GAIN:
-        return ""
-    return (
-        f"with the photos shifted by about {across:g} pixels across and {down:g} down they are "
-        f"{_median(gains):.1f} dB more so: principal points (cx, cy) are off, or photos were cropped"
-    )
-
-
-def _shift(photo: np.ndarray, render: np.ndarray) -> tuple[int, int]:
-    """Estimate the shift (down, across) in pixels of a photo onto a render, by phase correlation."""
-    render_spectrum, photo_spectrum = (np.fft.rfft2(image.mean(axis=2) - image.mean()) for image in (render, photo))
-    cross = render_spectrum * photo_spectrum.conj()
-    peaks = np.fft.irfft2(cross / np.maximum(np.abs(cross), 1e-12), s=render.shape[:2])
-    peak = np.unravel_index(int(peaks.argmax()), peaks.shape)
-    down, across = (
-        int(offset) - side if offset > side // 2 else int(offset)
-        for offset, side in zip(peak, peaks.shape, strict=True)
-    )
-    return down, across
-
-
-def _overlap(photo: np.ndarray, render: np.ndarray, down: int, across: int) -> tuple[np.ndarray, np.ndarray]:
-    """Crop a shifted photo and a render to their overlap."""
-    height, width = render.shape[:2]
-    render_part = np.s_[max(0, down) : height + min(0, down), max(0, across) : width + min(0, across)]
-    photo_part = np.s_[max(0, -down) : height - max(0, down), max(0, -across) : width - max(0, across)]
-    return photo[photo_part], render[render_part]
-
-
-def _exposed_photos(
-    floor: Mapping[str, float], pictures: Mapping[str, np.ndarray], renders: Mapping[str, np.ndarray]
-) -> str:
-    """Report the change of the renders' colours that makes them match their photos; empty if none does.
-
-    Fitted colours bring any render nearer to any photo, so that other views' photos are the control here too.
-    """
-    gains, factors = [], []
-    for name, least in floor.items():
-        recoloured, factor = _in_colours_of(renders[name], pictures[name])
-        control_photos = _controls(name, pictures)
-        control = [_psnr(_in_colours_of(renders[name], photo)[0], photo) for photo in control_photos]
-        gains.append(_psnr(recoloured, pictures[name]) - max(least, *control))
-        factors.append(factor)
-    if _median(gains) < LEAST_GAIN:
-        return ""
-    return (
-        f"with their colours times about {_median(factors):.2g} they are {_median(gains):.1f} dB more so: the photos "
-        "are of another exposure or development than those that the splats were trained on"
-    )
-
-
-def _in_colours_of(render: np.ndarray, photo: np.ndarray) -> tuple[np.ndarray, float]:
-    """Fit a factor and an offset a channel of a render [H, W, 3] f32 to a photo; return it with the mean factor."""
-    centred = render - render.mean(axis=(0, 1))
-    factors = (centred * photo).mean(axis=(0, 1)) / np.maximum(np.square(centred).mean(axis=(0, 1)), 1e-12)
-    return photo.mean(axis=(0, 1)) + factors * centred, float(factors.mean())
 
 
 def _controls(name: str, pictures: Mapping[str, np.ndarray]) -> list[np.ndarray]:

@@ -138,8 +138,6 @@ CAUSES = {  # change of the pixels and EXIF orientation -> the cause that is rep
     "turned": (lambda image: image[::-1, ::-1], 1, "photos and cameras are turned to each other"),
     "mirrored": (lambda image: image[:, ::-1], 1, "mirrored left to right"),
     "upside down": (lambda image: image[::-1], 1, "mirrored upside down"),
-    "shifted": (lambda image: np.roll(image, (-30, 40), axis=(0, 1)), 1, "principal points"),
-    "darker": (lambda image: image // 4, 1, "another exposure"),
 }
 
 
