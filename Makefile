@@ -14,7 +14,7 @@ CUDA_TORCH_PIP ?=
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 export PIP_ROOT_USER_ACTION = ignore
 
-.PHONY: demo test check coverage kernels contract gpu wheel lint format serve web docs sbom setup clean
+.PHONY: demo test check kernels gpu wheel lint format serve web docs setup clean
 
 demo: $(READY)  ## the whole job through the real service; SCENE=DIR takes a scene of your own, ASK=TEXT a question
 	$(BIN)/splatlift demo --out "$(OUT)" $(if $(SCENE),--scene "$(SCENE)") $(if $(ASK),--ask "$(ASK)")
@@ -33,18 +33,8 @@ test: $(READY)  ## everything that must hold
 check: $(READY) lint  ## before a commit: lint, types and the fast tests, in 90 s once set up
 	$(BIN)/python -m pytest -m "not slow" --numprocesses=2 --dist=loadfile --max-worker-restart=0 tests/unit
 
-# coverage is no part of the lock: it comes from PyPI when it is asked for.
-coverage: $(READY) kernels  ## how much of the code the unit tests run, by file; several times as slow as they are
-	$(BIN)/python -m pip install --quiet 'coverage>=7.10,<8'
-	$(BIN)/python -m coverage run -m pytest tests/unit
-	$(BIN)/python -m coverage combine --quiet
-	$(BIN)/python -m coverage report --skip-covered --sort=cover
-
 kernels: $(READY)
 	$(BIN)/python -m tests.kernels
-
-contract: $(READY)  ## every operation against the OpenAPI document, without keys and with them; some minutes
-	$(BIN)/python -m tests.contract
 
 # Another torch than the lock's build brings the triton that it was made with: that one stays.
 gpu:  ## all that a card is for: CUDA's torch, conformance, speed, accuracy, gsplat beside; prints figures
@@ -99,10 +89,6 @@ docs: $(READY)  ## the docs site in build/site; a broken link or reference fails
 	PYTHONPATH=.:$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))') \
 	.venv/docs/bin/python -m sphinx -W --keep-going -q -b html docs build/site
 
-sbom: $(READY)  ## what is installed, as CycloneDX: sbom.json, by a tool in an environment of its own
-	$(PYTHON) -m venv .venv/sbom && .venv/sbom/bin/python -m pip install --quiet cyclonedx-bom==7.5.0
-	.venv/sbom/bin/cyclonedx-py environment --pyproject pyproject.toml --output-file sbom.json $(BIN)/python
-
 setup: $(READY)
 
 # torch and torchvision first, from one index: each build of the one loads beside its own build of the other alone,
@@ -125,4 +111,4 @@ $(READY): requirements.lock pyproject.toml
 	touch $@
 
 clean:
-	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache demo-output sbom.json
+	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache demo-output

@@ -1,6 +1,6 @@
 """The service does what its OpenAPI document says, over real sockets, with keys and one example of each operation.
 
-`make contract` is the long form: every corner of the schema, many examples, without keys too.
+`python -m tests.contract` is the long form: every corner of the schema, many examples, without keys too.
 """
 
 from __future__ import annotations

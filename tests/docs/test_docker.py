@@ -46,15 +46,10 @@ def services() -> dict[str, Any]:
 def test_the_proxy_has_the_limits_of_the_service() -> None:
     caddy = text("docker/Caddyfile")
     mib = BODY_BYTES >> 20
-    assert caddy.count(f"max_size {DEFAULTS.upload_bytes >> 30}GiB # SPLATLIFT_UPLOAD_BYTES") == 2
-    assert f"max_size {mib}MiB" in caddy
+    assert f"max_size {DEFAULTS.upload_bytes >> 30}GiB # SPLATLIFT_UPLOAD_BYTES" in caddy
     assert all(f"\t{limit} " in caddy for limit in ("read_header 10s", "read_body 30m", "write 30m"))
     assert f"request_buffers {mib}MiB" in caddy  # a body of JSON that is slow to come waits there
     assert f"splatlift:{DEFAULTS.port}" in caddy and "Host localhost" in caddy
-    uploads = re.findall(r"@(\w+) \{\s+method (.+)\s+path (.+)\s+\}\s+request_body @\1 ", caddy)
-    limits = [("PUT", "/assets/*"), ("POST", "/lifts")]
-    assert [(methods, paths) for _, methods, paths in uploads] == limits
-    assert re.findall(r"not \{\s+method (.+)\s+path (.+)", caddy) == limits
     assert "health_uri /healthz" in caddy  # what must come through on a full disk does
 
 
@@ -73,7 +68,7 @@ def test_everything_that_is_copied_is_here_and_in_the_build_context() -> None:
     assert {source for words in copied for source in words[:-1]} == set(exceptions)
 
 
-FILES = ("docker/Dockerfile", "docker/compose.yaml", "docker/compose.ray.yaml")
+FILES = ("docker/Dockerfile", "docker/compose.yaml")
 
 
 def test_every_variable_is_a_setting() -> None:
