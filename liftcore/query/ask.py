@@ -14,7 +14,7 @@ import numpy as np
 from liftcore.errors import InvalidQuery
 from liftcore.io.json_file import finite
 from liftcore.query.candidates import candidates, parts_of
-from liftcore.query.directions import directions, part_phrase, table_of, unknown_part, wordings
+from liftcore.query.directions import directions, part_phrase, read_query, table_of, unknown_part, wordings
 from liftcore.query.objects import objects
 from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.presence import (
@@ -58,7 +58,8 @@ from liftcore.query.threshold import explain_no_selection, find_threshold
 from liftcore.runtime.cores import cores
 from liftcore.runtime.one_thread import one_thread
 from liftcore.text import TextEncoder, check_texts
-from liftcore.text.wording import PartPhrase, Wording, base_of, normalize_text
+from liftcore.text.phrases import PartPhrase
+from liftcore.text.wording import Wording, base_of, normalize_text
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -219,9 +220,15 @@ def resolve_query(
     Args:
         names: of the terms in errors; () = their own texts.
     """
+    query, names, phrases = read_query(scene, query, encoder, names)
     phrase = part_phrase(scene, query, encoder)
     if phrase is None:
-        return replace(_resolve(scene, query, encoder, names), unknown_part=unknown_part(scene, query, encoder))
+        request = _resolve(scene, query, encoder, names)
+        as_typed = {
+            index: Wording(typed, request.asked_as[index].word, form) for index, (typed, form) in phrases.items()
+        }
+        missing = unknown_part(scene, query, encoder)
+        return replace(request, asked_as={**request.asked_as, **as_typed}, unknown_part=missing)
     object_query = _resolve(scene, Query(text=[phrase.object_phrase], absent=query.absent), encoder)
     request = _resolve(scene, query, encoder, names) if not phrase.sure else replace(object_query, query=query)
     return replace(request, part=PartQuery(phrase, object_query, _resolve(scene, query, encoder, names, phrase)))
@@ -356,7 +363,11 @@ def _answer(scene: OpenedLift, request: ResolvedQuery, similarities: np.ndarray)
         threshold = Threshold(value=math.inf, method=method, explanation=presence.reason, clear=False)
         selected = np.zeros_like(has_feature)
     else:
-        threshold, selected = _select(scene, request, mask, scores)
+        words = np.flatnonzero((request.by_cosine & mask)[: len(query.positives)])
+        if query.threshold == "auto" and 1 < len(words) == mask[: len(query.positives)].sum():
+            threshold, selected = _select_each(scene, request, mask, similarities, words)
+        else:
+            threshold, selected = _select(scene, request, mask, scores)
     clear = threshold.clear and presence.present is not False and bool(selected.any())
     least = LEAST_RIVAL_OF_CLEAR if clear and presence.present is not None else LEAST_RIVAL
     competitors = _nearer_words(scene, request, scores, selected, least)
@@ -468,6 +479,30 @@ def _select(
             update={"explanation": f"{threshold.explanation.removesuffix('.')}; {addition}."}
         )
     return threshold, selected
+
+
+def _select_each(
+    scene: OpenedLift, request: ResolvedQuery, mask: np.ndarray, similarities: np.ndarray, words: np.ndarray
+) -> tuple[Threshold, np.ndarray]:
+    """Return the lowest threshold of several words, and the splats that one of them selects by its own, [P] bool.
+
+    Cosines of words differ in scale: by a common threshold a word of low ones selects nothing.
+    """
+    cuts, selected = list[Threshold](), np.zeros_like(scene.has_feature)
+    for word in words.tolist():
+        alone = mask.copy()
+        alone[: len(request.query.positives)] = False
+        alone[word] = True
+        scores = combine(similarities[:, alone], 1)
+        scores = scores if scene.all_have_features else np.where(scene.has_feature, scores, np.float32(LOWEST_COSINE))
+        threshold, of_word = _select(scene, request, alone, scores)
+        cuts.append(threshold)
+        selected |= of_word
+    explanation = " ".join(
+        f"{request.query.positives[word]!r}: {cut.explanation}" for word, cut in zip(words, cuts, strict=True)
+    )
+    lowest = min(cuts, key=lambda cut: cut.value)
+    return lowest.model_copy(update={"explanation": explanation, "clear": all(cut.clear for cut in cuts)}), selected
 
 
 def _competing_words(request: ResolvedQuery, directions: np.ndarray) -> list[CompetingWords]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,8 +21,58 @@ from liftcore.query.regions import codebook_row, regions_of
 from liftcore.query.selections import set_members
 from liftcore.query.terms import Area, Example, Region, SplatSet, SplatTerm, Term, Vector, parse_example
 from liftcore.text import CachingEncoder, TextEncoder, check_texts
+from liftcore.text.phrases import PartPhrase, part_phrases, read_phrase
 from liftcore.text.table import TableEncoder
-from liftcore.text.wording import PartPhrase, Wording, part_phrases, shipped_words
+from liftcore.text.wording import Wording, shipped_words
+
+
+class ReadQuery(NamedTuple):
+    """A query whose texts are names, and the phrases that they were read from."""
+
+    query: Query
+    names: tuple[str, ...]  # of the terms in errors; () = their own texts
+    phrases: Mapping[int, tuple[str, str]]  # by the index of a term: the phrase, and "list" or "negation"
+
+
+def read_query(scene: OpenedLift, query: Query, encoder: TextEncoder | None, names: Sequence[str] = ()) -> ReadQuery:
+    """Read the texts of a query (`liftcore.text.phrases`): a list is several, a negation has negatives too.
+
+    Args:
+        names: of the terms in errors; () = their own texts.
+
+    Raises:
+        InvalidQuery: a phrase that scores cannot answer, or one of another form among several.
+    """
+    source, term_names = table_of(encoder or scene.table), _Names(query.terms, names)
+    is_word = None if source is None else source.vocabulary.has_word
+    terms = list[tuple[bool, bool, int, str, Term]]()  # negative, example, index in the query, form, and the term
+    for place, term in enumerate(query.terms):
+        is_negative = place >= len(query.positives)
+        if not isinstance(term, str):
+            terms.append((is_negative, True, place, "", term))
+            continue
+        with term_names(place):
+            check_texts([term])
+            reading = read_phrase(term, is_word)
+            if is_negative and reading.negatives:
+                raise InvalidQuery("negatives", expected="names of what it is not", got=repr(term[:80]))
+        form = "negation" if reading.negatives else "list" if reading.names != (term,) else ""
+        terms.extend((is_negative, False, place, form, name) for name in reading.names)
+        terms.extend((True, False, place, "negation", name) for name in reading.negatives)
+    terms.sort(key=itemgetter(0, 1))
+    positives, negatives = ([entry[-1] for entry in terms if entry[0] is side] for side in (False, True))
+    if source is not None and len(positives) > 1:
+        for _, is_example, place, _, name in terms:
+            part = None if is_example else source.vocabulary.find_part(str(name))
+            if part is not None and part.sure:
+                with term_names(place):
+                    raise InvalidQuery("text", expected="a part of an object alone", got=repr(name))
+    phrases = {index: (str(query.terms[place]), form) for index, (_, _, place, form, _) in enumerate(terms) if form}
+    if not phrases:
+        return ReadQuery(query, tuple(names), {})
+    others = Query.model_fields.keys() - {"text", "like", "negatives", "unlike"}
+    read = Query.of(positives, negatives, **{name: getattr(query, name) for name in others})
+    return ReadQuery(read, tuple(names[place] for _, _, place, _, _ in terms) if names else (), phrases)
 
 
 def wordings(

@@ -388,13 +388,13 @@ class TopSplat(Value):
 
 
 class WordMatch(Value):
-    """A text that the encoder's table lacks, and the word of it that stands for the text."""
+    """A text that is no word of the encoder's table, and a word that stands for it; several for a list."""
 
     text: str
     word: str = Field(description="for a part: that part of the object in which it is searched")
-    match: Literal["spelling", "qualifier", "synonym", "number", "head", "part"] = Field(
+    match: Literal["spelling", "qualifier", "synonym", "number", "head", "part", "list", "negation"] = Field(
         description="the kind of match: letters, a word that says which is meant, meaning, one or several, the "
-        "head of a phrase, or a part that it names"
+        "head of a phrase, a part that it names, one of a list, or one that is looked for or excluded by a negation"
     )
 
 

@@ -7,7 +7,7 @@ A table has only its own words, and users type others: plurals, synonyms, phrase
 2. the word without its qualifier, "car" for "car (automobile)";
 3. a synonym (``synonyms.json``: those of LVIS, and everyday ones);
 4. the same for the singular or the plural;
-5. the head of a phrase, "cup" for "the red cup", "cow" for "a photo of two cows".
+5. the head of a name (`liftcore.text.phrases`), "cup" for "the red cup".
 
 `Vocabulary.find_part` parses a phrase as a part of an object, "the red mug's handle", "mug handle".
 
@@ -22,40 +22,20 @@ import unicodedata
 from collections.abc import Iterable, Iterator, Sequence
 from difflib import get_close_matches
 from functools import cache, cached_property
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+
+from liftcore.errors import InvalidQuery
+from liftcore.text.phrases import ARTICLES, IRREGULAR, PUNCTUATION, PartPhrase, heads, part_phrases, read_phrase
 
 if TYPE_CHECKING:
     import numpy as np
 
 SYNONYMS = Path(__file__).with_name("synonyms.json")
 SUGGESTED = 5  # words suggested for an unknown one
-_ARTICLES = frozenset({"a", "an", "the"})
-_POSSESSIVES = frozenset({"my", "your", "his", "her", "its", "our", "their", "this", "that"})
-_PUNCTUATION = " .,;:!?\"'\u2018\u2019\u201c\u201d()"
 _QUALIFIER = re.compile(r"\s*\([^)]*\).*$")
 _SEPARATORS = re.compile(r"[\s\-'\u2019.]+")
-_TRAILING = frozenset({"here", "there", "please", "now", "too"})  # words at the end of a question
-_CONNECTIVES = frozenset({
-    "on", "in", "with", "at", "under", "near", "by", "beside", "behind", "from", "for", "that", "which", "who", "to",
-    "made", "is", "are", "and", "or", "without", "over", "inside", "next", "above", "below", "beneath", "underneath",
-    "between", "among", "against", "around", "across", "along", "atop", "opposite", "close", "outside", "upon",
-})  # fmt: skip
-# Endings of a word between an object and its location, as in "sitting on".
-_PLACEMENT_ENDINGS = ("ing", "ed", "left", "right")
-# Nouns before "of" that do not name the object, as in "a piece of pizza".
-_PARTITIVES = frozenset({
-    "photo", "photos", "photograph", "picture", "pictures", "image", "images", "piece", "pieces", "slice", "slices",
-    "pair", "pairs", "kind", "sort", "type", "group", "bit", "bits", "set", "model", "lot", "lots", "couple", "one",
-    "some", "all",
-})  # fmt: skip
-_IRREGULAR = {
-    "mice": "mouse", "men": "man", "women": "woman", "children": "child", "feet": "foot", "teeth": "tooth",
-    "geese": "goose", "oxen": "ox", "leaves": "leaf", "knives": "knife", "wolves": "wolf", "calves": "calf",
-    "shelves": "shelf", "loaves": "loaf", "scarves": "scarf", "dice": "die", "cacti": "cactus",
-}  # fmt: skip
-_HEAD_WORDS = 12  # last words of a phrase that are searched for its head
 _MIN_TYPED = 3  # characters of a text whose spelling is compared: shorter ones resemble too many words
 _MIN_SYNONYM = 5  # the same for a synonym, of which there are thousands
 _MAX_TYPED = 80  # characters of a text that are compared
@@ -70,48 +50,7 @@ class Wording(NamedTuple):
 
     text: str
     word: str
-    match: str  # "" for the word itself, else "spelling", "qualifier", "synonym", "number", "head" or "part"
-
-
-class PartPhrase(NamedTuple):
-    """A phrase that names a part of an object."""
-
-    object_phrase: str
-    part: str
-    sure: bool  # True if the grammar is unambiguous; two nouns in a row, as in "mug handle", may mean something else
-
-    def __str__(self) -> str:
-        return f"{self.part} of the {self.object_phrase}"
-
-
-def part_phrases(text: str) -> Iterator[PartPhrase]:
-    """Yield the ways to parse a text as a part of an object, the most likely first.
-
-    "The cat's tail" and "tail of the cat" name a part. "A cup of coffee", without an article after "of", does not,
-    nor does a partitive, "a photo of a cat". "Handles of mugs" is uncertain, as "bowls of oranges" names no part; so
-    are plural owners without an article, as "men's shoes" are a kind of shoe.
-    """
-    typed = text.casefold().replace("_", " ").split()
-    is_certain = bool(typed) and typed[0].strip(_PUNCTUATION) in _ARTICLES | _POSSESSIVES
-    typed = typed[1:] if typed and typed[0].strip(_PUNCTUATION) in _ARTICLES else typed
-    parts = [part.strip(_PUNCTUATION) for part in typed]
-    if len(parts) > _HEAD_WORDS:
-        return
-    for index, part in enumerate(parts[:-1]):
-        owner = part[:-2] if part.endswith(("'s", "\u2019s")) else part
-        if owner != part or (typed[index].endswith(("s'", "s\u2019")) and typed[index][0] not in _PUNCTUATION):
-            is_one = owner != part and owner not in _IRREGULAR
-            owners, piece = " ".join([*parts[:index], owner]), " ".join(parts[index + 1 :])
-            yield PartPhrase(owners, piece, is_certain or is_one)
-        if part == "of" and index and parts[index - 1] not in _PARTITIVES:
-            of = parts[index + 1 :]
-            if of[0] in _ARTICLES | _POSSESSIVES and len(of) > 1:
-                yield PartPhrase(" ".join(of[1:]), " ".join(parts[:index]), True)
-            elif of[-1] in _IRREGULAR or (len(of[-1]) > 2 and of[-1].endswith("s") and not of[-1].endswith("ss")):
-                yield PartPhrase(" ".join(of), " ".join(parts[:index]), False)
-    if len(parts) > 1 and not any(part in _CONNECTIVES | {"of"} for part in parts):
-        for index in range(len(parts) - 1, 0, -1):
-            yield PartPhrase(" ".join(parts[:index]), " ".join(parts[index:]), False)
+    match: str  # "" for the word itself, else one of `liftcore.query.question.WordMatch`
 
 
 class Completion(NamedTuple):
@@ -127,11 +66,11 @@ def normalize_text(text: str) -> str:
     It is case-folded, has a space for each ``_``, and no leading article.
     """
     parts = unicodedata.normalize("NFC", text.casefold()).replace("_", " ").split()
-    return " ".join(parts[1:] if len(parts) > 1 and parts[0] in _ARTICLES else parts)
+    return " ".join(parts[1:] if len(parts) > 1 and parts[0] in ARTICLES else parts)
 
 
 def _spelling_key(text: str) -> str:
-    return _SEPARATORS.sub("", normalize_text(text).strip(_PUNCTUATION)) or normalize_text(text)
+    return _SEPARATORS.sub("", normalize_text(text).strip(PUNCTUATION)) or normalize_text(text)
 
 
 def base_of(word: str) -> str:
@@ -176,15 +115,25 @@ class Vocabulary:
         match = self._look_up(text)
         if match is not None:
             return Wording(text, *match)
+        try:
+            reading = read_phrase(text, self.has_word)
+        except InvalidQuery:
+            return None
+        if reading != ((text,), ()):
+            return None
         head = self._head(text)
         return None if head is None else Wording(text, head[1], "head")
+
+    def has_word(self, text: str) -> bool:
+        """Return True if a word matches a text as a whole."""
+        return self.word_of(text) is not None
 
     def find_part(self, text: str) -> PartPhrase | None:
         """Return the words of a part and its object if a text names both and is not itself a word, else None.
 
         Adjectives are ignored, as in the heads of other phrases. "Red toy car" names no part if "toy car" is a word.
         """
-        if self.word_of(text) is not None:
+        if self.has_word(text):
             return None
         for phrase in part_phrases(text):
             object_match = self.find(phrase.object_phrase)
@@ -198,7 +147,7 @@ class Vocabulary:
 
     def unknown_part(self, text: str) -> PartPhrase | None:
         """Return a part as typed and the word of its object if no word matches the part, else None."""
-        if self.word_of(text) is not None:
+        if self.has_word(text):
             return None
         for phrase in part_phrases(text):
             object_match = self.find(phrase.object_phrase) if phrase.sure else None
@@ -208,7 +157,7 @@ class Vocabulary:
 
     def _head(self, text: str) -> tuple[str, str] | None:
         """Return the longest head of a phrase that matches a word, and this word."""
-        for head in islice(_heads(text), 4 * _HEAD_WORDS):
+        for head in heads(text):
             if (match := self._look_up(head)) is not None:
                 return head, match[0]
         return None
@@ -223,7 +172,7 @@ class Vocabulary:
     def _look_up(self, text: str) -> tuple[str, str] | None:
         """Return the word that matches a text as a whole, and the kind of match."""
         for form in _forms(text):
-            is_unchanged = form == normalize_text(text).strip(_PUNCTUATION)
+            is_unchanged = form == normalize_text(text).strip(PUNCTUATION)
             key = _spelling_key(form)
             if key in self._keys:
                 return self._keys[key], "spelling" if is_unchanged else "number"
@@ -245,7 +194,7 @@ class Vocabulary:
         words = dict.fromkeys([match.word] if match else [])
         if not any(self._of_group(text)):  # the name of a group is not a misspelt word
             words.update(dict.fromkeys(self._misspelt(text)))
-        for head in chain([text], islice(_heads(text), _HEAD_WORDS)):
+        for head in chain([text], heads(text)):
             of_kind = sorted(self._of_group(head), key=lambda word: word not in preferred)
             words.update(dict.fromkeys([*of_kind, *self._of_meaning(head), *self._with_token(head)]))
             if len(words) >= count:
@@ -254,7 +203,7 @@ class Vocabulary:
 
     def complete(self, text: str, count: int = 8) -> tuple[Completion, ...]:
         """Return words that begin with a text, then those with a part that does, synonyms, and similar spellings."""
-        start = normalize_text(text).strip(_PUNCTUATION)
+        start = normalize_text(text).strip(PUNCTUATION)
         if not start:
             return ()
         completions: dict[str, Completion] = {}
@@ -283,7 +232,7 @@ class Vocabulary:
 
     def _misspelt(self, text: str) -> list[str]:
         """Return words with the same first letter and nearly the same other letters."""
-        typed = normalize_text(text).strip(_PUNCTUATION)[:_MAX_TYPED]
+        typed = normalize_text(text).strip(PUNCTUATION)[:_MAX_TYPED]
         if len(typed) < _MIN_TYPED:
             return []
         words = reversed(self.words[:_MAX_COMPARED])
@@ -339,7 +288,7 @@ class Vocabulary:
 
 def _forms(text: str) -> Iterator[str]:
     """Yield a text normalized, and with its last word in the singular or the plural."""
-    normalized = normalize_text(text).strip(_PUNCTUATION)
+    normalized = normalize_text(text).strip(PUNCTUATION)
     yield normalized
     before, _, last = normalized.rpartition(" ")
     for form in _numbers(last):
@@ -347,8 +296,8 @@ def _forms(text: str) -> Iterator[str]:
 
 
 def _numbers(word: str) -> Iterator[str]:
-    if word in _IRREGULAR:
-        yield _IRREGULAR[word]
+    if word in IRREGULAR:
+        yield IRREGULAR[word]
     if len(word) > 3 and word.endswith("ies"):
         yield f"{word[:-3]}y"
     if len(word) > 3 and word.endswith(("ses", "xes", "zes", "ches", "shes", "oes")):
@@ -360,28 +309,6 @@ def _numbers(word: str) -> Iterator[str]:
     if word and not word.endswith("s"):
         yield f"{word}s"
         yield f"{word}es"
-
-
-def _heads(text: str) -> Iterator[str]:
-    """Yield parts of a phrase that may name its object, the most likely first."""
-    parts = [part.strip(_PUNCTUATION) for part in normalize_text(text).split()]
-    while parts and (parts[-1] in _TRAILING or (len(parts) > 1 and parts[-1] in _PARTITIVES)):
-        parts.pop()
-    # The words of a question come before the object: of "where is the cat" the last words are tried separately.
-    connective = next((index for index, part in enumerate(parts) if part in _CONNECTIVES and index > 0), len(parts))
-    for words in (parts[:connective], parts[connective + 1 :]):
-        of = [index for index, part in enumerate(words) if part == "of" and 0 < index < len(words) - 1]
-        left, right = (words[: of[0]], words[of[0] + 1 :]) if of else (words, [])
-        sides = (right, left) if of and left[-1] in _PARTITIVES else (left, right)
-        if len(left) > 1 and left[-1].endswith(_PLACEMENT_ENDINGS) and (of or connective < len(parts)):
-            sides = (left, left[:-1], right)
-        for side in sides:
-            for first in range(max(0, len(side) - _HEAD_WORDS), len(side)):
-                yield " ".join(side[first:])
-    for part in parts:
-        for mark in ("'s", "\u2019s"):
-            if part.endswith(mark):
-                yield part.removesuffix(mark)
 
 
 @cache

@@ -1,0 +1,77 @@
+"""Typed phrases: lists and negations select what they say, and what scores cannot answer is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import liftcore as lc
+import numpy as np
+import pytest
+
+from tests.promises.tiny_files import photo_vectors, scene_with, write_table
+
+THINGS = ("mug", "bowl", "lamp")
+SPLATS = 20  # of each
+READ = {
+    "mug": "mug", "the small red mug": "mug", "mugs": "mug", "Where is the mug?": "mug", "mug, please": "mug",
+    "please show me the mugs": "mug", "a photo of a mug": "mug", "the black and white mug": "mug",
+    "only the mug": "mug",
+    "mug, bowl": "mug bowl", "mug; bowl": "mug bowl", "the mug and the bowl": "mug bowl", "mug or lamp": "mug lamp",
+    "mug & bowl": "mug bowl", "mug/bowl": "mug bowl", "a red mug, a bowl, and the lamps": "mug bowl lamp",
+    "I want the bowl as well as the lamp": "bowl lamp", "mug, mug": "mug", "mug but not the bowl": "mug",
+    "the lamp, not the mug": "lamp", "lamp without bowls": "lamp", "mug and bowl except the lamp": "mug bowl",
+    "not the mug but the bowl": "bowl", "bowl rather than mug": "bowl", "bowl, not mug, not lamp": "bowl",
+}  # fmt: skip
+REFUSED = {
+    "not the mug": "what it is not", "no mug": "what it is not", "everything except the mug": "what it is not",
+    "all but the mug": "what it is not", "neither mug nor bowl": "what it is not", "mug, not mug": "what it is not",
+    "the bowl to the left of the mug": "ask for 'bowl'", "mug in front of the bowl": "ask for 'mug'",
+    "the mug next to the lamp": "ask for 'mug'", "lamp between mug and bowl": "ask for 'lamp'",
+    "bowl on the mug": "ask for 'bowl'", "bowl sitting under the lamp": "ask for 'bowl'", "left mug": "ask for 'mug'",
+    "bowl holding a mug": "ask for 'bowl'", "two mugs": "ask for 'mugs'", "the biggest bowl": "ask for 'bowl'",
+    "what is on the lamp": "by its name", "the mug's lamp, bowl": "alone", "mug, boowl": "nearest: bowl",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def scene() -> lc.Scene:
+    """A mug, a bowl and a lamp, with vectors as of photos."""
+    return scene_with(photo_vectors(list(np.repeat(THINGS, SPLATS)), 0.25))
+
+
+def things_of(answer: lc.Answer) -> str:
+    """Return the things of which most splats are selected."""
+    shares = answer.selected.reshape(len(THINGS), SPLATS).mean(axis=1)
+    assert ((shares > 0.8) | (shares < 0.2)).all(), shares
+    return " ".join(thing for thing, share in zip(THINGS, shares, strict=True) if share > 0.5)
+
+
+@pytest.mark.parametrize("phrase", READ)
+def test_a_phrase_selects_the_things_that_it_names(scene: lc.Scene, phrase: str) -> None:
+    answer = scene.ask(phrase, encoder="lvis", places=False)
+    assert things_of(answer) == READ[phrase]
+    assert phrase in THINGS or {match.text for match in answer.wording} == {phrase}
+
+
+@pytest.mark.parametrize("phrase", REFUSED)
+def test_a_phrase_that_scores_cannot_answer_is_refused(scene: lc.Scene, phrase: str) -> None:
+    with pytest.raises(lc.InvalidQuery) as refusal:
+        scene.ask(phrase, encoder="lvis", places=False)
+    assert REFUSED[phrase] in str(refusal.value)
+
+
+def test_an_answer_says_how_a_phrase_was_read(scene: lc.Scene) -> None:
+    phrase = "red mugs or bowls but not the lamp"
+    answer = scene.ask(phrase, encoder="lvis", places=False)
+    matches = [(match.text, match.word, match.match) for match in answer.wording]
+    assert matches == [(phrase, "mug", "negation"), (phrase, "bowl", "negation"), (phrase, "lamp", "negation")]
+    assert answer.text == ["red mugs", "bowls"]
+
+
+def test_words_of_a_table_are_themselves_whatever_is_in_them(tmp_path: Path) -> None:
+    words = ["mug and bowl", "no parking", "bowl on a lamp"]
+    scene = scene_with(np.repeat(np.eye(3), SPLATS, axis=0))
+    encoder = write_table(tmp_path / "words.safetensors", words, np.eye(3))
+    for row, word in enumerate(words):
+        selected = scene.ask(word, encoder=encoder, places=False).selected
+        assert np.array_equal(np.flatnonzero(selected), np.arange(row * SPLATS, (row + 1) * SPLATS))
