@@ -43,7 +43,7 @@ def run(*words: object) -> Reply:
     return Reply(status, out.getvalue(), PROGRESS.sub("", err.getvalue()))
 
 
-def refused(*words: object) -> str:
+def error_line(*words: object) -> str:
     """Run a command that must end with status 2 and one line on stderr, and return the line."""
     reply = run(*words)
     assert (reply.status, reply.out) == (2, ""), reply

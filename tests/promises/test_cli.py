@@ -20,7 +20,7 @@ import torch
 from liftcore import cli, evaluate
 from PIL import Image
 
-from tests.promises.command_line import contents, refused, run
+from tests.promises.command_line import contents, error_line, run
 from tests.promises.scenes import arrays_of, random_scene, random_splats, write_pack
 from tests.promises.tiny_files import write_lift
 from tests.server import until
@@ -116,12 +116,12 @@ def test_no_output_replaces_an_input_or_another_kind(name: str, scene: Path) -> 
         output = scene / "out" / file
         for source in inputs if str(output) in words else []:
             before = contents(scene)
-            assert str(source) in refused(*(str(source) if word == str(output) else word for word in words))
+            assert str(source) in error_line(*(str(source) if word == str(output) else word for word in words))
             assert contents(scene) == before
         foreign = "s.ply" if output.suffix in (".png", ".csv", ".json") else "photo.png"
         output.write_bytes((scene / foreign).read_bytes())
         before = contents(scene)
-        assert f"{output}, which is " in refused(*words) and contents(scene) == before
+        assert f"{output}, which is " in error_line(*words) and contents(scene) == before
         output.unlink()
     assert run(*words).status == run(*words).status == 0  # one of its own kind is replaced
 
@@ -142,8 +142,8 @@ def test_stopped_lift_leaves_no_half_and_goes_on(tmp_path: Path) -> None:
     few = random_scene(7, views=8)
     result = lc.lift(*few.arguments(), preset="row-sum", progress=False)
     result.save_scene(tmp_path, few.splats, few.cameras)
-    many = random_splats(7, 30_000, flat=0.05)
-    lc.write_splats(tmp_path / "splats.ply", replace(many, log_scales=many.log_scales - 3))
+    splats = random_splats(7, 30_000, flat=0.05)
+    lc.write_splats(tmp_path / "splats.ply", replace(splats, log_scales=splats.log_scales - 3))
     write_pack(tmp_path / "f.safetensors", few.views)
     files = [tmp_path / name for name in ("splats.ply", "cameras.json", "f.safetensors")]
     lift, checkpoint = tmp_path / "out/x.safetensors", tmp_path / "kept"
@@ -211,7 +211,7 @@ REFUSALS = {  # words -> what the line says
 def test_wrong_words_are_one_line_with_the_remedy(words: str, scene: Path) -> None:
     paths = {key: str(scene / file) for key, file in {**FILES, "maps": "maps", "out": "out"}.items()}
     before = contents(scene)
-    message = refused(*(word.format(**paths) for word in words.split()), *(["--json"] if words else []))
+    message = error_line(*(word.format(**paths) for word in words.split()), *(["--json"] if words else []))
     assert REFUSALS[words] in message and contents(scene) == before
     assert ("expected" in message and "got" in message) or "see 'splatlift" in message
 
@@ -265,7 +265,9 @@ def test_lift_is_that_of_the_library(file: str, scene: Path) -> None:
 def test_plan_is_that_of_the_lift_and_said_once(scene: Path) -> None:
     write_pack(scene / "f.safetensors", {view: lc.FeatureGrid(np.ones((16, 16, 3), np.float32)) for view in VIEWS})
     document = run("plan", *sources(scene), "--set", "view_stride=2", "--json").document
-    plan = lc.plan_files(*sources(scene)[:2], [scene / "f.safetensors"], lc.LiftSettings.of(view_stride=2))
+    plan = lc.plan_files(
+        scene / "s.ply", scene / "c.json", [scene / "f.safetensors"], lc.LiftSettings.of(view_stride=2)
+    )
     assert document["views"] == {"lifted": list(plan.views), "left_out": list(plan.left_out)}
     assert document["memory_bytes"] == plan.memory_bytes == sum(document["memory"].values())
     assert plan.views == ("left", "right")
@@ -287,13 +289,13 @@ def test_plan_without_features_names_photos_to_encode(scene: Path) -> None:
 
 def test_files_that_moved_are_given_by_options(scene: Path) -> None:
     """A lift knows its files by their paths; beside it they are found, elsewhere they are given."""
-    moved = scene.with_name("moved")
-    scene.rename(moved)
-    lift, render = moved / FILES["lift"], ["--view", "left", "-o", moved / "r.png"]
+    folder = scene.with_name("moved")
+    scene.rename(folder)
+    lift, render = folder / FILES["lift"], ["--view", "left", "-o", folder / "r.png"]
     assert run("render", lift, *render).status == 0
-    (moved / "s.ply").rename(moved / "out/t.ply")
-    assert "--splats" in refused("render", lift, *render)
-    assert run("render", lift, "--splats", moved / "out/t.ply", *render).status == 0
+    (folder / "s.ply").rename(folder / "out/t.ply")
+    assert "--splats" in error_line("render", lift, *render)
+    assert run("render", lift, "--splats", folder / "out/t.ply", *render).status == 0
 
 
 def test_packed_maps_are_those_of_the_folder(scene: Path) -> None:
@@ -309,10 +311,10 @@ def test_packed_maps_are_those_of_the_folder(scene: Path) -> None:
     assert (document["views"], document["channels"]) == (3, CHANNELS)
     assert document["renamed"] == {f"{view}.png.npy": view for view in VIEWS}
     assert run(*words, "--layout", "chw").status == 0
-    again = lc.read_features(scene / "p.safetensors")
-    assert all(torch.equal(again[view].codebook, packs[view].codebook) for view in VIEWS)
+    transposed_pack = lc.read_features(scene / "p.safetensors")
+    assert all(torch.equal(transposed_pack[view].codebook, packs[view].codebook) for view in VIEWS)
     (scene / "maps" / "left.npy").write_bytes((scene / "maps" / "left.png.npy").read_bytes())
-    assert "left.npy and left.png.npy, both of the view 'left'" in refused(*words)
+    assert "left.npy and left.png.npy, both of the view 'left'" in error_line(*words)
 
 
 def test_packed_masks_and_phrases_are_regions(scene: Path) -> None:
@@ -327,7 +329,7 @@ def test_packed_masks_and_phrases_are_regions(scene: Path) -> None:
     assert (document["views"], document["folders"], document["warnings"]) == (1, ["camA"], [])
     np.save(folder / "camA/a.npy", np.eye(1, 5, dtype=np.float16))
     before = contents(scene)
-    assert "camA/a" in refused(*words) and contents(scene) == before
+    assert "camA/a" in error_line(*words) and contents(scene) == before
     for phrase, column in (("red_mug", 0), ("cat", 1)):
         (scene / "phrases" / phrase).mkdir(parents=True)
         mask = np.zeros((2, 3), np.uint8)
@@ -393,7 +395,7 @@ def test_masks_get_the_vectors_of_their_crops(scene: Path, photos: Path, clip: t
     inside[10:30, 20:50] = True
     Image.fromarray(inside.astype(np.uint8)).save(masks / "left.png")
     words = ["pack", "masks", masks, "-o", pack, "--encoder", f"open_clip:ViT-S-32-alt@{weights}"]
-    assert "--photos: expected" in refused(*words)
+    assert "--photos: expected" in error_line(*words)
     assert run(*words, "--photos", photos).status == 0
     with Image.open(photos / "left.png") as photo:
         crop = Image.fromarray(np.where(inside[..., None], np.asarray(photo), 0)[10:30, 20:50])
