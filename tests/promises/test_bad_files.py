@@ -114,6 +114,12 @@ def test_command_line_refuses_a_bad_file_with_exit_2(
     assert sorted(tmp_path.iterdir()) == before
 
 
+def with_header(content: bytes, length: int) -> bytes:
+    """Return a safetensors file whose header is padded to a length in bytes."""
+    end = 8 + int.from_bytes(content[:8], "little")
+    return length.to_bytes(8, "little") + content[8:end].ljust(length) + content[end:]
+
+
 def samples() -> list[tuple[str, str, bytes, dict[str, bytes]]]:
     """Return (kind, name, a good file, files beside it) of every format that is read."""
     scene = tiny_scene.make_scene()
@@ -136,6 +142,8 @@ def samples() -> list[tuple[str, str, bytes, dict[str, bytes]]]:
         ("table", "table", scene.table, {}),
         ("masks", "masks", tiny_scene.masks({"left": np.zeros((4, 6), int)}), {}),
     ]
+    # Headers whose lengths read like the first bytes of pickles and of zips.
+    rows += [("masks", f"header {length}", with_header(rows[-1][2], length), {}) for length in (640, 66_176, 19_280)]
     names = [path.name for path in SPLATS.iterdir() if not path.name.endswith(".decoded.ply")]
     rows += [("splats", name, (SPLATS / name).read_bytes(), {}) for name in sorted(names)]
     for model in (BINARY, MODEL):

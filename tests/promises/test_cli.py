@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import resource
 import signal
 import subprocess
@@ -19,12 +20,13 @@ import pytest
 import torch
 from liftcore import cli, evaluate
 from PIL import Image
+from safetensors.numpy import save_file
 
 from tests.promises.command_line import contents, error_line, run
 from tests.promises.scenes import arrays_of, random_scene, random_splats, write_pack
 from tests.promises.tiny_files import write_lift
 from tests.server import until
-from tests.tiny_scene import CHANNELS, VIEWS
+from tests.tiny_scene import CHANNELS, VIEWS, masks
 
 COMMANDS = (
     *("lift", "pack", "encode", "query", "segment", "objects", "evaluate", "check", "tradeoff", "inspect", "plan"),
@@ -138,6 +140,7 @@ def test_full_disk_leaves_the_file_of_before_and_no_other(name: str, scene: Path
     assert contents(scene) == before
 
 
+@pytest.mark.slow
 def test_stopped_lift_leaves_no_half_and_goes_on(tmp_path: Path) -> None:
     few = random_scene(7, views=8)
     result = lc.lift(*few.arguments(), preset="row-sum", progress=False)
@@ -228,6 +231,7 @@ def test_own_fault_is_one_line_and_exit_1(scene: Path, monkeypatch: pytest.Monke
         cli.main(["inspect", str(scene), "--debug"])
 
 
+@pytest.mark.slow
 def test_help_loads_nothing_heavy_and_closed_pipes_are_silent(scene: Path) -> None:
     heavy = "{'torch', 'numba', 'numpy', 'pydantic', 'tqdm'}"
     code = (
@@ -414,6 +418,24 @@ def test_inspection_is_that_of_the_library(scene: Path) -> None:
         assert document.pop("file") == str(scene / FILES[key]) and document["kind"] == kind
         assert document == json.loads(json.dumps(evaluate.inspect_file(scene / FILES[key])))
         assert f"kind {kind}" in " ".join(run("inspect", scene / FILES[key]).out.split())
+
+
+def test_inspection_tells_faults_of_other_files(scene: Path) -> None:
+    places = re.sub(r"-?0\.1\b", "0.0", (scene / "c.json").read_text())
+    (scene / "c.json").write_text(places)
+    cameras = run("inspect", scene / "c.json", "--json").document
+    assert (cameras["views"], cameras["sizes"]) == (3, ["32x24"]) and cameras["warnings"] == [
+        "3 views share 1 places"
+    ]
+    save_file({"embeddings": np.eye(2, dtype=np.float32)}, scene / "t.safetensors", {"words": '["cat"]'})
+    assert run("inspect", scene / "t.safetensors", "--json").document["warnings"] == ["1 words for 2 rows"]
+    tiny_masks = {"a": np.array([[-1, -1]]), "b": np.array([[0, 1]])}
+    (scene / "m.safetensors").write_bytes(masks(tiny_masks))
+    document = run("inspect", scene / "m.safetensors", "--json").document
+    assert (document["names"], document["unlabelled"]) == (["a", "b"], 0.5)
+    (scene / "s.ply").unlink()
+    warnings = run("inspect", scene / FILES["lift"], "--json").document["warnings"]
+    assert len(warnings) == 1 and "no longer at" in warnings[0]
 
 
 def test_inspection_counts_faults_of_splats_and_features(scene: Path) -> None:

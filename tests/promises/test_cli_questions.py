@@ -251,6 +251,42 @@ def test_right_lift_scores_near_one_and_wrong_words_zero(dataset: Any, lift: Pat
     assert run(*wrong, *options, "--json").document["measured"][0]["means"]["all labelled"]["object_micro"] < 0.1
 
 
+def test_means_are_those_of_counted_pixels(lift: Path, tmp_path: Path) -> None:
+    """Labels are stripes; a view without a camera and a word without a vector are named and left out."""
+    scene, encoder = lc.Scene(lift), f"table:{lift.with_name('words.safetensors')}"
+    masks, shared, union = dict[str, dict[str, np.ndarray]](), np.zeros((2, 2)), np.zeros((2, 2))
+    for row, view in enumerate(("left", "right")):
+        masks[view] = {}
+        for column, word in enumerate(("apple", "book")):
+            truth = np.zeros((HEIGHT, WIDTH), bool)
+            truth[:, 10 * column + 2 : 10 * column + 9 + 2 * row] = True
+            predicted = scene.mask(scene.ask(word, encoder=encoder), view)
+            shared[row, column], union[row, column] = (truth & predicted).sum(), (truth | predicted).sum()
+            masks[view][word] = truth
+    masks["left"].pop("book")
+    masks["stray"] = masks["right"]
+    masks["right"] |= {"griffin": masks["right"]["apple"]}
+    shared[0, 1] = union[0, 1] = np.nan
+    ious = shared / union
+    words = ["--data", write_labels(tmp_path, "lerf-ovs", masks), "--table", encoder[6:], "--protocol", "own"]
+    document = run("evaluate", "lerf-ovs", f"scene={lift}", *words, "--json").document
+    means = document["measured"][0]["means"]["all labelled"]
+    assert means["object_micro"] == pytest.approx(np.nanmean(ious)) and 0.1 < means["object_micro"] < 0.9
+    assert means["frame_macro"] == pytest.approx(np.nanmean(ious, axis=1).mean())
+    assert means["class_pooled"] == pytest.approx((np.nansum(shared, axis=0) / np.nansum(union, axis=0)).mean())
+    assert means["accuracy_25"] == pytest.approx((ious[~np.isnan(ious)] >= 0.25).mean())
+    assert any("stray have labels but no camera" in warning for warning in document["warnings"])
+    assert any("griffin" in warning and "left out" in warning for warning in document["warnings"])
+
+
+@pytest.mark.parametrize("content", ["[]", '{"info": {}, "objects": []}', '{"info": {"width": 1, "height": 1}}'])
+def test_malformed_labels_are_named_by_their_file(content: str, lift: Path, tmp_path: Path) -> None:
+    (tmp_path / "label/scene").mkdir(parents=True)
+    (tmp_path / "label/scene/left.json").write_text(content)
+    table = ["--table", lift.with_name("words.safetensors")]
+    assert "left.json" in error_line("evaluate", "lerf-ovs", f"scene={lift}", "--data", tmp_path, *table)
+
+
 BAD_EVALUATIONS = {
     "nothing.safetensors --data {data}": "nothing at",
     "scene={lift} {folder}/scene={lift} --data {data} --protocol P9": "invalid choice: 'P9'",
@@ -296,6 +332,33 @@ def sheet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in cameras:
         scene.export(folder / f"photos/{name}.png", None, "rgb", view=name)
     return folder
+
+
+def test_check_names_cameras_and_maps_of_others(sheet: Path, tmp_path: Path) -> None:
+    splats, cameras = lc.read_splats(sheet / "splats.ply"), lc.read_cameras(sheet / "cameras.json")
+    photos = {path.stem: path for path in sorted((sheet / "photos").iterdir())}
+
+    def wrong(splats: lc.Splats, cameras: lc.Cameras, photos: Any = None, maps: Any = None) -> str:
+        pack = maps and write_pack(tmp_path / "maps.safetensors", maps)
+        return " | ".join(evaluate.check_scene(splats, cameras, photos, pack).wrong)
+
+    scale = np.ones((4, 4))
+    scale[:3, 3] = 0.5
+    near = lc.Cameras([camera.replace(viewmat=camera.viewmat * scale) for camera in cameras.values()])
+    assert "with positions times about 2 " in wrong(splats, near, photos)
+    far = replace(splats, means=splats.means + 1000)
+    assert wrong(far, cameras).startswith("cameras: ")
+    swapped = dict(zip(photos, [*[*photos.values()][1:], photos["v0"]], strict=True))
+    assert "not of each other" in wrong(splats, cameras, swapped)
+    rows, columns = np.meshgrid(np.linspace(0, 3, 12), np.linspace(0, 4, 16), indexing="ij")
+    waves = np.stack([np.cos(k * rows + columns + k) for k in range(8)], axis=2).astype(np.float32)
+    good = {name: lc.FeatureGrid(np.roll(waves, k, 0)) for k, name in enumerate(cameras)}
+    transposed = {name: lc.FeatureGrid(view.grid.permute(2, 0, 1).reshape(12, 16, 8)) for name, view in good.items()}
+    assert "read as [F, h, w]" not in wrong(splats, cameras, None, good)
+    assert "read as [F, h, w]" in wrong(splats, cameras, None, transposed)
+    few = {"v0": photos["v0"], "stranger": photos["v1"]}
+    report = evaluate.check_scene(splats, cameras, few)
+    assert "3 cameras have none" in report.notes[0] and "1 have no camera: 'stranger'" in report.notes[1]
 
 
 @pytest.mark.parametrize("case", CAUSES)
