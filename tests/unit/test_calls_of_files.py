@@ -1,4 +1,4 @@
-"""Public calls that take files: a path may be a text, one may stand for several, and a wrong choice is named."""
+"""Public calls that take files: a path may be a text, and one may stand for several."""
 
 from __future__ import annotations
 
@@ -28,12 +28,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         *(("pack.safetensors", scene.features), ("table.safetensors", scene.table)),
     ):
         (folder / name).write_bytes(content)
-    for name in ("maps", "photos", "label/kitchen"):
+    for name in ("maps", "photos"):
         (folder / name).mkdir(parents=True)
     for view in tiny_scene.VIEWS:
         np.save(folder / "maps" / f"{view}.npy", np.ones((6, 8, 3), np.float16))
         Image.new("RGB", (tiny_scene.WIDTH, tiny_scene.HEIGHT)).save(folder / "photos" / f"{view}.png")
-    (folder / "label" / "kitchen" / "frame.json").write_text("{}")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         yield folder
@@ -79,61 +78,3 @@ PATHS: dict[str, Call] = {
 def test_path_may_be_a_text_and_one_alone_is_a_list_of_it(call: Call) -> None:
     ways = [call(path, form) for path in (Path, str) for form in (list_of, lambda value: value)]
     assert all(way == ways[0] for way in ways)
-
-
-CHOICES: list[tuple[str, Call]] = [
-    (r"kind: expected one of langsplat, npy, masks, prompts, got 'mask'", lambda: pack("mask")),
-    (r"layout: expected one of hwc, chw, got 'xyz'", lambda: pack("npy", layout="xyz")),
-    (r"layuot: expected one of layout of npy", lambda: pack("npy", layuot="chw")),
-    (r"unlabelled: expected one of layout of npy", lambda: pack("npy", unlabelled=3)),
-    (r"layout: expected no option of langsplat", lambda: pack("langsplat", layout="chw")),
-    (r"folders: expected one of phrases, views", lambda: pack("prompts", folders="view")),
-    (r"text_space: expected None for prompts", lambda: pack("prompts", text_space="x")),
-    (r"normalised: expected True, False or None, got 'maybe'", lambda: pack("npy", normalised="maybe")),
-    (r"text_space: expected a non-empty text, got 3", lambda: pack("npy", text_space=3)),
-    (r"^encoder: expected", lambda: pack("masks", photos="photos")),
-    (r"^photos: expected", lambda: pack("masks", encoder="open_clip:a/b")),
-    (
-        r"^normalised: expected True or None.*got False",
-        lambda: pack("masks", encoder="open_clip:a/b", photos="photos", normalised=False),
-    ),
-    (r"^names: expected a file of names", lambda: pack("prompts", names="nowhere.txt")),
-    (r"folder: expected the path", lambda: lc.pack_folder(None, "x.safetensors", "npy")),  # pyright: ignore
-    (r"images: expected images", lambda: lc.encode_images([], "x.safetensors", "timm:resnet18")),
-    (r"^encoder: expected one of maskclip", lambda: lc.encode_images("photos", "x.safetensors", "magic")),
-    (r"kind: expected one of splats, ply", lambda: files.check_output("new.npy", [], "foo")),
-    (r"kind: expected one of splats, cameras", lambda: evaluate.inspect_file("splats.ply", "foo")),
-    (r"settings: expected LiftSettings, or None", lambda: lift({"quality": "fast"})),
-    (r"files: expected SceneFiles", lambda: evaluate.compare_speeds("splats.ply")),  # pyright: ignore
-    (r"splats: expected the path", lambda: evaluate.SceneFiles(None, "cameras.json", ())),  # pyright: ignore
-    (
-        r"settings: expected settings that are the same in all runs, got quality",
-        lambda: evaluate.compare_speeds(speeds(str, list_of), settings={"quality": "fast"}),
-    ),
-]
-
-
-def pack(kind: Any, **options: Any) -> Any:
-    return lc.pack_folder("maps", "refused.safetensors", kind, **options)
-
-
-def lift(settings: Any) -> Any:
-    return lc.lift_files("splats.ply", "cameras.json", ["pack.safetensors"], settings)
-
-
-@pytest.mark.parametrize(("message", "call"), CHOICES, ids=[message for message, _ in CHOICES])
-def test_wrong_choice_is_named_with_what_is_possible(message: str, call: Call, folder: Path) -> None:
-    with pytest.raises(lc.SplatliftError, match=message) as excinfo:
-        call()
-    assert "--" not in f"{excinfo.value.argument} {excinfo.value.expected}", "options are the command line's"
-    assert not (folder / "refused.safetensors").exists()
-
-
-@pytest.mark.parametrize(
-    "names",
-    [{}, "words", {"foo": "x"}, {"text_space": 3}, {"encoder": " "}, {"normalised": "maybe"}, {"words": "["}],
-)
-def test_names_that_no_reader_takes_make_no_pack(names: Any, folder: Path) -> None:
-    with pytest.raises(lc.InvalidInput, match=r"names|text_space|encoder"):
-        lc.retag_pack("pack.safetensors", "refused.safetensors", names)
-    assert not (folder / "refused.safetensors").exists()

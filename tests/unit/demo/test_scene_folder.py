@@ -13,13 +13,7 @@ from safetensors.numpy import save_file as save_arrays
 from safetensors.torch import save_file
 
 from liftcore.errors import InvalidInput
-from liftcore.io.transforms import FRAME_FILE
 from service.commands.demo import find_scene
-
-INRIA_CAMERA = {
-    "id": 0, "img_name": "v", "width": 4, "height": 3, "fx": 4.0, "fy": 4.0,
-    "position": [0.0, 0.0, 0.0], "rotation": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
-}  # fmt: skip
 
 
 @pytest.fixture
@@ -52,17 +46,6 @@ def test_a_scene_is_found_by_what_its_files_are(folder: Path, tmp_path: Path) ->
     assert scene.truth.name_of(masks) == "cat"
 
 
-def test_cameras_go_up_with_the_frame_of_their_splats(folder: Path, tmp_path: Path) -> None:
-    (folder / "transforms.json").touch()
-    assert find_scene(folder, (), tmp_path / "scratch").cameras == folder / "transforms.json"
-    (folder / FRAME_FILE).touch()
-    packed = find_scene(folder, (), tmp_path / "scratch").cameras
-    assert zipfile.ZipFile(packed).namelist() == ["transforms.json", FRAME_FILE]
-    (folder / "transforms.json").unlink()
-    packed = find_scene(folder, (), tmp_path / "scratch").cameras
-    assert zipfile.ZipFile(packed).namelist() == ["cameras.bin", "images.bin", FRAME_FILE]
-
-
 def test_phrases_of_the_user_come_first_and_a_table_is_the_encoder(folder: Path, tmp_path: Path) -> None:
     (folder / "text_table.safetensors").touch()
     (folder / "cameras.json").touch()
@@ -80,27 +63,3 @@ def test_what_is_missing_is_named(folder: Path, tmp_path: Path) -> None:
             find_scene(folder, (), tmp_path)
     with pytest.raises(InvalidInput, match="folder"):
         find_scene(tmp_path / "none", (), tmp_path)
-
-
-def test_a_scene_without_its_truth_has_no_phrases(folder: Path, tmp_path: Path) -> None:
-    (folder / "truth.json").unlink()
-    (folder / "cameras.json").write_text(json.dumps([INRIA_CAMERA]))
-    scene = find_scene(folder, (), tmp_path)
-    assert (scene.phrases, scene.text_space, scene.views) == ((), "other", ("v",))
-
-
-@pytest.mark.parametrize("space", ["none", "animals"])
-def test_phrases_without_an_encoder_for_them_are_refused(folder: Path, tmp_path: Path, space: str) -> None:
-    save_file({"v/grid": torch.ones(1, 1, 2)}, str(folder / "grids.safetensors"), metadata={"text_space": space})
-    with pytest.raises(
-        InvalidInput, match=rf"--ask: expected words .* as text_table.safetensors in .*space is {space}"
-    ):
-        find_scene(folder, ["a whale"], tmp_path)
-
-
-def test_a_pack_that_names_no_text_space_has_the_words_of_the_table_beside_it(folder: Path, tmp_path: Path) -> None:
-    save_file({"v/grid": torch.ones(1, 1, 2)}, str(folder / "grids.safetensors"))
-    bare = find_scene(folder, (), tmp_path / "bare")
-    assert (bare.phrases, bare.text_space) == ((), "")  # without a text space the demo queries nothing
-    (folder / "text_table.safetensors").touch()
-    assert find_scene(folder, (), tmp_path / "worded").phrases == ("the cat",)

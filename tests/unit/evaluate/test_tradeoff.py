@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
@@ -13,20 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from matplotlib.figure import Figure
-from safetensors.torch import save, save_file
+from safetensors.torch import save_file
 
-from liftcore import cli
-from liftcore.errors import InvalidInput
-from liftcore.evaluate import tradeoff as comparison
-from liftcore.evaluate import tradeoff_report as report
 from liftcore.evaluate.accuracy import centred_cosines, class_ious, cosine_figures, shared_pixels
 from liftcore.evaluate.ranking import accuracy_of, choose
-from liftcore.evaluate.tradeoff import RunSpec, SceneFiles, candidates_of, measure_run
-from liftcore.evaluate.tradeoff_report import table_of
+from liftcore.evaluate.tradeoff import RunSpec, SceneFiles, measure_run
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import dense_view, reading_matrix
-from liftcore.runtime.progress import silent
 from liftcore.scene.compositing import CompositingParams
 from liftcore.values.views import FeatureGrid
 from tests.scenes import centred, observed, random_camera, random_splats, write_scene
@@ -128,20 +119,6 @@ def test_centred_cosines_equal_the_dense_definition(grids):
     assert actual == pytest.approx(expected, abs=1e-4)
 
 
-def test_candidates_start_from_the_preset_of_the_order():
-    default, guided = candidates_of({}), candidates_of({"preset": "tikhonov"})
-    names = [[candidate.name for candidate in candidates] for candidates in (default, guided)]
-    assert names[0][0] == names[1][0] == "exact"
-    assert "default" not in names[0] and "tikhonov" not in names[1]  # both equal exact
-    assert {"tikhonov + aggregation", "tikhonov"} <= set(names[0]) and "default" in names[1]
-    # A setting that stands on the robust step leaves out presets that have none.
-    assert [candidate.name for candidate in candidates_of({"reliability": True}) if candidate.kind == "preset"] == [
-        "smoothness 1",
-        "smoothness 4",
-    ]
-    assert "smoothness 4" not in [candidate.name for candidate in candidates_of({"smoothness": 4})]
-
-
 def test_cosines_count_splats_that_the_exact_run_saw():
     exact = torch.tensor([[1.0, 0], [0, 1], [1, 0], [0, 0]])
     figures = cosine_figures(
@@ -188,138 +165,3 @@ def test_masks_are_judged_by_the_words_of_their_classes(tmp_path):
         ]  # of the class that is shown, in its view
     # A mask of zeros: the share of its pixels called "cat" over all, then "dog"; the other class has an IoU of zero.
     assert figures[0] + figures[1] == pytest.approx(0.5, abs=0.01)
-
-
-def test_a_short_budget_takes_fewer_views_and_runs_the_exact_one_alone(tmp_path, monkeypatch):
-    calls = []
-
-    def record_call(order, candidate):
-        calls.append((candidate.name, order.lifted))
-        return run_of(candidate.name, 10, VIEWS)
-
-    monkeypatch.setattr(comparison, "_run", record_call)
-    monkeypatch.setattr(comparison, "LEAST_VIEWS", 1)
-    paths = write_scene(tmp_path, 2)
-    scene = SceneFiles(paths[0], paths[1], (paths[2],))
-    document = comparison.compare(scene, 1.0, {}, 1, silent)
-    assert [name for name, _ in calls] == ["draft", "exact"]
-    assert [run["name"] for run in document["runs"]] == ["exact"]
-    assert document["over_budget"] == [candidate.name for candidate in candidates_of({})[1:]]
-    assert (document["views"], calls[1][1]) == ({"lifted": 1, "of": 2, "held_out": 1}, ("v0",))
-    calls.clear()
-    document = comparison.compare(scene, 1e6, {}, 1, silent)
-    assert (len(document["runs"]), document["over_budget"], document["views"]["lifted"]) == (
-        len(candidates_of({})),
-        [],
-        2,
-    )
-
-
-def test_chart_table_and_json_are_written(tmp_path):
-    lossy = [RUNS[0], RUNS[1], RUNS[2] | {"lost_share": 0.125}, RUNS[3]]
-    runs = [{**run, **accuracy_of(run["accuracies"])} for run in lossy]
-    document = {
-        "title": "t", "scene": "s", "command": "c", "runs": runs, "over_budget": ["mean"], "invalid_runs": ["argmax"],
-        "choice": choice_of(*RUNS),
-        "views": {"lifted": 2, "of": 4, "held_out": 6}, "labelled_views": 0, "budget_s": 1.0, "seconds": 2.0,
-        "date": "2026-11-21", "hardware": {"cpu": "x"},
-    }  # fmt: skip
-    paths = report.save(document, tmp_path / "out")
-    assert [path.name for path in paths] == ["tradeoff.json", "tradeoff.png", "tradeoff.md"]
-    assert json.loads(paths[0].read_text())["choice"]["name"] == "equal"
-    assert paths[1].read_bytes()[:4] == b"\x89PNG"
-    figure = Figure()
-    report.draw(figure, document)
-    assert [text.get_text() for text in figure.axes[0].texts] == ["unclear", "distinct", "equal", "exact"]
-    page = paths[2].read_text()
-    assert "**Take equal**" in page
-    assert "distinct leaves 12.5% of the splats without the feature that exact gives them." in page
-    assert "every n-th of 4" in page
-    assert "want of time: mean. Not compared, as your settings forbid it: argmax." in page
-    assert "Not run for want of time: mean." in page
-    assert [line.split(" | ")[0] for line in table_of(document)[2:]] == [
-        "| **unclear**", "| **distinct**", "| **equal**", "| **exact**",
-    ]  # fmt: skip
-    single = document | {"runs": runs[:1], "choice": choice_of(RUNS[0])}
-    report.save(single, tmp_path / "alone")
-    assert "\nNothing can be recommended: exact alone fitted" in "\n".join(report.page_of(single))
-
-
-def test_command_compares_in_processes_of_their_own(tmp_path, capsys):
-    paths = write_scene(tmp_path, 2)
-    command = ["tradeoff", *map(str, paths), "--budget", "0.1", "-o", str(tmp_path / "out"), "--json"]
-    assert cli.main([*command, "--set", "diagnostic_rays=0", "--threads", "1"]) == 0
-    document = json.loads(capsys.readouterr().out)
-    assert [run["name"] for run in document["runs"]] == ["exact"]
-    assert "exact alone fitted the budget" in document["choice"]["why"] and not document["choice"]["recommended"]
-    assert document["runs"][0]["cosine"] == pytest.approx(1.0)
-    assert all(Path(file).is_file() for file in document["files"])
-    saved = json.loads((tmp_path / "out" / "tradeoff.json").read_text())
-    assert all(document[name] == saved[name] for name in ("over_budget", "invalid_runs"))
-    assert np.isfinite(document["runs"][0]["wall_with_reading_ratio"])
-    repeated_options = vars(cli.build_parser().parse_args(shlex.split(document["command"])[1:]))
-    options = vars(cli.build_parser().parse_args([*command, "--set", "diagnostic_rays=0", "--threads", "1"]))
-    assert {key for key, value in options.items() if repeated_options[key] != value} == {"out", "json"}
-
-
-@pytest.mark.parametrize("wrong", [["--set", "quality=fast"], ["--set", "stride=0"], ["--labels", "nowhere"]])
-def test_bad_orders_are_refused_in_one_line(tmp_path, capsys, wrong):
-    paths = write_scene(tmp_path, 2)
-    assert cli.main(["tradeoff", *map(str, paths), "-o", str(tmp_path / "out"), *wrong]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-
-
-BAD_MASKS = {
-    "nothing there": None,
-    "foreign": b"hello, world",
-    "truncated": save({"v2/mask": torch.zeros(7, 9, dtype=torch.int16)})[:-5],
-    "three sides": save({"v2/mask": torch.zeros(1, 7, 9, dtype=torch.int16)}),
-    "fractions": save({"v2/mask": torch.zeros(7, 9)}),
-    "empty": save({"v2/mask": torch.zeros(0, 9, dtype=torch.int16)}),
-    "no such class": save({"v2/mask": torch.full((7, 9), 2, dtype=torch.uint8)}),
-    "below none": save({"v2/mask": torch.full((7, 9), -2, dtype=torch.int8)}),
-}
-
-
-def test_bad_masks_and_a_table_of_other_channels_are_refused_in_one_line(tmp_path, capsys):
-    paths = write_scene(tmp_path, 2)
-    words = ["--labels", str(tmp_path / "m"), "--table", str(tmp_path / "t"), "--classes", "cat", "dog"]
-    command = ["tradeoff", *map(str, paths), "-o", str(tmp_path / "out"), *words]
-    save_file({"embeddings": torch.eye(2, 6)}, tmp_path / "t", metadata={"words": '["cat", "dog"]'})
-    for name, masks in BAD_MASKS.items():
-        if masks is not None:
-            (tmp_path / "m").write_bytes(masks)
-        assert cli.main(command) == 2, name
-        stderr = capsys.readouterr().err
-        assert stderr.count("\n") == 1 and "labels" in stderr, name
-    save_file({"embeddings": torch.eye(2, 5)}, tmp_path / "t", metadata={"words": '["cat", "dog"]'})
-    save_file({"v2/mask": torch.zeros(7, 9, dtype=torch.int16)}, tmp_path / "m")
-    assert cli.main(command) == 2
-    assert capsys.readouterr().err == "splatlift: table: expected 6 channels, as the features, got 5\n"
-
-
-def test_a_scene_of_which_the_exact_run_sees_nothing_is_refused(tmp_path, monkeypatch):
-    blind = cosine_figures(torch.zeros(3, 2), torch.zeros(3, 2), torch.ones(3))
-    assert set(blind.values()) == {None}
-    monkeypatch.setattr(comparison, "_run", lambda *_: run_of("exact", 10, VIEWS) | blind)
-    paths = write_scene(tmp_path, 2)
-    with pytest.raises(InvalidInput, match="gave no splat a feature"):
-        comparison.compare(SceneFiles(paths[0], paths[1], (paths[2],)), 1.0, {}, 1, silent)
-
-
-def test_every_nth_view_is_compared_when_the_settings_say_so(tmp_path, monkeypatch):
-    orders = []
-
-    def record_order(order, candidate):
-        orders.append(order)
-        figures = run_of(candidate.name, 1e6, VIEWS)
-        del figures["options"]  # a run does not report them
-        return figures
-
-    monkeypatch.setattr(comparison, "_run", record_order)
-    paths = write_scene(tmp_path, 2)
-    scene = SceneFiles(paths[0], paths[1], (paths[2],))
-    document = comparison.compare(scene, 1e5, {"view_stride": 2}, 1, silent)
-    assert (orders[-1].lifted, orders[-1].held_out) == (("v0",), ("v2",))
-    assert measure_run(replace(orders[-1], reference=tmp_path))["views"] == 1
-    assert document["runs"][0]["options"]["view_stride"] == 2

@@ -8,8 +8,8 @@ import pytest
 from liftcore.errors import InvalidQuery
 from liftcore.query.scene import Scene
 from liftcore.text import open_encoder
-from liftcore.text.table import TableEncoder, Vocabulary
 from liftcore.text.phrases import part_phrases
+from liftcore.text.table import TableEncoder, Vocabulary
 
 OF_SCENE = ["cat", "cow", "doughnut", "boat", "airplane", "flowerpot", "fish", "hammer", "pizza", "violin", "teapot"]
 
