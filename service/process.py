@@ -76,6 +76,7 @@ class Child:
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, pass_fds=[lifeline],
                 start_new_session=True, env=os.environ | environment,
             )  # fmt: skip
+            arm(lifeline, self._process.pid)  # else it would live through its imports
         finally:
             os.close(lifeline)
         assert self._process.stdin is not None and self._process.stdout is not None
@@ -318,17 +319,21 @@ class Children:
 # The child's side
 
 
-def end_with_parent(lifeline: int) -> None:
-    """End this process, and the group that it leads, when the other end of a pipe closes: the server has ended.
-
-    A signal of the kernel does it, even within a call that no thread could interrupt.
+def arm(lifeline: int, group: int) -> None:
+    """Let the kernel end a process group when the other end of a pipe closes, even within a call that blocks.
 
     Args:
-        lifeline: the file number of the pipe's reading end; nothing is ever written to it.
+        lifeline: the file number of the pipe's reading end, in any process; nothing is ever written to it.
+        group: the process that leads it.
     """
-    fcntl.fcntl(lifeline, fcntl.F_SETOWN, -os.getpid())  # of the group that this process leads
+    fcntl.fcntl(lifeline, fcntl.F_SETOWN, -group)
     fcntl.fcntl(lifeline, fcntl.F_SETSIG, signal.SIGKILL)
     fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | os.O_ASYNC)
+
+
+def end_with_parent(lifeline: int) -> None:
+    """End this process, and the group that it leads, when the other end of its lifeline closes."""
+    arm(lifeline, os.getpid())
 
     def wait() -> None:  # the pipe may have closed before
         os.read(lifeline, 1)

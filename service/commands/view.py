@@ -25,7 +25,7 @@ from liftcore.errors import InvalidInput, InvalidLift, Unavailable
 from liftcore.text import BUILT_IN, NO_WORDS, OWN_WORDS
 from service.commands.serve import serve
 from service.errors import Fault, Misconfigured
-from service.process import Children, end_with_parent
+from service.process import Children, arm, end_with_parent
 from service.results import add_lift
 from service.settings import ServiceSettings, read_settings, require_encoder_files
 from service.store import SERVICE, Store
@@ -74,6 +74,7 @@ def show(
         with subprocess.Popen(
             command, stdout=subprocess.PIPE, text=True, pass_fds=[lifeline], start_new_session=True
         ) as server:
+            arm(lifeline, server.pid)
             os.close(lifeline)
             assert server.stdout is not None
             try:
