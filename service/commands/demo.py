@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import io
 import json
-import os
 import re
 import subprocess
 import sys
@@ -103,10 +102,8 @@ class Client:
     """HTTP client of a service. Answers of 4xx and 5xx become errors with the service's message."""
 
     def __init__(self, url: str) -> None:
-        key = os.environ.get("SPLATLIFT_KEY")
-        headers = {"Authorization": f"Bearer {key}"} if key else {}
         # ignore a proxy of the environment
-        self.http = httpx.Client(base_url=url, timeout=TIMEOUT, trust_env=False, headers=headers)
+        self.http = httpx.Client(base_url=url, timeout=TIMEOUT, trust_env=False)
 
     def call(self, method: str, path: str, **options: Any) -> httpx.Response:
         """Return the response to a request.
@@ -131,14 +128,6 @@ class Client:
         """Order a lift and wait; return the job and its lift."""
         job = self.call("POST", "/lift", json=order).json()
         while job["state"] not in ("succeeded", "failed", "canceled"):
-            if sys.stderr.isatty():
-                step = job["progress"] or {"stage": job["state"], "completed": 0, "total": 1}
-                print(
-                    f"\r\033[K{step['stage']} {step['completed']}/{step['total']}",
-                    end="",
-                    file=sys.stderr,
-                    flush=True,
-                )
             time.sleep(0.25)
             job = self.get(f"/jobs/{job['id']}")
         if job["state"] != "succeeded":

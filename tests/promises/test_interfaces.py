@@ -276,9 +276,7 @@ def test_splats_of_an_answer_are_the_same_files(interfaces: Interfaces) -> None:
         expected = interfaces.exported("out.ply", answer, kind)
         assert interfaces.written_file("query", option, "out.ply", *words) == expected
         for send in (interfaces.get, interfaces.post):
-            path = "/query/splats" if send == interfaces.get else f"/query/splats?what={what}"
-            parameters = fields | ({"what": what} if send == interfaces.get else {})
-            assert send(path, **parameters).content == expected
+            assert send("/query/splats", what=what, **fields).content == expected
     count = len(lc.read_splats(interfaces.folder / "out.ply").means)
     assert count == len(interfaces.scene.features)
 
@@ -305,7 +303,7 @@ def test_objects_and_their_tree_are_the_same_lists(interfaces: Interfaces) -> No
 
 def test_splats_of_an_object_are_the_same_file(interfaces: Interfaces) -> None:
     expected = interfaces.exported("object.ply", 1)
-    assert interfaces.of_lift("objects/1/splats").content == expected
+    assert interfaces.get("/query/splats", sets="object:1").content == expected
     assert interfaces.written_file("export", "-o", "object.ply", "--object", 1) == expected
     assert len(lc.read_splats(interfaces.folder / "object.ply").means) == interfaces.scene.members(1).sum() > 0
 
