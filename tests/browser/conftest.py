@@ -20,16 +20,17 @@ from service.store import Store
 from tests.server import until, wait_for_end
 from tests.tiny_scene import make_scene
 
-from .browser import Browser, Chromium, launch
+from .browser import PATIENCE_SECONDS, Browser, Chromium, launch
 
 
 @dataclass(frozen=True)
 class PageServer:
-    """Address, lift and data directory of a running service."""
+    """A running service: address, lift, data directory, and a client."""
 
     address: str
     lift: str
     data: Path
+    client: httpx.Client
 
 
 @contextlib.contextmanager
@@ -53,26 +54,28 @@ def serving(data: Path, **settings: Any) -> Iterator[str]:
 def server(chromium: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Iterator[PageServer]:
     folder, scene = tmp_path_factory.mktemp("page"), make_scene()
     (folder / "table.safetensors").write_bytes(scene.table)
-    with serving(folder / "data", encoder=f"table:{folder}/table.safetensors") as address:
-        with httpx.Client(base_url=address, timeout=60) as client:
-            bodies = {kind: getattr(scene, kind) for kind in ("splats", "cameras", "features")}
-            ids = {kind: client.put(f"/assets/{kind}", content=body).json()["id"] for kind, body in bodies.items()}
-            order = ids | {"features": [ids["features"]], "settings": {"preset": "row-sum", "objects": True}}
-            job = wait_for_end(client, client.post("/lift", json=order).headers["location"])
+    with (
+        serving(folder / "data", encoder=f"table:{folder}/table.safetensors") as address,
+        httpx.Client(base_url=address, timeout=PATIENCE_SECONDS) as client,
+    ):
+        bodies = {kind: getattr(scene, kind) for kind in ("splats", "cameras", "features")}
+        ids = {kind: client.put(f"/assets/{kind}", content=body).json()["id"] for kind, body in bodies.items()}
+        order = ids | {"features": [ids["features"]], "settings": {"preset": "row-sum", "objects": True}}
+        job = wait_for_end(client, client.post("/lift", json=order).headers["location"])
         assert job["state"] == "succeeded", job
-        yield PageServer(address, job["id"], folder / "data")
+        yield PageServer(address, job["id"], folder / "data", client)
 
 
 @pytest.fixture
 def other_lift(server: PageServer) -> Iterator[str]:
     """Another lift of the same scene."""
-    with httpx.Client(base_url=server.address, timeout=60) as client:
-        lift_document = client.get(f"/lifts/{server.lift}").json()
-        order = {name: lift_document[name] for name in ("splats", "cameras", "features")}
-        order["settings"] = {"preset": "tikhonov"}
-        job = wait_for_end(client, client.post("/lift", json=order).headers["location"])["id"]
-        yield job
-        assert client.delete(f"/jobs/{job}?with_lift=true").status_code == 204
+    client = server.client
+    lift_document = client.get(f"/lifts/{server.lift}").json()
+    order = {name: lift_document[name] for name in ("splats", "cameras", "features")}
+    order["settings"] = {"preset": "tikhonov"}
+    job = wait_for_end(client, client.post("/lift", json=order).headers["location"])["id"]
+    yield job
+    assert client.delete(f"/jobs/{job}?with_lift=true").status_code == 204
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from tests.still_life.files import write_still_life
 from tests.still_life.scene import still_life
 from tests.tiny_scene import colmap_zip, make_scene
 
-from .browser import Browser
+from .browser import PATIENCE_SECONDS, Browser
 from .conftest import PageServer, serving
 from .looking import AMBER, READY, ask, columns, text_of
 
@@ -99,9 +99,7 @@ def test_dropped_files_are_planned_compared_and_cancelled(empty: Browser, files:
 def test_lift_file_asks_for_what_it_was_made_of_and_opens(
     empty: Browser, server: PageServer, files: dict[str, Path], tmp_path: Path
 ) -> None:
-    (tmp_path / "brought.safetensors").write_bytes(
-        httpx.get(f"{server.address}/lifts/{server.lift}/features").content
-    )
+    (tmp_path / "brought.safetensors").write_bytes(server.client.get(f"/lifts/{server.lift}/features").content)
     empty.drop([tmp_path / "brought.safetensors"])
     empty.until("document.querySelector('.file .state')?.textContent.includes('(cameras)')")
     assert "(splats) and" in text_of(empty, ".file .state") and "(cameras)" in text_of(empty, ".file .state")
@@ -151,7 +149,7 @@ def test_files_are_still_there_after_the_page_is_loaded_again(empty: Browser, fi
 
 
 def test_scenes_that_others_make_and_delete_are_followed(empty: Browser, files: dict[str, Path]) -> None:
-    with httpx.Client(base_url=empty.value("location.origin")) as other:
+    with httpx.Client(base_url=empty.value("location.origin"), timeout=PATIENCE_SECONDS) as other:
         asset_ids = {kind: other.put(f"/assets/{kind}", content=file.read_bytes()) for kind, file in files.items()}
         ids = {kind: reply.json()["id"] for kind, reply in asset_ids.items() if kind != "table"}
         order = ids | {"features": [ids["features"]], "settings": {"preset": "row-sum"}}

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
 import numpy as np
 import pytest
 from safetensors import safe_open
@@ -162,7 +161,7 @@ def test_click_takes_the_object_and_another_its_patch(page: Browser) -> None:
 @pytest.fixture
 def scene_with_parts(server: PageServer, tmp_path: Path) -> Iterator[str]:
     """A lift whose lamp has two parts, nodes 3 and 4: its splats of even and of odd rows."""
-    (tmp_path / "lift").write_bytes(httpx.get(f"{server.address}/lifts/{server.lift}/features").content)
+    (tmp_path / "lift").write_bytes(server.client.get(f"/lifts/{server.lift}/features").content)
     with safe_open(tmp_path / "lift", framework="np") as file:
         metadata = file.metadata()
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
@@ -171,9 +170,9 @@ def scene_with_parts(server: PageServer, tmp_path: Path) -> Iterator[str]:
     tensors["node_parents"] = np.array([-1, -1, -1, lamp, lamp], np.int32)
     for name in ("node_views", "node_confidence", "node_features"):
         tensors[name] = tensors[name][[0, 1, 2, lamp, lamp]]
-    lifted = httpx.post(f"{server.address}/lifts", content=save(tensors, metadata)).raise_for_status().json()["id"]
+    lifted = server.client.post("/lifts", content=save(tensors, metadata)).raise_for_status().json()["id"]
     yield lifted
-    httpx.delete(f"{server.address}/jobs/{lifted}?with_lift=true").raise_for_status()
+    server.client.delete(f"/jobs/{lifted}?with_lift=true").raise_for_status()
 
 
 def test_objects_unfold_into_parts_by_keyboard_and_by_clicks(
@@ -223,7 +222,7 @@ def test_object_takes_a_name_and_is_hidden_for_good(page: Browser, server: PageS
     assert page.value("document.querySelectorAll('#catalogue-list li').length") == 2
     assert "1 hidden object" in text_of(page, "#catalogue-hidden")
     for change in ({"name": None}, {"hidden": False}):
-        httpx.patch(f"{server.address}/lifts/{server.lift}/objects/0", json=change).raise_for_status()
+        server.client.patch(f"/lifts/{server.lift}/objects/0", json=change).raise_for_status()
 
 
 def test_objects_are_joined_split_and_taken_apart_again(page: Browser, server: PageServer) -> None:
@@ -240,7 +239,7 @@ def test_objects_are_joined_split_and_taken_apart_again(page: Browser, server: P
     page.until(f"{names}.length === 2")
     objects_text = page.value("splatlift.objects.exportedSets()")
     body = {"lift": server.lift, "of": "questions", "questions": objects_text}
-    with zipfile.ZipFile(io.BytesIO(httpx.post(f"{server.address}/query/export", json=body).content)) as archive:
+    with zipfile.ZipFile(io.BytesIO(server.client.post("/query/export", json=body).content)) as archive:
         classes = json.loads(archive.read("labels.json"))["classes"]
     assert sorted(entry["splats"] for entry in classes) == [20, 40]
     splat = page.value("splatlift.query.current.paintedScores.findIndex(Boolean)")
@@ -283,7 +282,7 @@ def test_objects_are_joined_split_and_taken_apart_again(page: Browser, server: P
     page.key("z", ctrl=True)
     page.until("splatlift.objects.selections.length === 1 && !splatlift.objects.items.some(object => object.hidden)")
     object_id = page.value("splatlift.objects.selections[0].id")
-    assert httpx.delete(f"{server.address}/lifts/{server.lift}/selections/{object_id}").status_code == 204
+    assert server.client.delete(f"/lifts/{server.lift}/selections/{object_id}").status_code == 204
 
 
 def test_answer_is_corrected_by_hand_and_undone(page: Browser) -> None:

@@ -10,7 +10,6 @@ import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import httpx
 import pytest
 import zstandard
 
@@ -109,4 +108,4 @@ def test_ten_tasks_are_done_without_a_manual(
     page.until("document.querySelector('#sent .file.done')")
     save_picture("6-brought")
     page.press("#sent .file .away")
-    assert httpx.delete(f"{server.address}/lifts/{server.lift}/selections/{object_id}").status_code == 204
+    assert server.client.delete(f"/lifts/{server.lift}/selections/{object_id}").status_code == 204
