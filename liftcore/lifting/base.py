@@ -76,7 +76,7 @@ class LiftSteps(Protocol[Weights]):
         ...
 
     def reweight(self, W: Weights, levels_apart: bool) -> tuple[Weights, float | None]:
-        """Reweight W by the robust steps; return it and the median reliability of regions, None if that is off.
+        """Reweight W by the robust step; return it and the median reliability of regions, None without masks.
 
         Args:
             levels_apart: True if regions are compared with those of their own level alone.

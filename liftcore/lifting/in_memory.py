@@ -32,7 +32,7 @@ from liftcore.solve.directions import region_totals
 from liftcore.solve.least_squares import AllRays, reference, refine
 from liftcore.solve.membership import Memberships, RegionGroups, memberships
 from liftcore.solve.objects import NodeVectors, RegionObjects, region_objects
-from liftcore.solve.reweight import Reweighting, reweighting_factors, scale_weights, whole_regions
+from liftcore.solve.reweight import Reweighting, mask_regions, reweighting_factors, scale_weights
 from liftcore.solve.smooth import smooth
 from liftcore.solve.sums import sum_pieces
 from liftcore.values.lift_views import LiftViews
@@ -131,9 +131,9 @@ class InMemory(LiftSteps[SceneWeights]):
 
     def reweight(self, W: SceneWeights, levels_apart: bool) -> tuple[SceneWeights, float | None]:
         reweighting = reweighting_factors(
-            W.weights, W.geometry.codebook, self.settings.robust_steps, self.timings.progress,
+            W.weights, W.geometry.codebook, self.timings.progress,
             principal=self.settings.robust_directions, means=self.splats.means, threads=self.threads,
-            reliability=whole_regions(self.settings.reliability, W.geometry.levels), consensus=W.consensus,
+            masks=mask_regions(W.geometry.levels), consensus=W.consensus,
             levels=W.geometry.levels if levels_apart else None,
         )  # fmt: skip
         result = replace(W.with_factors(reweighting.factors), consensus=None, reweighting=reweighting)

@@ -158,8 +158,7 @@ def region_weights(
         splats, cameras, views, preset, progress, threads, settings: as in `lift`. All views count, whatever the
             settings' coverage. A label on several levels is one region a level.
         reweight: False: W by geometry alone, which reads no feature. True: W of the solve of `lift`, reweighted by
-            the features of other views (``robust_steps``, ``consensus``, ``reliability``); sums of rows stay
-            the same.
+            the features of other views (``robust``); sums of rows stay the same.
 
     Returns:
         W on the CPU, a row a splat: in memory, or in mapped files if it is large. With E the views' codebooks,
@@ -179,7 +178,7 @@ def region_weights(
         if reweight:
             steps = InMemory(inputs.splats, inputs.settings, Timings(reporter), threads)
             masks, levels_apart = bool((geometry.levels >= 0).any()), False
-            if inputs.settings.robust_steps and np.unique(geometry.levels).size > 1:
+            if inputs.settings.robust and np.unique(geometry.levels).size > 1:
                 _, node_vectors = find_objects(steps, W, masks, inputs.settings, steps.timings)
                 levels_apart = needs_separate_levels(node_vectors, len(inputs.views.names))
             W, _ = reweigh(steps, W, masks, levels_apart, inputs.settings, steps.timings)

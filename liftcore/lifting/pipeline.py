@@ -149,7 +149,7 @@ def _run(
         with timings.stage("aggregate"):
             X, aggregation = steps.aggregate(W, X)
         facts["aggregation"] = aggregation.facts
-    if settings.robust_steps:
+    if settings.robust:
         facts["reweighting"] = reweighting_facts(statistics.levels, reliability, support.confidence, levels_apart)
     if objects and node_vectors:
         facts["objects"] = object_facts(objects, node_vectors)
@@ -203,25 +203,19 @@ def needs_separate_levels(node_vectors: NodeVectors | None, views: int) -> bool:
 def reweigh(
     steps: LiftSteps[Weights], W: Weights, masks: bool, levels_apart: bool, settings: LiftSettings, timings: Timings
 ) -> tuple[Weights, float | None]:
-    """Reweight W for the solve; return it and the median reliability of regions, None if that is off.
-
-    Consensus and the robust steps multiply the entries of W by factors.
+    """Reweight W for the solve; return it and the median reliability of regions, None without masks.
 
     Args:
         masks: True if any view has masks.
         levels_apart: True if regions are compared with those of their own level alone.
-
-    Raises:
-        InvalidSettings: the settings require consensus, and no view has masks.
     """
-    reliability = None
-    if settings.uses_consensus(masks):
+    if not settings.robust:
+        return W, None
+    if masks:
         with timings.stage("consensus"):
             W = steps.compare_masks(W)
-    if settings.robust_steps:
-        with timings.stage("robust"):
-            W, reliability = steps.reweight(W, levels_apart)
-    return W, reliability
+    with timings.stage("robust"):
+        return steps.reweight(W, levels_apart)
 
 
 def diagnose(

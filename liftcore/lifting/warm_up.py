@@ -31,9 +31,8 @@ def warm_up_lift(kernel: Kernel, device: Device, settings: LiftSettings) -> None
     solve(W, book, torch.float32, threads=1)
     if settings.objects:
         region_objects(W, np.zeros(1, np.int8), np.ones(1), 1)
-    if settings.consensus:
+    if settings.robust:
         mask_consensus(W, np.zeros(1, np.int8), 1)
-    if settings.reliability:
-        reweighting_factors(W, book, 1, principal=1, threads=1, reliability=torch.ones(1, dtype=torch.bool))
+        reweighting_factors(W, book, principal=1, threads=1, masks=torch.ones(1, dtype=torch.bool))
     if settings.smoothness:
         warm_up_smoothing()

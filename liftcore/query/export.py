@@ -259,7 +259,7 @@ def layer_colours(scene: OpenedLift, layer: str) -> np.ndarray:
     else:
         tensor = getattr(scene.lift, layer)
         if tensor is None:
-            hint = "lift again with the setting robust_steps=1"
+            hint = "lift again with the setting robust=true"
             got = "a lift without reweighting"
             raise InvalidQuery("what", expected=f"a lift with {layer}", got=got, hint=hint)
         values = as_numpy(tensor).astype(np.float32)

@@ -163,7 +163,7 @@ def _render_clusters(scene: OpenedLift, view: str | Camera) -> np.ndarray:
 
 def _render_confidence(scene: OpenedLift, view: str | Camera) -> np.ndarray:
     if scene.confidence is None:
-        hint = "lift again with the preset default, or with robust_steps"
+        hint = "lift again with the preset default, or with robust=true"
         raise InvalidQuery(
             "channel", expected="a lift with confidence", got="a lift that was not reweighted", hint=hint
         )

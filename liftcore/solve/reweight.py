@@ -6,8 +6,7 @@ With e_m the direction of region m (`liftcore.solve.directions`), its weight in 
     r_jv = sum of W_jn e_n over the regions n of all other views,     c = sum W c_jm / sum W over the scene
 
 ``p_jv`` is the share of view v in the weight of splat j, and ``s_j`` restores the sum of weights of the splat, so
-denominators, ``has_feature`` and total weight do not change. A further step takes r and p from the weights of the
-step before, and starts from the first W again. There are no tuned parameters; the reason for each part:
+denominators, ``has_feature`` and total weight do not change. There are no tuned parameters; the reason for each part:
 
 - **Other views are the reference, never the region itself.** A region's vector is noisy, and the noise of a heavy
   region pulls the splat's mean towards it. Compared with that mean, a region is rewarded for its own noise, most
@@ -35,9 +34,9 @@ mask of two objects. With ``p`` as above, region m of view v has::
     r_m = sum_j W_jm (1 - p_jv) c_jm / sum_j W_jm (1 - p_jv)        r = the median of r_m over the regions
 
 and all its entries get the factor ``r_m / r``. Parts of a region that no other view sees are no evidence, so the
-weights are those of the other views. It is applied once: a second pass would compare with the result of the first,
-and is worse. Cells of a grid do not claim that their splats are one object, so they have no reliability: cells across
-an edge would lose their weight there.
+weights are those of the other views. A second pass would compare with the result of the first, and is worse. Cells
+of a grid do not claim that their splats are one object, so they have no reliability: cells across an edge would lose
+their weight there.
 
 **Mask consensus** (`consensus`) enters as ``q_jm^(SHARPNESS (1 - r))``: where features agree, they reveal wrong masks
 themselves, and geometry counts more the less they agree. This exponent leaves correct masks unchanged.
@@ -81,17 +80,17 @@ class Reweighting:
     """Factors and scores of a reweighting of W."""
 
     factors: Tensor  # [nnz] f32, of each entry of W; the sums of rows do not change
-    confidence: Tensor | None  # [P] f32 in 0..1; None after no step
-    reliability: float | None = None  # r, the median over regions; None if not requested
+    confidence: Tensor  # [P] f32 in 0..1
+    reliability: float | None  # r, the median over regions; None without masks
 
 
-def whole_regions(reliability: bool | str, levels: np.ndarray) -> Tensor | None:
-    """Return the mask [M] bool of regions with a reliability: with ``auto`` those of masks; None if there is none.
+def mask_regions(levels: np.ndarray) -> Tensor | None:
+    """Return [M] bool, the regions that are masks, which have a reliability; None if there is none.
 
     Args:
-        reliability: the setting. levels: [M] i8, -1 for cells of grids.
+        levels: [M] i8, -1 for cells of grids.
     """
-    mask = levels >= 0 if reliability == "auto" else np.full(levels.shape, bool(reliability))
+    mask = levels >= 0
     return torch.from_numpy(mask) if mask.any() else None
 
 
@@ -121,43 +120,37 @@ def scale_weights(W: RegionWeights, factors: Tensor) -> RegionWeights:
 def reweighting_factors(
     W: RegionWeights,
     codebook: Codebook,
-    steps: int,
     progress: Progress = silent,
     *,
     principal: int = DIRECTIONS,
     means: Tensor | None = None,
     threads: int | None = None,
-    reliability: Tensor | None = None,
+    masks: Tensor | None = None,
     consensus: Tensor | None = None,
     levels: np.ndarray | None = None,
 ) -> Reweighting:
-    """Return the factor of each entry of W after ``steps`` steps, for a scene whose W is in one piece.
+    """Return the factor of each entry of W, for a scene whose W is in one piece.
 
     Args:
         W: of all views by rows of codebooks, on the CPU.
         principal: directions in which regions are compared (`RegionDirections`). means: [P, 3] of the splats;
             neighbours are processed together.
         threads: None uses the cores that this process may use. The result is bitwise identical for any number.
-        reliability: [M] bool, the regions with a reliability; None: none.
+        masks: [M] bool, the regions with a reliability; None: none.
         consensus: [nnz] f32 of each entry (`mask_consensus`).
         levels: [M] i8, the level of each region in its view, -1 for cells of grids; None: one level.
     """
     block = BlockReweighter(W, means, threads, levels)
     directions = RegionDirections.of_weights(W, codebook, principal, threads)
-    factors, confidence, scene = None, None, None
-    for step in range(steps):
-        table = np.zeros((2, codebook.regions + block.levels))
+    table = np.zeros((2, codebook.regions + block.levels))
 
-        def add(part: PieceSums, table: np.ndarray = table) -> None:
-            table[:, part.places] += part.values
+    def add(part: PieceSums) -> None:
+        table[:, part.places] += part.values
 
-        cosines = block.cosines(directions, factors, reliability is not None, add)
-        scene = SceneConsistency.of(table, reliability, block.level)
-        confidence = block.weigh(cosines, factors, scene, consensus)
-        factors = cosines
-        progress("robust", step + 1, steps, "steps")
-    if factors is None or scene is None:
-        return Reweighting(torch.ones_like(W.weight), None)
+    factors = block.cosines(directions, masks is not None, add)
+    scene = SceneConsistency.of(table, masks, block.level)
+    confidence = block.weigh(factors, scene, consensus)
+    progress("robust", 1, 1, "steps")
     return Reweighting(factors, confidence, scene.reliability)
 
 
@@ -179,7 +172,7 @@ class SceneConsistency:
     mean_cosine: Tensor  # [K] f64, c, the mean cosine
     regions: Tensor  # [M] f32, r_m / r of each region; 1 for regions without a reliability
     power: Tensor  # [K] f64, exponent of the consensus, SHARPNESS (1 - r)
-    reliability: float | None  # r, the median over all regions; None if not requested
+    reliability: float | None  # r, the median over all regions; None without masks
 
     @classmethod
     def of(cls, sums: np.ndarray, mask: Tensor | None, level: np.ndarray) -> "SceneConsistency":
@@ -228,28 +221,21 @@ class BlockReweighter:
             self.rows = self.rows[torch.argsort(morton_codes(means[self.rows]))]
         self.blocks = row_blocks(W.indptr.diff()[self.rows].numpy(), BLOCK_ROWS, BLOCK_ENTRIES)
 
-    def cosines(
-        self,
-        directions: RegionDirections,
-        factors: Tensor | None,
-        by_region: bool,
-        add: Callable[[PieceSums], None],
-    ) -> Tensor:
+    def cosines(self, directions: RegionDirections, by_region: bool, add: Callable[[PieceSums], None]) -> Tensor:
         """Return ``c_jm`` of each entry, [nnz] f32.
 
         Args:
-            factors: [nnz] f32, of the step before; None before the first one.
             by_region: True to compute the sums of reliability.
             add: called with the sums of each piece, in order: ``W (1 - p) c`` and ``W (1 - p)`` of each region and,
                 at the places from M on, ``W c`` and ``W`` of each level.
         """
-        products, squares, factors = self._entries(), self._entries(), _or_ones(factors)
+        products, squares = self._entries(), self._entries()
         for columns in directions.slices():
             table, width = flat_table(directions.table(columns)), columns.stop - columns.start
-            arrays = [self._arrays(factors), table, width, products.numpy(), squares.numpy()]
+            arrays = [self._arrays(), table, width, products.numpy(), squares.numpy()]
             blocks = [(self.rows[first:last].numpy(), *arrays) for first, last in self.blocks]
             run_each(compare_rows, blocks, self.threads)
-        arrays = [*self._arrays(factors), products.numpy(), squares.numpy()]
+        arrays = [*self._arrays(), products.numpy(), squares.numpy()]
 
         def add_rows(first: int, last: int, table: np.ndarray) -> None:
             tally(*[first, last, *arrays, by_region, table])
@@ -259,22 +245,21 @@ class BlockReweighter:
             add(part)
         return products
 
-    def weigh(
-        self, cosines: Tensor, factors: Tensor | None, scene: SceneConsistency, consensus: Tensor | None
-    ) -> Tensor:
+    def weigh(self, cosines: Tensor, scene: SceneConsistency, consensus: Tensor | None) -> Tensor:
         """Replace cosines by factors ``s ((1 - p) c_jm + p c) (r_m / r) q^power``, in place.
 
         Args:
-            cosines: [nnz] f32, of `cosines`. factors: of the step before, as there.
+            cosines: [nnz] f32, of `cosines`.
             consensus: [nnz] f32 of each entry (`mask_consensus`); None: no consensus.
 
         Returns:
             [n] f32, the confidence of each splat.
         """
         confidence = torch.zeros(self.W.indptr.shape[0] - 1, dtype=torch.float32)
-        parts = cosines, scene.regions, _or_ones(consensus), confidence, scene.mean_cosine, scene.power
+        consensus = torch.zeros(0, dtype=torch.float32) if consensus is None else consensus  # as the kernel reads it
+        parts = cosines, scene.regions, consensus, confidence, scene.mean_cosine, scene.power
         powers = ((np.arange(POWERS + 2) / POWERS) ** scene.power.numpy()[:, None]).astype(np.float32)
-        arrays = [*self._arrays(_or_ones(factors)), *(part.numpy() for part in parts), powers]
+        arrays = [*self._arrays(), *(part.numpy() for part in parts), powers]
         # In the order of memory: nothing is shared by neighbours, unlike in `cosines`.
         blocks = [(first, last, *arrays) for first, last in self.W.blocks(BLOCK_ROWS, BLOCK_ENTRIES)]
         run_each(weigh_rows, blocks, self.threads)
@@ -285,20 +270,15 @@ class BlockReweighter:
         size = self.W.weight.nbytes
         return zeros(tuple(self.W.weight.shape), torch.float32, name="weights", in_file=2 * size > MEMORY_LIMIT)
 
-    def _arrays(self, factors: Tensor) -> list[np.ndarray]:
-        """Return the arrays of W, its factors, and the view and level of each region."""
+    def _arrays(self) -> list[np.ndarray]:
+        """Return the arrays of W, and the view and level of each region."""
         W = self.W
-        return [*(part.numpy() for part in (W.indptr, W.region, W.weight, factors, self.view)), self.level]
-
-
-def _or_ones(factors: Tensor | None) -> Tensor:
-    """Return factors or consensus [nnz] f32 for a kernel, which reads an empty array as ones."""
-    return torch.zeros(0, dtype=torch.float32) if factors is None else factors
+        return [*(part.numpy() for part in (W.indptr, W.region, W.weight, self.view)), self.level]
 
 
 @kernel
 def weigh_rows(
-    first_row, last_row, indptr, region, weight, factors, view, level, cosines, reliable, consensus, confidence,
+    first_row, last_row, indptr, region, weight, view, level, cosines, reliable, consensus, confidence,
     mean_cosine, power, powers,
 ):  # fmt: skip
     """Compute `BlockReweighter.weigh` of rows ``first_row..last_row``.
@@ -320,8 +300,8 @@ def weigh_rows(
             begin, v = k, view[region[k]]
             view_shares[:] = 0.0
             while k < last and view[region[k]] == v:
-                factor, a = factors[k] if factors.size > 0 else np.float32(1.0), level[region[k]]
-                view_shares[a] += weight[k] * factor * (1.0 / before[a] if before[a] > 0.0 else 0.0)
+                a = level[region[k]]
+                view_shares[a] += weight[k] * (1.0 / before[a] if before[a] > 0.0 else 0.0)
                 k += 1
             for n in range(begin, k):
                 a = level[region[n]]
@@ -349,7 +329,7 @@ def weigh_rows(
 
 
 @kernel
-def tally(first, last, indptr, region, weight, factors, view, level, cosines, squares, by_region, sums):
+def tally(first, last, indptr, region, weight, view, level, cosines, squares, by_region, sums):
     """Replace products of the entries of some rows by cosines, and add these to the sums [2, M + K] f64."""
     count = level.size
     totals, view_shares = np.empty(sums.shape[1] - count), np.empty(sums.shape[1] - count)
@@ -362,16 +342,15 @@ def tally(first, last, indptr, region, weight, factors, view, level, cosines, sq
             begin, v = k, view[region[k]]
             view_shares[:] = 0.0
             while k < indptr[row + 1] and view[region[k]] == v:
-                length, factor = np.sqrt(squares[k]), factors[k] if factors.size > 0 else np.float32(1.0)
+                length = np.sqrt(squares[k])
                 cosine = cosines[k] / length if length > NO_CONSENSUS else np.float32(0.0)
                 cosines[k] = min(max(cosine, np.float32(0.0)), np.float32(1.0))
                 a = level[region[k]]
                 sums[0, count + a] += weight[k] * np.float64(cosines[k])
                 sums[1, count + a] += weight[k]
-                view_shares[a] += weight[k] * factor * (1.0 / totals[a] if totals[a] > 0.0 else 0.0)
+                view_shares[a] += weight[k] * (1.0 / totals[a] if totals[a] > 0.0 else 0.0)
                 k += 1
             for n in range(begin, k if by_region else begin):
                 other_share = max(1.0 - view_shares[level[region[n]]], 0.0)
-                factor = factors[n] if factors.size > 0 else np.float32(1.0)
-                sums[0, region[n]] += weight[n] * factor * other_share * cosines[n]
-                sums[1, region[n]] += weight[n] * factor * other_share
+                sums[0, region[n]] += weight[n] * other_share * cosines[n]
+                sums[1, region[n]] += weight[n] * other_share

@@ -200,14 +200,14 @@ def count_pieces(rows, indptr, length):
 
 @kernel
 def unite_rows(
-    rows, first, last, piece, length, indptr, region, weight, factors, level, inverse, regions, shares, entries
+    rows, first, last, piece, length, indptr, region, weight, level, inverse, regions, shares, entries
 ):  # fmt: skip
     """Write the regions of a group, ascending, with the share and the entry of each row; return their number.
 
     Args:
         rows: of W; those numbered ``first..last`` are the group.
         piece: number of a piece of ``length`` entries of each row.
-        factors: [nnz] f32 of entries, or [0] for none. level: [M] i32 of regions, or [0] for one level.
+        level: [M] i32 of regions, or [0] for one level.
         inverse: [levels GROUP] f64, 1 / the row's sum of weights of a level.
         regions: [GROUP length] i32. shares: [GROUP GROUP length] f32, zero for none.
         entries: i64 likewise, -1 for none.
@@ -230,8 +230,7 @@ def unite_rows(
             place = GROUP * count + j
             if heads[j] == least:
                 n = k[j]
-                factor = factors[n] if factors.size > 0 else np.float32(1.0)
-                shares[place], entries[place] = weight[n] * factor * inverse[base + j], n
+                shares[place], entries[place] = weight[n] * inverse[base + j], n
                 k[j] = n + 1
                 heads[j] = region[n + 1] if n + 1 < ends[j] else NO_REGION
             else:
@@ -264,7 +263,7 @@ def sum_rows(rows, indptr, region, weight, inverse, lengths, table, width, sums)
         table: `flat_table` [M, width]. sums: [n, width] f32.
     """
     regions, shares = np.empty(GROUP * LONG, np.int32), np.empty(GROUP * GROUP * LONG, np.float32)
-    entries, none = np.empty(GROUP * GROUP * LONG, np.int64), np.empty(0, np.float32)
+    entries = np.empty(GROUP * GROUP * LONG, np.int64)
     scales, no_level = np.zeros(GROUP), np.empty(0, np.int32)
     stride = width + LANES
     group_sums, piece_totals = np.empty(GROUP * stride, np.float32), np.empty((GROUP, width))
@@ -276,7 +275,7 @@ def sum_rows(rows, indptr, region, weight, inverse, lengths, table, width, sums)
         for j in range(last - first):
             scales[j] = inverse[rows[first + j]]
         for piece in range(pieces):
-            arrays = indptr, region, weight, none, no_level, scales
+            arrays = indptr, region, weight, no_level, scales
             count = unite_rows(rows, first, last, piece, LONG, *arrays, regions, shares, entries)
             if lengths.size > 0:
                 for place in range(GROUP * count):
@@ -319,15 +318,14 @@ def compare_rows(
 
     Args:
         rows: [n] i64, of W.
-        W: its indptr, region and weight; factors [nnz] f32 of entries, or [0] for none; the view [M] i64 and the
-            level [M] i32 of each region.
+        W: its indptr, region and weight; the view [M] i64 and the level [M] i32 of each region.
         table: `flat_table` [M, width]. products, squares: [nnz] f32.
     """
     add_products(*[rows, *W, table, width, products, squares])
 
 
 @kernel
-def add_products(rows, indptr, region, weight, factors, view, level, table, width, products, squares):
+def add_products(rows, indptr, region, weight, view, level, table, width, products, squares):
     """Add the products of `compare_rows`."""
     regions, shares = np.empty(GROUP * MOST_COMPARED, np.int32), np.empty(GROUP * GROUP * MOST_COMPARED, np.float32)
     entries = np.empty(GROUP * GROUP * MOST_COMPARED, np.int64)
@@ -360,7 +358,7 @@ def add_products(rows, indptr, region, weight, factors, view, level, table, widt
                 inverse[GROUP * level[region[k]] + j] += weight[k]
         for n in range(inverse.size):
             inverse[n] = 1.0 / inverse[n] if inverse[n] > 0.0 else 0.0
-        arrays = indptr, region, weight, factors, level, inverse, regions, shares, entries
+        arrays = indptr, region, weight, level, inverse, regions, shares, entries
         if pieces == 1:
             order_by_level(
                 regions, unite_rows(rows, first, last, 0, MOST_COMPARED, *arrays), level, levels, starts, order

@@ -1,4 +1,4 @@
-"""The settings of a lift as keyword arguments, for type checkers and editors: ``lc.lift(..., robust_steps=1)``."""
+"""The settings of a lift as keyword arguments, for type checkers and editors: ``lc.lift(..., robust=True)``."""
 
 from __future__ import annotations
 
@@ -31,10 +31,8 @@ class LiftOptions(TypedDict, total=False):
     view_cosine: float
     levels: Literal["rows", "composite"] | int
     grid_reading: Literal["bilinear", "nearest"]
-    robust_steps: int
+    robust: bool
     robust_directions: int
-    reliability: bool | Literal["auto"]
-    consensus: bool | Literal["auto"]
     objects: bool | Literal["auto"]
     dtype: Literal["float16", "float32"]
     aggregation: bool

@@ -11,7 +11,6 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
-from pydantic_core import PydanticCustomError
 
 from liftcore.errors import InvalidSettings
 from liftcore.runtime.device_name import device_name
@@ -57,9 +56,8 @@ class Preset(StrEnum):
     MEAN = "mean"  # the same ray, and the plain mean over the views that see the splat (Semantic Gaussians)
 
 
-_REWEIGHTED = {"reliability": "auto", "consensus": "auto"}  # they need a robust step
 _PRESETS: dict[Preset, dict[str, Any]] = {
-    Preset.DEFAULT: {"robust_steps": 1, **_REWEIGHTED},
+    Preset.DEFAULT: {"robust": True},
     Preset.ROW_SUM: {},
     Preset.TIKHONOV: {"power": 2, "lift_gain": TIKHONOV_GAIN, "render_gain": TIKHONOV_GAIN},
     Preset.ARGMAX: {"selection": Selection.TOP_K, "k": 1},
@@ -111,7 +109,7 @@ GROUPS = {  # of the settings, for people who read all of them
     "weights of a ray that count": ("selection", "k", "mass", "weight_floor", "power"),
     "pixels, views and levels": ("stride", "view_stride", "coverage", "view_cosine", "levels", "grid_reading"),
     "the rasterizer": ("kernel", "antialiased", "lift_gain", "render_gain", "alpha_cap", "transmittance_stop"),
-    "wrong masks": ("robust_steps", "robust_directions", "reliability", "consensus"),
+    "wrong masks": ("robust", "robust_directions"),
     "objects and clusters": ("objects", "aggregation", "aggregation_iou", "aggregation_cluster_size"),
     "neighbours": ("smoothness",),
     "least squares": ("cg_steps", "damping", "cg_basis", "reference_channels"),
@@ -127,7 +125,7 @@ class LiftSettings(PlainModel):
     preset: Preset = Field(
         Preset.DEFAULT,
         description="sets `selection`, `k`, `mass`, `weight_floor`, `power`, `lift_gain` and `render_gain`; "
-        "`default` also `robust_steps`, `reliability` and `consensus`",
+        "`default` also `robust`",
     )
     quality: Quality = Field(
         Quality.EXACT,
@@ -191,12 +189,10 @@ class LiftSettings(PlainModel):
     grid_reading: Literal["bilinear", "nearest"] = Field(
         "bilinear", description="what a pixel reads of a feature grid: four cells by distance, or the `nearest` alone"
     )
-    robust_steps: int = Field(
-        0,
-        ge=0,
-        le=100,
-        description="how often each region's weight at a splat is multiplied by its agreement with the other "
-        "views; 1 is enough. 0 turns off the next three",
+    robust: bool = Field(
+        False,
+        description="multiply each region's weight at a splat by its agreement with the other views; masks also by "
+        "their reliability and by what masks of other views keep together",
     )
     robust_directions: int = Field(
         DIRECTIONS,
@@ -204,15 +200,6 @@ class LiftSettings(PlainModel):
         le=4_096,
         description="principal directions of the features in which a robust step compares regions, where channels "
         "are more and regions have many splats each; fewer are faster",
-    )
-    reliability: bool | Literal["auto"] = Field(
-        False,
-        description="with a robust step: weigh regions as a whole too; `auto` does not for grids",
-    )
-    consensus: bool | Literal["auto"] = Field(
-        False,
-        description="with a robust step: weigh regions by what masks of other views keep together; `auto` does "
-        "not for grids, `true` refuses features that are grids alone",
     )
     objects: bool | Literal["auto"] = Field(
         "auto",
@@ -302,19 +289,9 @@ class LiftSettings(PlainModel):
         preset, quality = values.get("preset", Preset.DEFAULT), values.get("quality", Quality.EXACT)
         weights = _PRESETS[Preset(preset)] if isinstance(preset, str) and preset in set(Preset) else {}
         level = _LEVELS[Quality(quality)] if isinstance(quality, str) and quality in set(Quality) else {}
-        if values.get("robust_steps") in (0, "0"):  # drop the preset's settings that need a step; a caller's own stay
-            weights = {name: value for name, value in weights.items() if name not in _REWEIGHTED}
         settings = handler({**weights, **level, **values})
         settings.model_fields_set.intersection_update(values)  # set by the caller; they stay when the preset changes
         return settings
-
-    @model_validator(mode="after")
-    def _check_combinations(self) -> Self:
-        """Refuse combinations of settings that contradict each other."""
-        if (self.reliability or self.consensus) and not self.robust_steps:
-            requirement = "robust_steps of 1 or more beside reliability and consensus, which need a step"
-            raise PydanticCustomError("needs_robust_step", "{expected}", {"expected": requirement})
-        return self
 
     def __repr__(self) -> str:
         overrides = self.model_dump(mode="json", include=self.model_fields_set - {"preset", "quality"})
@@ -366,7 +343,7 @@ class LiftSettings(PlainModel):
     @property
     def weighs_rows(self) -> bool:
         """True if W needs a column for each region; else levels may share one for each distinct tuple of labels."""
-        return bool(self.robust_steps) or self.objects is True
+        return self.robust or self.objects is True
 
     def finds_objects(self, masks: bool) -> bool:
         """Return True if objects are looked for, where views have masks or not.
@@ -378,17 +355,6 @@ class LiftSettings(PlainModel):
             expected = "views with masks: objects are what masks of several views keep together"
             raise InvalidSettings("objects", expected=expected, got=NO_MASKS, hint="take auto")
         return masks and bool(self.objects)
-
-    def uses_consensus(self, masks: bool) -> bool:
-        """Return True if masks are compared with one another, where views have masks or not.
-
-        Raises:
-            InvalidSettings: consensus is true, and no view has masks.
-        """
-        if self.consensus is True and not masks:
-            expected = "views with masks: cells of a grid say nothing of what they show"
-            raise InvalidSettings("consensus", expected=expected, got=NO_MASKS, hint="leave it at auto")
-        return masks and bool(self.consensus)
 
     def check_blocks(self) -> None:
         """Refuse what no engine can work on in blocks of views and splats.

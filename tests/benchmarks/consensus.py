@@ -48,8 +48,6 @@ PACKS = ("features_hard", "features", "features_clean", "grids")
 SETTINGS: dict[str, dict[str, Any]] = {
     "row-sum": {"preset": "row-sum"},
     "tikhonov": {"preset": "tikhonov"},
-    "robust": {"preset": "row-sum", "robust_steps": 1},
-    "and reliability": {"preset": "default", "consensus": False},
     "default": {"preset": "default"},
     "published": {"preset": "default", "aggregation": True},
 }

@@ -70,7 +70,7 @@ def test_a_lift_has_no_threads_of_torch(tmp_path, monkeypatch):
     watch(reweight, "row_blocks")
     watch(closed_form, "sum_rows")
     splats, cameras, features = write_scene(tmp_path, 3)[:3]
-    lift_files(splats, cameras, [features], LiftSettings.of(robust_steps=1))
+    lift_files(splats, cameras, [features], LiftSettings.of(robust=True))
     assert thread_counts == dict.fromkeys(("as_regions", "stacked", "row_blocks", "sum_rows"), 1)
     assert torch.get_num_threads() == 3
 

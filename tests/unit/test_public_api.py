@@ -185,7 +185,7 @@ def test_settings_and_keywords_beside_them_are_one(scene):
     assert float(full.weight.sum()) > 2 * float(strided.weight.sum())
     merged = lc.lift(splats, cameras, views, lc.LiftSettings.of(quality="fast", seed=3), quality="exact").settings
     assert merged == lc.LiftSettings.of(quality="exact", seed=3, antialiased=False)  # which auto came to
-    assert lc.lift(splats, cameras, views, lc.LiftSettings.of(), robust_steps=0).confidence is None
+    assert lc.lift(splats, cameras, views, lc.LiftSettings.of(), robust=False).confidence is None
 
 
 def test_answers_refuse_splats_of_another_scene(scene):

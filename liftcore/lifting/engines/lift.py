@@ -51,7 +51,7 @@ from liftcore.solve.objects import (
     number_objects,
 )
 from liftcore.solve.region_tree import RegionTree, region_tree
-from liftcore.solve.reweight import SceneConsistency, level_numbers, whole_regions
+from liftcore.solve.reweight import SceneConsistency, level_numbers, mask_regions
 from liftcore.solve.sums import sum_pieces, unpack_sums
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.pack import NO_ROOM, Views, write_pack
@@ -238,7 +238,7 @@ class InBlocks(LiftSteps[Job]):
             dtype = getattr(torch, settings.dtype)
             if dtype == torch.float16 and not steps.codebook_of(job).fits_float16():
                 dtype = torch.float32
-            related = settings.finds_objects(statistics.masks) or settings.uses_consensus(statistics.masks)
+            related = settings.finds_objects(statistics.masks) or (settings.robust and statistics.masks)
             job = replace(job, dtype=dtype, related=related)
             self._gather(job)
         return job, statistics
@@ -304,29 +304,26 @@ class InBlocks(LiftSteps[Job]):
         return replace(W, usual_share=mean_share(int(share_sum), int(share_count)))
 
     def reweight(self, W: Job, levels_apart: bool) -> tuple[Job, float | None]:
-        """See the protocol; the solve of each block applies the factors of the last step."""
+        """See the protocol; the solve of each block applies the factors."""
         W = replace(W, levels_apart=levels_apart)
         codebook = steps.codebook_of(W)
-        region_mask = whole_regions(W.settings.reliability, steps.mapped(W.folder / steps.REGIONS)["levels"])
+        region_mask = mask_regions(steps.mapped(W.folder / steps.REGIONS)["levels"])
         totals = _sums(W, "rows", (1, codebook.regions))
         entries = sum(part["region"].size for part in _pieces(W, "rows"))
         principal = W.settings.robust_directions
         RegionDirections(codebook, torch.from_numpy(totals[0]), entries, principal).save(W.folder)
-        level, scene = level_numbers(steps.compared_levels(W), codebook.regions), None
+        level = level_numbers(steps.compared_levels(W), codebook.regions)
         shape = 2, codebook.regions + int(level.max(initial=0)) + 1
-        for step in range(W.settings.robust_steps):
-            self.run(
-                "robust", steps.compare, replace(W, step=step, by_region=region_mask is not None), W.splat_pieces
-            )
-            scene = SceneConsistency.of(_sums(W, f"cosines-{step}", shape), region_mask, level)
-            steps.write_scene_consistency(W, step, scene)
-        return W, scene.reliability if scene else None
+        self.run("robust", steps.compare, replace(W, by_region=region_mask is not None), W.splat_pieces)
+        scene = SceneConsistency.of(_sums(W, "cosines", shape), region_mask, level)
+        steps.write_scene_consistency(W, scene)
+        return W, scene.reliability
 
     def solve(self, W: Job) -> tuple[Tensor, SplatSupport]:
         job = W
         self.run("solve", steps.solve, job, job.splat_pieces)
         sums, total_weight = _column(job, "rows", "sums"), _column(job, "rows", "total_weight")
-        view_consistency, robust = _column(job, "columns", "view_consistency"), job.settings.robust_steps
+        view_consistency, robust = _column(job, "columns", "view_consistency"), job.settings.robust
         confidence = torch.from_numpy(_column(job, "columns", "confidence")) if robust else None
         support = SplatSupport(sums, torch.from_numpy(total_weight), torch.from_numpy(view_consistency), confidence)
         return _mapped(job, job.features_file), support

@@ -64,9 +64,7 @@ TUPLES = "tuples.safetensors"  # bases [pieces] i64, parents and members [T] i32
 CURVE = "curve.safetensors"  # bounds [2, 3] f64 of the splats with weight
 NODES = "nodes.safetensors"  # nodes and other_masks, i64
 TREE = "tree-{}.safetensors"  # of regions (`RegionTree`), by the step of `label`
-SCENE_CONSISTENCY = (
-    "consistency-{}.safetensors"  # regions [M] f32, mean_cosine and power [K] f64, reliability [1] f64
-)
+SCENE_CONSISTENCY = "consistency.safetensors"  # regions [M] f32, mean_cosine and power [K] f64, reliability [1] f64
 
 
 def mapped(path: Path) -> dict[str, Any]:
@@ -273,7 +271,7 @@ def gather(job: Job, piece: int, threads: int | None) -> Piece:
     none = torch.zeros(0, 3, dtype=torch.float64)
     bounds = torch.stack([means.amin(dim=0), means.amax(dim=0)]) if means.numel() else none
     arrays = {"indptr": W.indptr, "region": W.region, "weight": W.weight, "sums": sums}
-    needs_totals = job.settings.robust_steps or job.settings.objects  # these read the weight of each region
+    needs_totals = job.settings.robust or job.settings.objects  # these read the weight of each region
     totals = list(region_totals(W, threads)) if needs_totals else []
     return arrays | {"total_weight": _total_weight(job, ends), "bounds": bounds}, totals
 
@@ -341,20 +339,20 @@ def _consensus(job: Job, block: SplatBlock, threads: int | None) -> Tensor | Non
     return sums
 
 
-def scene_consistency(job: Job, step: int) -> SceneConsistency:
-    """Read the driver's totals of a robust step."""
-    arrays = map_tensors(job.folder / SCENE_CONSISTENCY.format(step))[0]
+def scene_consistency(job: Job) -> SceneConsistency:
+    """Read the driver's totals of the robust step."""
+    arrays = map_tensors(job.folder / SCENE_CONSISTENCY)[0]
     mean_cosine, regions, power = (torch.from_numpy(arrays[name]) for name in ("mean_cosine", "regions", "power"))
     reliability = float(arrays["reliability"][0])
     return SceneConsistency(mean_cosine, regions, power, None if np.isnan(reliability) else reliability)
 
 
-def write_scene_consistency(job: Job, step: int, scene: SceneConsistency) -> None:
-    """Write the driver's totals of a robust step."""
+def write_scene_consistency(job: Job, scene: SceneConsistency) -> None:
+    """Write the driver's totals of the robust step."""
     reliability = np.nan if scene.reliability is None else scene.reliability
     arrays = {"regions": scene.regions, "mean_cosine": scene.mean_cosine, "power": scene.power}
     arrays["reliability"] = torch.tensor([reliability], dtype=torch.float64)
-    write_tensors(job.folder / SCENE_CONSISTENCY.format(step), arrays, {})
+    write_tensors(job.folder / SCENE_CONSISTENCY, arrays, {})
 
 
 def _block_reweighter(job: Job, block: SplatBlock, threads: int | None) -> BlockReweighter:
@@ -366,42 +364,22 @@ def compared_levels(job: Job) -> np.ndarray | None:
     return mapped(job.folder / REGIONS)["levels"] if job.levels_apart else None
 
 
-def _factors_after(
-    job: Job, piece: int, block: SplatBlock, reweighter: BlockReweighter, step: int, threads: int | None
-) -> tuple[Tensor, Tensor]:
-    """Compute the factors after ``step`` steps, at least one, and the confidence of splats."""
-    cosines = torch.from_numpy(map_tensors(job.piece_file(f"cosines-{step - 1}", piece))[0]["cosines"])
-    before = _before(job, piece, step - 1)
-    factors = values_of(cosines.shape[0], torch.float32).copy_(cosines)
-    confidence = reweighter.weigh(factors, before, scene_consistency(job, step - 1), _consensus(job, block, threads))
-    return factors, confidence
-
-
-def _before(job: Job, piece: int, step: int) -> Tensor | None:
-    """Read the factors of the step before; None for the first step."""
-    if step == 0:
-        return None
-    return torch.from_numpy(map_tensors(job.piece_file(f"factors-{step}", piece))[0]["factors"])
-
-
-@piece_of("cosines-{step}")
+@piece_of("cosines")
 def compare(job: Job, piece: int, threads: int | None) -> Piece:
-    """Write the cosines of a step with their sums over the scene, and the factors of the step before."""
-    block = _splat_block(job, piece)
-    reweighter, sums, before = _block_reweighter(job, block, threads), list[PieceSums](), None
-    if job.step:
-        before, _ = _factors_after(job, piece, block, reweighter, job.step, threads)
-        write_piece(job.piece_file(f"factors-{job.step}", piece), {"factors": before})
-    directions = StoredDirections(job.folder)
-    return {"cosines": reweighter.cosines(directions, before, job.by_region, sums.append)}, sums
+    """Write the cosines of regions with their sums over the scene."""
+    block, sums = _splat_block(job, piece), list[PieceSums]()
+    reweighter = _block_reweighter(job, block, threads)
+    return {"cosines": reweighter.cosines(StoredDirections(job.folder), job.by_region, sums.append)}, sums
 
 
 def _reweighted(job: Job, piece: int, block: SplatBlock, threads: int | None) -> tuple[RegionWeights, Tensor | None]:
-    """Compute W of a block after all robust steps, and the confidence of splats [n]; None without a step."""
-    if not job.settings.robust_steps:
+    """Compute W of a block after the robust step, and the confidence of splats [n]; None without the step."""
+    if not job.settings.robust:
         return block.W, None
-    reweighter = _block_reweighter(job, block, threads)
-    factors, confidence = _factors_after(job, piece, block, reweighter, job.settings.robust_steps, threads)
+    cosines = torch.from_numpy(map_tensors(job.piece_file("cosines", piece))[0]["cosines"])
+    factors = values_of(cosines.shape[0], torch.float32).copy_(cosines)
+    reweighter, consensus = _block_reweighter(job, block, threads), _consensus(job, block, threads)
+    confidence = reweighter.weigh(factors, scene_consistency(job), consensus)
     return scale_weights(block.W, factors), confidence
 
 

@@ -146,7 +146,7 @@ def agreement_of_views(
     """
     few = views.only(evenly_spaced(views.names, PROBE_VIEWS))
     longest = max(max(few.camera(k).width, few.camera(k).height) for k in range(len(few)))
-    coarse = {"stride": max(1, longest // SIDE), "diagnostic_rays": rays, "robust_steps": 0, "consensus": False}
+    coarse = {"stride": max(1, longest // SIDE), "diagnostic_rays": rays}
     coarse_settings = settings.model_copy(update=coarse)
     with one_thread():
         return agreement_of(weigh_views(raster, raster.splats.count, few, coarse_settings, silent, by_rows=False))

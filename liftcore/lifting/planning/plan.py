@@ -314,7 +314,7 @@ def _seconds(raster: Raster, views: LiftViews, names: Sequence[str], settings: L
 
 def weight_bytes(visible: Visibility, entries: np.ndarray, settings: LiftSettings) -> int:
     """Estimate the bytes of W of all views from the number of entries of each [V]."""
-    factor_bytes = FACTOR_BYTES if settings.robust_steps else 0
+    factor_bytes = FACTOR_BYTES if settings.robust else 0
     return int(ROW_BYTES * _splat_counts(visible).sum() + (ENTRY_BYTES + factor_bytes) * entries.sum())
 
 
@@ -428,9 +428,9 @@ def memory_phases(
     }
     if settings.finds_objects(masks):
         phases["objects"] = weighed | {"objects": int(OBJECT_BYTES * of_all) + 8 * min(MOST_REGIONS, regions) ** 2}
-    if settings.robust_steps:
+    if settings.robust:
         factors = int(REWEIGHT_BYTES * min(of_all, MEMORY_LIMIT / ENTRY_BYTES))  # more lies in files
-        if settings.consensus and masks:
+        if masks:
             factors += int(CONSENSUS_BYTES * of_all + BLOCK_BYTES * min(of_all, BLOCK_ENTRIES))
         phases["reweighting"] = weighed | {"reweighting": factors}
     if settings.cg_steps or settings.reference_channels:

@@ -255,7 +255,7 @@ def estimate_view_noise(
     sample: list[int] = spaced_indices(total, count).tolist()
     sample_views = views.only(views.names[view] for view in sample)
     longest = max(max(sample_views.camera(k).width, sample_views.camera(k).height) for k in range(count))
-    coarse = {"stride": max(1, longest // NOISE_SIDE), "diagnostic_rays": 0, "robust_steps": 0, "consensus": False}
+    coarse = {"stride": max(1, longest // NOISE_SIDE), "diagnostic_rays": 0}
     coarse_settings = settings.model_copy(update=coarse)
     channels = views.features.channels
     axes = random_axes(channels, min(NOISE_CHANNELS, channels), settings.seed)

@@ -59,7 +59,7 @@ export class LayerPanel {
     this.showLayer("rgb");
     const clusters = lift.diagnostics?.clusters ?? lift.settings?.aggregation;
     byId("layer-cluster").hidden = !clusters;
-    byId("layer-confidence").hidden = !lift.settings?.robust_steps;
+    byId("layer-confidence").hidden = !lift.settings?.robust;
     byId("layer-photo").hidden = !lift.photos;
     let { views, next } = await fetchJson(`/lifts/${lift.id}/views?limit=${PAGE_SIZE}`);
     this.views = views;

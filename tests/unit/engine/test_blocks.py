@@ -115,7 +115,6 @@ def assert_same_metadata(left: lc.LiftResult, right: lc.LiftResult) -> None:
     "overrides",
     [
         {"preset": "row-sum", "objects": True},
-        {"preset": "default", "robust_steps": 2},
         {"preset": "default", "dtype": "float32"},
     ],
 )

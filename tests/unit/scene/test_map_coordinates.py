@@ -80,7 +80,7 @@ def moved_back(splats: Splats, offset: np.ndarray = UTM) -> Splats:
 def test_a_moved_scene_has_the_same_features_pictures_and_plan(kernel: Kernel) -> None:
     splats, cameras, views = scene_of(kernel)
     far_splats, far_cameras = moved_splats(splats), [moved_camera(camera) for camera in cameras]
-    settings = LiftSettings.of(dtype="float32", robust_steps=1)
+    settings = LiftSettings.of(dtype="float32", robust=True)
     original = lc.lift(splats, Cameras(cameras), views, settings)
     far = lc.lift(far_splats, Cameras(far_cameras), views, settings)
     assert far.metadata.origin == far_splats.origin != FILE_ORIGIN

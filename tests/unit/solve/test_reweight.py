@@ -34,10 +34,10 @@ class Scene:
     def stacked(self) -> RegionWeights:
         return stacked([of_dense(view) for view in self.weights], len(self.weights[0]))
 
-    def after(self, steps: int, **options) -> list[np.ndarray]:
-        """The weights of every view after so many steps, dense."""
+    def after(self, **options) -> list[np.ndarray]:
+        """The weights of every view after the step, dense."""
         W = self.stacked()
-        consistency = scale_weights(W, reweighting_factors(W, codebook_of(self.books), steps, **options).factors)
+        consistency = scale_weights(W, reweighting_factors(W, codebook_of(self.books), **options).factors)
         matrix = dense(consistency, len(self.weights[0])).astype(np.float32)
         return np.split(matrix, W.offsets.numpy()[1:-1], axis=1)
 
@@ -62,23 +62,21 @@ def defined_directions(scene: Scene) -> tuple[np.ndarray, list[np.ndarray]]:
     return mean, e
 
 
-def defined(scene: Scene, steps: int, e: list[np.ndarray] | None = None) -> list[np.ndarray]:
+def defined(scene: Scene, e: list[np.ndarray] | None = None) -> list[np.ndarray]:
     """The module's equation, line by line."""
     first, e = [view.astype(np.float64) for view in scene.weights], e or defined_directions(scene)[1]
-    D, current = scene.denominators[:, None], first
-    for _ in range(steps):
-        total = sum(w @ v for w, v in zip(current, e, strict=True))
-        cosines = []
-        for w, v in zip(current, e, strict=True):
-            r = over(total - w @ v, D)
-            lengths = np.linalg.norm(r, axis=1, keepdims=True)
-            cosines.append(np.maximum(over(r, np.where(lengths > NO_CONSENSUS, lengths, 0.0)) @ v.T, 0.0))
-        mean = sum((w * c).sum() for w, c in zip(first, cosines, strict=True)) / (sum(w.sum() for w in first) or 1.0)
-        shares = [over(w.sum(axis=1, keepdims=True), D) for w in current]
-        new = [w * ((1 - p) * c + p * mean) for w, c, p in zip(first, cosines, shares, strict=True)]
-        gain = over(D, np.sum([w.sum(axis=1, keepdims=True) for w in new], axis=0))
-        current = [np.where(gain > 0, w * gain, old) for w, old in zip(new, first, strict=True)]
-    return current
+    D = scene.denominators[:, None]
+    total = sum(w @ v for w, v in zip(first, e, strict=True))
+    cosines = []
+    for w, v in zip(first, e, strict=True):
+        r = over(total - w @ v, D)
+        lengths = np.linalg.norm(r, axis=1, keepdims=True)
+        cosines.append(np.maximum(over(r, np.where(lengths > NO_CONSENSUS, lengths, 0.0)) @ v.T, 0.0))
+    mean = sum((w * c).sum() for w, c in zip(first, cosines, strict=True)) / (sum(w.sum() for w in first) or 1.0)
+    shares = [over(w.sum(axis=1, keepdims=True), D) for w in first]
+    new = [w * ((1 - p) * c + p * mean) for w, c, p in zip(first, cosines, shares, strict=True)]
+    gain = over(D, np.sum([w.sum(axis=1, keepdims=True) for w in new], axis=0))
+    return [np.where(gain > 0, w * gain, old) for w, old in zip(new, first, strict=True)]
 
 
 @st.composite
@@ -99,16 +97,16 @@ def scenes(draw: st.DrawFn) -> Scene:
 
 
 @settings(max_examples=30, deadline=None)
-@given(scene=scenes(), steps=st.integers(0, 3))
-def test_the_steps_equal_their_definition_and_keep_every_splats_sum(scene, steps):
-    got, expected, D = scene.after(steps), defined(scene, steps), scene.denominators
+@given(scene=scenes())
+def test_the_step_equals_its_definition_and_keeps_every_splats_sum(scene):
+    got, expected, D = scene.after(), defined(scene), scene.denominators
     for actual, real in zip(got, expected, strict=True):
         assert np.abs(over(actual - real, D[:, None])).max() < 2e-3
     sums = np.sum([view.sum(axis=1, dtype=np.float64) for view in got], axis=0)
     assert np.allclose(sums, D, rtol=1e-5)
 
 
-def levels_apart(scene: Scene, levels: np.ndarray, steps: int) -> list[np.ndarray]:
+def levels_apart(scene: Scene, levels: np.ndarray) -> list[np.ndarray]:
     """The definition for each level by itself: regions [M] of others weigh nothing, and directions stay."""
     e, ends = defined_directions(scene)[1], np.cumsum([len(book) for book in scene.books])[:-1]
     parts = []
@@ -116,16 +114,15 @@ def levels_apart(scene: Scene, levels: np.ndarray, steps: int) -> list[np.ndarra
         level_weights = [
             view * (part == level) for view, part in zip(scene.weights, np.split(levels, ends), strict=True)
         ]
-        parts.append(defined(Scene(level_weights, scene.books), steps, e))
+        parts.append(defined(Scene(level_weights, scene.books), e))
     return [np.sum(views, axis=0) for views in zip(*parts, strict=True)]
 
 
-@pytest.mark.parametrize("steps", [1, 2])
-def test_levels_are_compared_separately(steps):
+def test_levels_are_compared_separately():
     scene = random_scene(3, count=400, channels=20)
     levels = np.random.default_rng(4).integers(-1, 3, sum(len(book) for book in scene.books)).astype(np.int8)
-    got = scene.after(steps, levels=levels)
-    for actual, real in zip(got, levels_apart(scene, levels, steps), strict=True):
+    got = scene.after(levels=levels)
+    for actual, real in zip(got, levels_apart(scene, levels), strict=True):
         assert np.abs(over(actual - real, scene.denominators[:, None])).max() < 2e-3
 
 
@@ -139,10 +136,10 @@ def random_scene(seed: int, count: int = 9_000, views: int = 4, rows: int = 7, c
 
 def test_neither_threads_nor_files_nor_order_change_a_bit_and_the_first_weights_stay(monkeypatch):
     scene = random_scene(0)
-    expected, means = scene.after(3, threads=1), torch.rand(9_000, 3, generator=torch.manual_seed(0))
+    expected, means = scene.after(threads=1), torch.rand(9_000, 3, generator=torch.manual_seed(0))
 
     def assert_same(**options) -> None:
-        assert all(np.array_equal(a, b) for a, b in zip(expected, scene.after(3, **options), strict=True))
+        assert all(np.array_equal(a, b) for a, b in zip(expected, scene.after(**options), strict=True))
 
     assert_same(threads=5)
     assert_same(threads=2, means=means)
@@ -151,8 +148,7 @@ def test_neither_threads_nor_files_nor_order_change_a_bit_and_the_first_weights_
     assert_same(threads=2)
     W = scene.stacked()
     before = W.weight.clone()
-    assert (reweighting_factors(W, codebook_of(scene.books), 0).factors == 1).all()
-    reweighting_factors(W, codebook_of(scene.books), 2)
+    reweighting_factors(W, codebook_of(scene.books))
     assert torch.equal(W.weight, before)
 
 
@@ -168,14 +164,14 @@ def test_principal_directions_have_the_cosines_of_all_channels(channels: int) ->
     np.testing.assert_allclose((principal @ principal.T).numpy(), e @ e.T, atol=2e-6)
 
 
-@pytest.mark.parametrize(("views", "steps"), [(2, 1), (4, 2), (7, 3)])
-def test_steps_that_change_much_equal_their_definition_to_the_last_digits(views, steps):
+@pytest.mark.parametrize("views", [2, 4, 7])
+def test_a_step_that_changes_much_equals_its_definition_to_the_last_digits(views):
     scene = random_scene(views, count=20, views=views, channels=33)
     scene.books[0][0] = 0
     scene.books[1] = scene.books[1].half()
     scene.weights[1][3] = 0
     D, largest_change = scene.denominators[:, None], 0.0
-    for actual, real, first in zip(scene.after(steps), defined(scene, steps), scene.weights, strict=True):
+    for actual, real, first in zip(scene.after(), defined(scene), scene.weights, strict=True):
         np.testing.assert_allclose(over(actual, D), over(real, D), atol=1e-5)
         largest_change = max(largest_change, np.abs(over(real - first, D)).max())
     assert largest_change > 0.05
@@ -183,10 +179,10 @@ def test_steps_that_change_much_equal_their_definition_to_the_last_digits(views,
 
 def test_slices_of_channels_are_compared_as_one_vector(monkeypatch):
     scene = random_scene(3, count=500)
-    matrix = scene.after(2)
+    matrix = scene.after()
     for module in ("codebook", "directions"):
         monkeypatch.setattr(f"liftcore.solve.{module}.TABLE_BYTES", 1)
-    for sliced, expected in zip(scene.after(2), matrix, strict=True):
+    for sliced, expected in zip(scene.after(), matrix, strict=True):
         np.testing.assert_allclose(sliced, expected, rtol=1e-4, atol=1e-5)
 
 
@@ -197,7 +193,7 @@ def test_splats_of_few_and_of_many_views_in_one_group_equal_the_definition():
     entry_counts = np.sum([(view > 0).sum(axis=1) for view in scene.weights], axis=0)
     assert entry_counts.min() < LONG < entry_counts.max() <= MOST_COMPARED
     D = np.maximum(scene.denominators[:, None], 1e-30)
-    for actual, real in zip(scene.after(1), defined(scene, 1), strict=True):
+    for actual, real in zip(scene.after(), defined(scene), strict=True):
         np.testing.assert_allclose(actual / D, real / D, atol=1e-6)
 
 
@@ -209,7 +205,7 @@ def test_splats_of_many_views_and_of_many_regions_equal_the_definition():
     scene.weights.append(rng.random((3, 2 * MOST_COMPARED + 30)).astype(np.float32))
     scene.books.append(torch.tensor(rng.normal(0, 1, (2 * MOST_COMPARED + 30, 150)), dtype=torch.float32))
     D = scene.denominators[:, None]
-    for actual, real in zip(scene.after(1), defined(scene, 1), strict=True):
+    for actual, real in zip(scene.after(), defined(scene), strict=True):
         np.testing.assert_allclose(actual / D, real / D, atol=1e-6)
 
 
@@ -220,7 +216,7 @@ def test_a_step_over_very_many_terms_keeps_its_digits(rows, channels):
     books = rng.uniform(-1, 2, (2, rows, 1)) * direction + rng.normal(0, 1, (2, rows, channels))
     weights = rng.uniform(0.001, 1, (2, 1, rows)).astype(np.float32)
     scene = Scene([*weights], [torch.tensor(book, dtype=torch.float32) for book in books])
-    got, exact = np.concatenate(scene.after(1)), np.concatenate(defined(scene, 1))
+    got, exact = np.concatenate(scene.after()), np.concatenate(defined(scene))
     assert np.abs(got - exact).max() < 1e-6 * exact.max()
 
 
@@ -244,7 +240,7 @@ def shares(weights: list[np.ndarray], splat: int) -> np.ndarray:
 def test_one_wrong_view_loses_its_weight_to_the_others():
     scene = two_objects()
     scene.weights[3][:5] = scene.weights[3][:5, ::-1].copy()
-    before, after = shares(scene.weights, 0), shares(scene.after(1), 0)
+    before, after = shares(scene.weights, 0), shares(scene.after(), 0)
     assert after[3] < 0.2 * before[3]
     is_other = np.arange(8) != 3
     assert np.allclose(after[is_other] / after[is_other].sum(), before[is_other] / before[is_other].sum(), atol=0.01)
@@ -255,32 +251,29 @@ def test_a_view_that_holds_most_of_the_weight_is_not_outvoted():
     scene.weights[0][0] *= 20
     for view in scene.weights[1:]:
         view[0] = view[0, ::-1].copy()
-    assert shares(scene.after(1), 0)[0] > shares(scene.weights, 0)[0] > 0.8
+    assert shares(scene.after(), 0)[0] > shares(scene.weights, 0)[0] > 0.8
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0])
 def test_nothing_changes_where_no_vector_has_a_direction(value):
     scene = random_scene(2, count=50)
     constant = Scene(scene.weights, [torch.full_like(book, value) for book in scene.books])
-    assert all(np.array_equal(a, b) for a, b in zip(constant.after(2), scene.weights, strict=True))
+    assert all(np.array_equal(a, b) for a, b in zip(constant.after(), scene.weights, strict=True))
 
 
-def test_the_default_leaves_cells_of_grids_as_a_robust_step_weighs_them(tmp_path):
+def test_cells_of_grids_have_no_reliability(tmp_path):
     paths = write_scene(tmp_path, 9, grids=True)
-    step = {"preset": "row-sum", "robust_steps": 1}
-    cases = ({"preset": "default"}, step, {**step, "reliability": True})
-    default, robust, relied = (
-        lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(**options)) for options in cases
-    )
-    assert torch.equal(default.features, robust.features)
-    assert not torch.equal(default.features, relied.features)
+    default = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of())
+    assert default.confidence is not None
+    assert "reliability_median" not in default.diagnostics["reweighting"]
+    assert default.diagnostics["reweighting"]["masks"] == 0
 
 
 def test_a_robust_lift_keeps_what_is_seen_and_how_much(tmp_path):
     paths = write_scene(tmp_path, 9)
     baseline, robust = (
-        lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(robust_steps=steps, dtype="float32"))
-        for steps in (0, 1)
+        lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(robust=robust, dtype="float32"))
+        for robust in (False, True)
     )
     assert torch.equal(baseline.has_feature, robust.has_feature)
     assert torch.equal(baseline.total_weight, robust.total_weight)

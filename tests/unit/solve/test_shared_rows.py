@@ -67,7 +67,7 @@ def test_sums_equal_float64_ones_and_those_of_each_row_alone_to_the_bit(width, s
 def compare(rows: np.ndarray, dense: np.ndarray, table: torch.Tensor) -> np.ndarray:
     """Products and squares of all entries, [2, nnz]."""
     indptr, region, weight = sparse(dense)
-    W, result = [indptr, region, weight, np.zeros(0, np.float32), VIEW, LEVEL], np.zeros((2, weight.size), np.float32)
+    W, result = [indptr, region, weight, VIEW, LEVEL], np.zeros((2, weight.size), np.float32)
     compare_rows(rows, W, flat_table(table), table.shape[1], result[0], result[1])
     return result
 
