@@ -87,8 +87,8 @@ class LiftSteps(Protocol[Weights]):
         """Solve for X [P, F] in closed form."""
         ...
 
-    def solve_least_squares(self, W: Weights, X: Tensor, visible: np.ndarray) -> tuple[Tensor, dict[str, Any]]:
-        """Refine X of the ``visible`` [P] bool splats by the settings' least squares; return its facts too."""
+    def compare_with_optimum(self, W: Weights, X: Tensor, visible: np.ndarray) -> dict[str, Any]:
+        """Compare X of the ``visible`` [P] bool splats with the least-squares optimum."""
         ...
 
     def smooth(self, W: Weights, X: Tensor, support: SplatSupport) -> tuple[Tensor, dict[str, Any]]:

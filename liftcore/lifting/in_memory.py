@@ -14,7 +14,7 @@ from torch import Tensor
 
 from liftcore.lifting.base import LiftSteps, SplatSupport, WeightStatistics
 from liftcore.lifting.checkpoint import Checkpoint
-from liftcore.lifting.geometry import Geometry, as_read, weigh_views
+from liftcore.lifting.geometry import Geometry, as_read, strided, weigh_views
 from liftcore.lifting.planning.contradictions import contradictions, probe_views
 from liftcore.lifting.planning.plan import TIMED_VIEWS, Plan, plan_lift
 from liftcore.query.result import LiftResult
@@ -22,6 +22,8 @@ from liftcore.raster import open_raster
 from liftcore.raster.base import Raster
 from liftcore.runtime.device import Device
 from liftcore.runtime.progress import Timings
+from liftcore.scene.cameras import Camera
+from liftcore.scene.compositing import CompositingParams
 from liftcore.scene.neighbours import SplatGraph
 from liftcore.scene.splats import Splats
 from liftcore.solve.aggregate import Aggregation, aggregate
@@ -29,9 +31,9 @@ from liftcore.solve.closed_form import solve
 from liftcore.solve.consensus import mask_consensus
 from liftcore.solve.diagnostics import ViewMeasures, measure_samples
 from liftcore.solve.directions import region_totals
-from liftcore.solve.least_squares import AllRays, reference, refine
 from liftcore.solve.membership import Memberships, RegionGroups, memberships
 from liftcore.solve.objects import NodeVectors, RegionObjects, region_objects
+from liftcore.solve.optimum import compare_with_optimum
 from liftcore.solve.reweight import Reweighting, mask_regions, reweighting_factors, scale_weights
 from liftcore.solve.smooth import smooth
 from liftcore.solve.sums import sum_pieces
@@ -149,22 +151,18 @@ class InMemory(LiftSteps[SceneWeights]):
             W.row_sums(), W.geometry.total_weight(), solution.view_consistency, confidence
         )
 
-    def solve_least_squares(self, W: SceneWeights, X: Tensor, visible: np.ndarray) -> tuple[Tensor, dict[str, Any]]:
-        settings, progress, books, facts = self.settings, self.timings.progress, W.geometry.books, dict[str, Any]()
-        views = W.views
+    def compare_with_optimum(self, W: SceneWeights, X: Tensor, visible: np.ndarray) -> dict[str, Any]:
+        settings, geometry = self.settings, W.geometry
 
-        def observed(number: int) -> ViewFeatures:
-            return as_read(views[number][1], settings, views.names[number])
+        def read(number: int) -> tuple[Camera, ViewFeatures, CompositingParams]:
+            camera, features = W.views[number]
+            params = strided(settings.lift_params, settings, camera, number)
+            return camera, as_read(features, settings, camera.name), params
 
-        rays = AllRays(W.raster, self.splats.count, views.lifted, observed, settings.lift_params, progress)
-        if settings.cg_steps:
-            with self.timings.stage("refine"):
-                refinement = refine(rays, X, visible, books, settings, progress)
-            X, facts["refinement"] = refinement.features, refinement.stats
-        if settings.reference_channels:
-            with self.timings.stage("reference"):
-                facts["reference"] = reference(rays, X, visible, W.geometry.samples, books, settings, progress)
-        return X, facts
+        views = map(read, range(len(W.views)))
+        return compare_with_optimum(
+            W.raster, views, X, visible, geometry.samples, geometry.books, settings, self.timings.progress
+        )
 
     def smooth(self, W: SceneWeights, X: Tensor, support: SplatSupport) -> tuple[Tensor, dict[str, Any]]:
         graph, visible = SplatGraph.of(self.splats, self.threads), torch.from_numpy(support.sums > 0)

@@ -163,7 +163,7 @@ def region_weights(
     Returns:
         W on the CPU, a row a splat: in memory, or in mapped files if it is large. With E the views' codebooks,
         ``W E`` over the sums of rows of W are features: with ``reweight`` those of `lift` with the same settings,
-        before least squares (``cg_steps``) and aggregation; without it those of ``row-sum``.
+        before smoothing and aggregation; without it those of ``row-sum``.
 
     Raises:
         InvalidFeatures, InvalidSettings, Unavailable: as in `lift`.

@@ -138,10 +138,9 @@ def _run(
     with timings.stage("solve"):
         X, support = steps.solve(W)
     facts = dict[str, Any]()
-    if settings.cg_steps or settings.reference_channels:
-        with timings.stage("rays"):
-            X, least_squares = steps.solve_least_squares(W, X, support.sums > 0)
-        facts |= least_squares
+    if settings.reference_channels:
+        with timings.stage("reference"):
+            facts["reference"] = steps.compare_with_optimum(W, X, support.sums > 0)
     if settings.smoothness:
         with timings.stage("smooth"):
             X, facts["smoothing"] = steps.smooth(W, X, support)

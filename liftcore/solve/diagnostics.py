@@ -10,7 +10,7 @@ With a stride, rays are sampled among those of the lift; B is read at the lift's
 ``L <= J`` (Jensen) where rows sum to one; a ray that hits no splat has ``L = ||B||^2`` and ``J = 0``.
 Here ``a_ij = A_ij / sum_j A_ij``; a ray that hits no splat has no beta. A ray has a row i for each labelled level.
 The paper defines beta at the optimum x^; here it is measured at the result x', so ``1 + beta`` is an indicator and
-not a bound. `least_squares.reference` computes x^ and the beta of the theorem.
+not a bound. `liftcore.solve.optimum` computes x^ and the beta of the theorem.
 """
 
 import math

@@ -41,9 +41,6 @@ class LiftOptions(TypedDict, total=False):
     diagnostic_rays: int
     seed: int
     smoothness: float
-    cg_steps: int
-    damping: float
-    cg_basis: int
     reference_channels: int
     kernel: Literal["auto", "3dgs", "2dgs", "dbs"]
     device: str | torch.device

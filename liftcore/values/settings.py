@@ -112,8 +112,7 @@ GROUPS = {  # of the settings, for people who read all of them
     "wrong masks": ("robust", "robust_directions"),
     "objects and clusters": ("objects", "aggregation", "aggregation_iou", "aggregation_cluster_size"),
     "neighbours": ("smoothness",),
-    "least squares": ("cg_steps", "damping", "cg_basis", "reference_channels"),
-    "the result, and where it is made": ("dtype", "diagnostic_rays", "seed", "device"),
+    "the result, and where it is made": ("dtype", "diagnostic_rays", "reference_channels", "seed", "device"),
 }  # fmt: skip
 
 
@@ -243,32 +242,12 @@ class LiftSettings(PlainModel):
         "`splatlift tradeoff` tries it on held-out views. "
         "It runs on the CPU, also with `device=cuda`. Refused with an `engine`",
     )
-    cg_steps: int = Field(
-        0,
-        ge=0,
-        le=10_000,
-        description="conjugate gradient steps at most, from the closed form towards the smallest `|A x - b|^2`. "
-        "Each step renders all views, forth and back, for every 32 channels",
-    )
-    damping: float = Field(
-        1.0,
-        ge=0,
-        le=1e6,
-        description="how strongly these steps are held at the closed form; 0 is plain least squares, which "
-        "believes wrong masks",
-    )
-    cg_basis: int = Field(
-        0,
-        ge=0,
-        le=65_536,
-        description="refine this many principal directions of the features only; 0 refines all channels",
-    )
     reference_channels: int = Field(
         0,
         ge=0,
         le=1_024,
         description="compare the lift with the least-squares optimum in the diagnostics, in this many random "
-        "projections of the channels: up to 100 conjugate gradient steps for every 32",
+        "projections of the channels: 12 bytes of memory for each splat on a ray. Refused with an `engine`",
     )
     kernel: Literal["auto", "3dgs", "2dgs", "dbs"] = Field(
         "auto",
@@ -360,15 +339,15 @@ class LiftSettings(PlainModel):
         """Refuse what no engine can work on in blocks of views and splats.
 
         Raises:
-            InvalidSettings: least squares, smoothness, or an aggregation.
+            InvalidSettings: the optimum, smoothness, or an aggregation.
         """
-        whole = ("cg_steps", "reference_channels", "smoothness", "aggregation")
+        whole = ("reference_channels", "smoothness", "aggregation")
         requested = {name: getattr(self, name) for name in whole if getattr(self, name)}
         if requested:
             changes = (f"{name}={'false' if value is True else 0}" for name, value in requested.items())
             raise InvalidSettings(
                 "engine",
-                expected="settings that work on blocks of splats: least squares need all rays, smoothness and "
+                expected="settings that work on blocks of splats: the optimum needs all rays, smoothness and "
                 "clusters all features in one place",
                 got=", ".join(f"{name}={value}" for name, value in requested.items()),
                 hint=f"set {' and '.join(changes)}; or lift without an engine",

@@ -211,7 +211,7 @@ AWAY = "away"  # the view that looks where nothing is
 CLOUD = 30  # splats
 SUM = 2e-6  # of the longest value, for what is stored in float32
 ALL_STEPS = {"preset": "default", "aggregation": True, "aggregation_cluster_size": 3}
-ALL_STEPS |= {"cg_steps": 3, "damping": 0.0, "reference_channels": 2}
+ALL_STEPS |= {"reference_channels": 2}
 
 
 def lift_of(

@@ -330,7 +330,7 @@ def test_torch_modes_change_no_bit_and_hold_in_the_callers_iterator(scene, mode)
         return *modes, torch.get_default_dtype(), torch.get_default_device()
 
     def tensors_of(sources):
-        result = lc.lift(splats, cameras, sources, cg_steps=1, reference_channels=2)
+        result = lc.lift(splats, cameras, sources, reference_channels=2)
         assert lc.plan(splats, cameras, views).views == result.views
         answer = result.query(vectors, splats=splats)
         W, image = lc.region_weights(splats, cameras, views), lc.render(splats, cameras["v0"], values)

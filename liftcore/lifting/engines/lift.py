@@ -328,9 +328,9 @@ class InBlocks(LiftSteps[Job]):
         support = SplatSupport(sums, torch.from_numpy(total_weight), torch.from_numpy(view_consistency), confidence)
         return _mapped(job, job.features_file), support
 
-    def solve_least_squares(self, W: Job, X: Tensor, visible: np.ndarray) -> NoReturn:
+    def compare_with_optimum(self, W: Job, X: Tensor, visible: np.ndarray) -> NoReturn:
         """See the protocol; `LiftSettings.check_blocks` rejects settings that need it."""
-        raise AssertionError("least squares need all rays in one place")
+        raise AssertionError("the optimum needs all rays in one place")
 
     def smooth(self, W: Job, X: Tensor, support: SplatSupport) -> NoReturn:
         """See the protocol; `LiftSettings.check_blocks` rejects settings that need it."""

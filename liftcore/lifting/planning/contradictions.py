@@ -35,7 +35,7 @@ from liftcore.raster.base import Raster
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import silent
 from liftcore.scene.cameras import Cameras
-from liftcore.solve.least_squares import random_axes
+from liftcore.solve.optimum import random_axes
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.settings import LiftSettings
 

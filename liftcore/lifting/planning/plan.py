@@ -63,7 +63,7 @@ REWEIGHT_BYTES = 12  # of an entry: factors, and the products and squares behind
 CONSENSUS_BYTES = 10  # of an entry: its share, the count of views, its membership; the tuple of its view
 BLOCK_BYTES = 9  # of an entry that lies by region
 OBJECT_BYTES = 12  # of an entry: the membership of its splat, the node, its place in the node's list
-CG_VECTORS, CG_CHANNELS = 14, 32  # [P, 32] f32 of conjugate gradients, with the images of a view
+HIT_BYTES = 24  # of a splat on a ray, in the matrix of the least-squares optimum and what it is joined from
 CLUSTERING = 80_000_000  # of hdbscan and its dependencies
 SMOOTHING_BYTES = 2_100  # of a splat: the graph while it is built, or with a block of channels
 SPARE = 0.9  # of the free memory: 10 % are left to other processes
@@ -433,9 +433,9 @@ def memory_phases(
         if masks:
             factors += int(CONSENSUS_BYTES * of_all + BLOCK_BYTES * min(of_all, BLOCK_ENTRIES))
         phases["reweighting"] = weighed | {"reweighting": factors}
-    if settings.cg_steps or settings.reference_channels:
-        vectors = 4 * (splats.count * (CG_VECTORS * CG_CHANNELS) + 3 * largest * CG_CHANNELS)
-        phases["refinement"] = solved | {"refinement": vectors, "view": view}
+    if settings.reference_channels:
+        hits = float(visible.areas.sum(dtype=np.float64)) / visible.areas.shape[1] * visible.splats
+        phases["reference"] = solved | {"reference": int(HIT_BYTES * hits / settings.stride**2), "view": view}
     if settings.smoothness:
         phases["smoothing"] = solved | {"smoothing": SMOOTHING_BYTES * splats.count}
     if settings.aggregation:

@@ -52,7 +52,7 @@ from liftcore.scene.cameras import Camera
 from liftcore.scene.compositing import CompositingParams
 from liftcore.scene.splats import Splats
 from liftcore.solve.closed_form import bag_sums
-from liftcore.solve.least_squares import random_axes
+from liftcore.solve.optimum import random_axes
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.region_weights import RegionWeights, segment_sums
 from liftcore.values.settings import LiftSettings

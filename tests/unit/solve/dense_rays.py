@@ -1,4 +1,4 @@
-"""A and B of a small scene as dense float64 matrices, with the raster's own weights: the least squares' oracle."""
+"""A and B of a small scene as dense float64 matrices, with the raster's own weights: the optimum's oracle."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import reading_matrix
 from liftcore.scene.cameras import Camera
 from liftcore.scene.compositing import CompositingParams
-from liftcore.solve.least_squares import AllRays
 from liftcore.values.views import ViewFeatures
 from tests.scenes import random_camera, random_grid, random_regions, random_splats
 
@@ -27,7 +26,7 @@ def dense_view(raster: CpuRaster, camera: Camera, params: CompositingParams) -> 
 
 
 class SmallScene:
-    """Three views of a random scene: the operator, and A [rows, P] and B [rows, F] of the same rays."""
+    """Three views of a random scene: A [rows, P] and B [rows, F] of the same rays."""
 
     def __init__(self, seed: int, grids: bool = False, observations: Sequence[ViewFeatures] | None = None) -> None:
         self.params, self.splats = CompositingParams(), random_splats(seed, 25)
@@ -46,16 +45,6 @@ class SmallScene:
     def _rows(self, view: Camera, observation: ViewFeatures) -> tuple[np.ndarray, np.ndarray]:
         S, ray = reading_matrix(observation, view.width, view.height)
         return dense_view(self.raster, view, self.params)[ray], S @ observation.codebook.double().numpy()
-
-    def rays(self, threads: int = 2) -> AllRays:
-        raster = CpuRaster(self.splats, threads)
-        return AllRays(raster, self.splats.count, self.views, self.observations.__getitem__, self.params)
-
-    def damped(self, damping: float) -> np.ndarray:
-        """X [P, F] f64 of the damped normal equations, by a dense solver; where singular, the shortest step."""
-        X0 = self.closed_form.double().numpy()
-        K = self.A.T @ self.A + damping * np.diag(self.row_sums)
-        return X0 + np.linalg.lstsq(K, self.A.T @ (self.B - self.A @ X0), rcond=1e-12)[0]
 
     def loss(self, X: np.ndarray | torch.Tensor) -> float:
         """``|A X - B|^2``."""

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from liftcore.lifting.files import lift_files
 from liftcore.runtime.progress import silent
 from liftcore.solve.diagnostics import ViewMeasures, measure_rows, quantiles
-from liftcore.solve.least_squares import reference, row_betas
+from liftcore.solve.optimum import compare_with_optimum, row_betas
 from liftcore.solve.rays import SampledRays, read_pixels, sample_pixels
 from liftcore.values.settings import LiftSettings
 from tests.scenes import write_scene
@@ -29,7 +29,10 @@ def reference_facts(scene: SmallScene, features: torch.Tensor, **overrides: int)
             SampledRays(scene.raster.ray_rows(view, pixels, scene.params), read_pixels(observation, view, pixels))
         )
     knobs = LiftSettings.of(**{"reference_channels": 6, **overrides})
-    return reference(scene.rays(), features, scene.has_weight, samples, scene.codebooks, knobs, silent)
+    views = [(view, observed, scene.params) for view, observed in zip(scene.views, scene.observations, strict=True)]
+    return compare_with_optimum(
+        scene.raster, views, features, scene.has_weight, samples, scene.codebooks, knobs, silent
+    )
 
 
 def measures_of(A: np.ndarray, X: np.ndarray, B: np.ndarray) -> ViewMeasures:
