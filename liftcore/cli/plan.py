@@ -12,11 +12,6 @@ from liftcore.cli.reply import reply
 if TYPE_CHECKING:
     from liftcore import LiftSettings
 
-SMOOTHNESS_NOTE = (
-    "smoothness does not change these shares: splats that no photo shows get the features of their neighbours, and "
-    "still count as unseen"
-)
-
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
@@ -55,8 +50,5 @@ def _photos(options: argparse.Namespace, settings: LiftSettings) -> int:
 
     splats = read_splats(options.splats, settings.kernel, colour=False)
     plan = plan_photos(splats, read_cameras(options.cameras), settings, threads=options.threads, progress=True)
-    lines = [*plan.lines(verbose=options.verbose)]
-    if settings.smoothness:
-        lines.append(SMOOTHNESS_NOTE)
-    reply(plan.facts(), as_json=options.json, lines=lines)
+    reply(plan.facts(), as_json=options.json, lines=plan.lines(verbose=options.verbose))
     return 0

@@ -95,7 +95,7 @@ def smoothing_line(facts: Mapping[str, Any]) -> str:
     neighbourhood = "position and colour" if facts["colours"] else "position only, as the splats have no colours"
     return (
         f"smoothness {facts['smoothness']:g}: features moved {shift} towards their neighbours' in "
-        f"{neighbourhood}; {facts['filled']} splats without weight took their neighbours' "
+        f"{neighbourhood} "
         f"({facts['steps']} steps, {facts['residual']:.1g} of the gradient remaining)"
     )
 

@@ -15,8 +15,7 @@ and with alpha and beta given it is one pass over the graph, by blocks of channe
 Every sum has a fixed order: the result is bitwise identical for any number of threads. The solution is a mean of X0's
 rows, so each channel stays in the range of X0; the result is clipped to it.
 
-A splat without total weight has no data term. It takes the limit of the solution for w_j to zero, the mean of its
-neighbours by ``a_jk sqrt(w_k)``; splats further from any total weight take the mean of these, ring by ring.
+A splat without total weight keeps its row of zeros: it has no feature, and no question reads one.
 """
 
 from __future__ import annotations
@@ -95,22 +94,18 @@ def smooth(
         X: [P, F] f16 or f32 on the CPU, changed in place.
         graph: of the P lifted splats.
         total_weight: [P] f32, sums of unscaled weights. confidence: [P] f32; None: one everywhere.
-        solved: [P] bool, the splats with a row of X from the solve; the others take their neighbours' features.
+        solved: [P] bool, the splats with a row of X from the solve; the others keep theirs.
         smoothness: lambda; zero does not change X.
         threads: None uses the cores that this process may use. The result is bitwise identical for any number.
 
     Returns:
         X, and its facts for the diagnostics: ``smoothness``, the ``steps``, the ``residual`` (the preconditioned
         gradient's length over that at X0, of the probes), ``moved`` (the root of
-        ``sum_j w_j |x_j - x0_j|^2 / sum_j w_j |x0_j|^2``), ``filled``, the number of splats without total weight that
-        took a feature, and ``colours``, True if the graph uses colours.
+        ``sum_j w_j |x_j - x0_j|^2 / sum_j w_j |x0_j|^2``), and ``colours``, True if the graph uses colours.
     """
     weights = smoothing_weights(torch.where(solved, total_weight, 0.0), confidence)[graph.order]
-    rings = _rings(graph, weights) if smoothness else []
     system = _System.of(graph, weights, smoothness)
-    has_weight, has_feature = weights > 0, weights > 0
-    for rows, _ in rings:
-        has_feature[rows] = True
+    has_weight = weights > 0
     count, channels = X.shape
     squares, steps, residual = np.zeros((2, channels)), list[Step](), 0.0
     with ThreadPoolExecutor(threads or cores()) as pool:
@@ -137,8 +132,6 @@ def smooth(
                 solution = _descend(system, values, iterates, steps, pool)
                 arguments = system.weights, values, low, high, solution
                 squares[:, begin : begin + width] = _row_sums(clip_rows, arguments, (2, width), count, pool)
-                for rows, shares in rings:
-                    solution[rows] = shares @ solution
 
                 def write(
                     rows: slice, begin: int = begin, width: int = width, solution: np.ndarray = solution
@@ -146,7 +139,7 @@ def smooth(
                     """Copy rows back to X."""
                     staged[rows, :width].copy_(torch.from_numpy(solution[rows, :width]))
                     first_word = begin // BLOCK * target.shape[1]
-                    put_rows(rows.start, rows.stop, graph.order, has_feature, target, first_word, source)
+                    put_rows(rows.start, rows.stop, graph.order, has_weight, target, first_word, source)
 
                 _map_rows(write, count, pool)
                 progress("smooth", begin + width, channels, "channels")
@@ -156,7 +149,6 @@ def smooth(
         "steps": len(steps),
         "residual": residual,
         "moved": float(np.sqrt(change / norm)) if norm > 0 and np.isfinite(norm) else None,
-        "filled": sum(len(rows) for rows, _ in rings),
         "colours": graph.coloured,
     }
     if residual > system.tolerance:
@@ -184,39 +176,6 @@ def smoothing_weights(total_weight: Tensor, confidence: Tensor | None) -> np.nda
     largest = float(values.max(initial=0.0))
     values = values / largest if largest > 0 else values
     return np.where(values >= LEAST_WEIGHT, values, 0.0)
-
-
-def _rings(graph: SplatGraph, weights: np.ndarray) -> list[tuple[np.ndarray, Any]]:
-    """Return the rows without total weight, ring by ring from those with total weight, and their shares of rows with
-    a feature.
-
-    Args:
-        weights: [P] f64, in the graph's order.
-
-    Returns:
-        For each ring its rows [n] and shares [n, P], sparse f32, whose rows sum to one.
-    """
-    from scipy.sparse import csr_array
-
-    count, remaining = len(weights), np.flatnonzero(weights == 0)
-    if not 0 < remaining.size < count:
-        return []
-    affinities = csr_array((graph.affinities, graph.neighbours, graph.starts), shape=(count, count))[remaining]
-    roots, rings = np.sqrt(weights), list[tuple[np.ndarray, Any]]()
-    while remaining.size:
-        shares = csr_array(affinities.multiply(roots[None]))
-        shares.eliminate_zeros()
-        sums = np.asarray(shares.sum(axis=1), np.float64)
-        ring = np.flatnonzero(sums > 0)
-        if not ring.size:
-            break
-        shares = csr_array(shares[ring].multiply(1.0 / sums[ring][:, None])).astype(np.float32)
-        rings.append((remaining[ring], shares))
-        roots = np.zeros_like(roots)  # the next ring has neighbours in this ring only
-        roots[remaining[ring]] = 1.0
-        rest = np.delete(np.arange(remaining.size), ring)
-        remaining, affinities = remaining[rest], affinities[rest]
-    return rings
 
 
 def _probe(X: Tensor, order: np.ndarray, mask: np.ndarray, pool: Executor) -> np.ndarray:
@@ -374,10 +333,10 @@ def take_rows(first, last, order, source, begin, target):
 
 
 @kernel
-def put_rows(first, last, order, has_feature, source, begin, target):
-    """Copy rows first..last of a block that have a feature back to X, inverse to `take_rows`."""
+def put_rows(first, last, order, has_weight, source, begin, target):
+    """Copy rows first..last of a block that have weight back to X, inverse to `take_rows`."""
     for j in range(first, last):
-        if has_feature[j]:
+        if has_weight[j]:
             row = order[j]
             for word in range(min(source.shape[1], target.shape[1] - begin)):
                 target[row, begin + word] = source[j, word]

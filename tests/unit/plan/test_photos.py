@@ -71,19 +71,6 @@ def test_command_without_features_tells_what_to_encode_first(tmp_path, capsys):
     assert f"encode first: {', '.join(plan.order)}" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("smoothness", ["0", "4"])
-def test_smoothness_changes_no_share_and_the_plan_says_so(smoothness, tmp_path, capsys):
-    paths = write_scene(tmp_path, 2)
-    plan = lc.plan_photos(lc.read_splats(paths[0]), lc.read_cameras(paths[1]))
-    arguments = ["plan", *map(str, paths[:2]), "--set", f"smoothness={smoothness}"]
-    assert cli.main([*arguments, "--json"]) == 0
-    reply = json.loads(capsys.readouterr().out)
-    assert reply["order"] == list(plan.order)
-    assert [row["twice"] for row in reply["coverage"]] == pytest.approx([row.twice for row in plan.coverage])
-    assert cli.main(arguments) == 0
-    assert ("smoothness does not change these shares" in capsys.readouterr().out) == (smoothness != "0")
-
-
 def test_splats_that_no_photo_sees_give_a_warning():
     splats = random_splats(3, 60)
     far = replace(splats, means=splats.means + torch.tensor([0.0, 0.0, 1e4]))
