@@ -23,7 +23,7 @@ from liftcore.values.levels import at_levels, region_levels
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.region_weights import MEMORY_LIMIT, RegionWeights, stacked
 from liftcore.values.settings import LiftSettings
-from liftcore.values.views import FeatureGrid, Regions, ViewFeatures
+from liftcore.values.views import Regions
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def weight_request(views: LiftViews, number: int, settings: LiftSettings, by_row
         by_rows: True if each region must be a row of a codebook, False if it may be a tuple of labels (`as_regions`).
     """
     camera, features = views[number]
-    observation = as_read(features, settings, camera.name)
+    observation = at_levels(features, settings.levels, camera.name)
     params = strided(settings.lift_params, settings, camera, number)
     pixels = sample_pixels(camera, -(-settings.diagnostic_rays // len(views)), (settings.seed, number), params)
     regions, codebook = as_regions(observation, by_rows)
@@ -160,17 +160,3 @@ def strided(params: CompositingParams, settings: LiftSettings, camera: Camera, n
     rng = np.random.default_rng((settings.seed, number, settings.stride))
     left, top = (int(rng.integers(min(settings.stride, side))) for side in (camera.width, camera.height))
     return replace(params, stride=settings.stride, offset=(left, top))
-
-
-def as_read(observation: ViewFeatures, settings: LiftSettings, view: str) -> ViewFeatures:
-    """Return the observation as the settings read it: its levels, and with ``nearest`` a grid as one region a cell.
-
-    Raises:
-        InvalidFeatures: the view lacks the level of the settings.
-    """
-    observation = at_levels(observation, settings.levels, view)
-    if not isinstance(observation, FeatureGrid) or settings.grid_reading == "bilinear":
-        return observation
-    rows, columns = observation.grid.shape[:2]
-    cells = torch.arange(rows * columns, dtype=torch.int32).reshape(1, rows, columns)
-    return Regions.unchecked(cells, observation.codebook)

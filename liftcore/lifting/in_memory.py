@@ -14,7 +14,7 @@ from torch import Tensor
 
 from liftcore.lifting.base import LiftSteps, SplatSupport, WeightStatistics
 from liftcore.lifting.checkpoint import Checkpoint
-from liftcore.lifting.geometry import Geometry, as_read, strided, weigh_views
+from liftcore.lifting.geometry import Geometry, strided, weigh_views
 from liftcore.lifting.planning.contradictions import contradictions, probe_views
 from liftcore.lifting.planning.plan import TIMED_VIEWS, Plan, plan_lift
 from liftcore.query.result import LiftResult
@@ -37,6 +37,7 @@ from liftcore.solve.optimum import compare_with_optimum
 from liftcore.solve.reweight import Reweighting, mask_regions, reweighting_factors, scale_weights
 from liftcore.solve.smooth import smooth
 from liftcore.solve.sums import sum_pieces
+from liftcore.values.levels import at_levels
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import LiftSettings
@@ -157,7 +158,7 @@ class InMemory(LiftSteps[SceneWeights]):
         def read(number: int) -> tuple[Camera, ViewFeatures, CompositingParams]:
             camera, features = W.views[number]
             params = strided(settings.lift_params, settings, camera, number)
-            return camera, as_read(features, settings, camera.name), params
+            return camera, at_levels(features, settings.levels, camera.name), params
 
         views = map(read, range(len(W.views)))
         return compare_with_optimum(

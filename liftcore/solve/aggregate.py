@@ -24,7 +24,7 @@ from liftcore.solve.clusters import BLOCK, NO_CLUSTER, Clustering, cluster_splat
 from liftcore.values.levels import at_levels
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.settings import LiftSettings
-from liftcore.values.views import Regions, ViewFeatures, cells_under
+from liftcore.values.views import Regions, cells_under
 
 LEAST_LIGHT = 0.5  # row sum from which a ray shows a cluster, as for masks of answers
 
@@ -112,7 +112,7 @@ def filter_regions(
     params = settings.render_params
     for number, name in enumerate(views.names):
         camera, features = views[number]
-        observation = masks_of(features, settings, name)
+        observation = at_levels(features, settings.levels, name)
         if isinstance(observation, Regions):
             kappa = raster.strongest_labels(camera, clustering.labels, params).numpy()
             kappa = np.where(raster.row_sums(camera, params).numpy() < LEAST_LIGHT, NO_CLUSTER, kappa)
@@ -123,14 +123,6 @@ def filter_regions(
             region_sums.regions += int(matches.present.sum())
         progress("aggregate", number + 1, len(views), "views")
     return region_sums
-
-
-def masks_of(observation: ViewFeatures, settings: LiftSettings, view: str) -> ViewFeatures:
-    """Return the masks to filter: those of one level if it was lifted alone, else all.
-
-    Composite regions are pieces of masks, which match no cluster's footprint.
-    """
-    return at_levels(observation, "rows" if settings.levels == "composite" else settings.levels, view)
 
 
 def kept_means(region_sums: KeptRegionSums, dtype: torch.dtype) -> Tensor:

@@ -29,8 +29,7 @@ class LiftOptions(TypedDict, total=False):
     view_stride: int
     coverage: int
     view_cosine: float
-    levels: Literal["rows", "composite"] | int
-    grid_reading: Literal["bilinear", "nearest"]
+    levels: Literal["rows"] | int
     robust: bool
     robust_directions: int
     objects: bool | Literal["auto"]

@@ -107,7 +107,7 @@ MOST_DIAGNOSTIC_RAYS = 1_000_000
 GROUPS = {  # of the settings, for people who read all of them
     "a choice of many": ("preset", "quality"),
     "weights of a ray that count": ("selection", "k", "mass", "weight_floor", "power"),
-    "pixels, views and levels": ("stride", "view_stride", "coverage", "view_cosine", "levels", "grid_reading"),
+    "pixels, views and levels": ("stride", "view_stride", "coverage", "view_cosine", "levels"),
     "the rasterizer": ("kernel", "antialiased", "lift_gain", "render_gain", "alpha_cap", "transmittance_stop"),
     "wrong masks": ("robust", "robust_directions"),
     "objects and clusters": ("objects", "aggregation", "aggregation_iou", "aggregation_cluster_size"),
@@ -180,13 +180,9 @@ class LiftSettings(PlainModel):
         description="choose the fewest views from which features are expected to have this mean cosine to those "
         "from all views (before reweighting); for 33 views and more. 0 takes all",
     )
-    levels: Literal["rows", "composite"] | Annotated[int, Field(strict=True, ge=0)] = Field(
+    levels: Literal["rows"] | Annotated[int, Field(strict=True, ge=0)] = Field(
         "rows",
-        description="levels of a region map: `rows` of their own, `composite` (one region for each distinct set "
-        "of labels, with the normalised sum of their embeddings), or the number of the one to take",
-    )
-    grid_reading: Literal["bilinear", "nearest"] = Field(
-        "bilinear", description="what a pixel reads of a feature grid: four cells by distance, or the `nearest` alone"
+        description="levels of a region map: `rows` are those of all, a number is the one to take",
     )
     robust: bool = Field(
         False,

@@ -56,7 +56,6 @@ def planned_and_measured(scene: Path, pack: Path, options: dict[str, Any]) -> tu
         ("features", {"view_stride": 6}, 9),
         ("features", {"view_stride": 6, "levels": 0}, 7),
         ("grids", {"view_stride": 6}, 4),
-        ("grids", {"view_stride": 6, "grid_reading": "nearest"}, 9),
         ("grids", {"view_stride": 6, "stride": 3}, 5),
     ],
 )
@@ -67,10 +66,9 @@ def test_plan_has_room_for_the_region_weights_there_will_be(shared_data, name, o
     assert measured < planned < limit * measured
 
 
-@pytest.mark.parametrize(("reading", "limit"), [("bilinear", 1.4), ("nearest", 2.5)])
-def test_fine_maps_are_planned_with_their_many_weights(shared_data, fine_maps, reading, limit):
-    planned, measured = planned_and_measured(shared_data / "tabletop", fine_maps, {"grid_reading": reading})
-    assert measured < planned < limit * measured
+def test_fine_maps_are_planned_with_their_many_weights(shared_data, fine_maps):
+    planned, measured = planned_and_measured(shared_data / "tabletop", fine_maps, {})
+    assert measured < planned < 1.4 * measured
 
 
 def test_plan_has_room_for_what_reweighting_holds(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:

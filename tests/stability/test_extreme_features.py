@@ -1,12 +1,10 @@
-"""Extremes of the solution that no table has: view consistency and readings."""
+"""Extremes of the solution that no table has: lengths."""
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 
-from liftcore.values.views import FeatureGrid, Regions
 from tests.benchmarks.extreme_measures import cloud, run
 from tests.benchmarks.extremes import checkerboard
 
@@ -37,19 +35,3 @@ def numbers(facts: object) -> list[float]:
     if not isinstance(facts, dict):
         return [facts] if isinstance(facts, float) else []
     return [n for name, part in facts.items() if name not in ("residual", "optimum") for n in numbers(part)]
-
-
-def without_plan(diagnostics: dict[str, object]) -> dict[str, object]:
-    return {key: value for key, value in diagnostics.items() if key != "plan"}
-
-
-@pytest.mark.parametrize("size", [(1, 1), (5, 7), (12, 16), (50, 70)])
-def test_the_nearest_reading_of_a_grid_takes_the_cell_under_the_pixel(size):
-    vectors = np.random.default_rng(1).uniform(size=(*size, 6))
-    grid = FeatureGrid(torch.tensor(vectors, dtype=torch.float32))
-    cells = Regions(torch.arange(size[0] * size[1], dtype=torch.int32).reshape(1, *size), grid.codebook)
-    got = lifted({"v0": grid}, preset="row-sum", grid_reading="nearest")
-    as_regions = lifted({"v0": cells}, preset="row-sum", objects=False)  # as cells of a grid make none
-    assert torch.equal(got.features, as_regions.features)
-    # The plan's memory is an upper bound of each reading.
-    assert without_plan(got.metadata.diagnostics) == without_plan(as_regions.metadata.diagnostics)

@@ -454,7 +454,7 @@ def _tiles(visible: Visibility) -> float:
 
 def _parts_a_tile(features: Views, view: str, settings: LiftSettings) -> int:
     if not features.is_regions(view):
-        return 4  # of bilinear reading; nearest reads fewer, but fine cells are smaller than a tile
+        return 4  # of bilinear reading
     return 1 if isinstance(settings.levels, int) else _levels(features, view)
 
 

@@ -1,4 +1,4 @@
-"""Combined levels, and maps of distorted photos resampled to a pinhole."""
+"""Single levels, and maps of distorted photos resampled to a pinhole."""
 
 from __future__ import annotations
 
@@ -11,73 +11,11 @@ import torch
 from liftcore.errors import InvalidFeatures
 from liftcore.scene.cameras import Camera, Cameras, behind_lens
 from liftcore.scene.distortion import Brown, Distortion, Fisheye
-from liftcore.values import levels
 from liftcore.values.lens import as_pinhole_sees
-from liftcore.values.levels import at_levels, composite
+from liftcore.values.levels import at_levels
 from liftcore.values.pack import pair, read_features, write_pack
-from liftcore.values.views import NO_LABEL, FeatureGrid, Regions
+from liftcore.values.views import FeatureGrid, Regions
 from tests.scenes import random_grid, random_regions
-
-
-def dense_sums(regions: Regions) -> np.ndarray:
-    """Return [h * w, F]: per pixel, the normalised sum of the embeddings of its labels, zero without any."""
-    labels, codebook = regions.labels.numpy(), regions.codebook.double().numpy()
-    _, rows, columns = labels.shape
-    dense = np.zeros((rows, columns, codebook.shape[1]))
-    for y in range(rows):
-        for x in range(columns):
-            for label in labels[:, y, x]:
-                if label != NO_LABEL:
-                    dense[y, x] += codebook[label]
-            length = np.linalg.norm(dense[y, x])
-            dense[y, x] /= length if length > 0 else 1
-    return dense.reshape(-1, codebook.shape[1])
-
-
-def read(regions: Regions) -> np.ndarray:
-    """Return [h * w, F]: the row that each pixel of a one-level map refers to, zero without a label."""
-    labels = regions.labels.long().flatten()
-    return np.where(labels[:, None] >= 0, regions.codebook.double().numpy()[labels], 0.0)
-
-
-@pytest.mark.parametrize("levels", [1, 2, 4])
-@pytest.mark.parametrize("seed", range(3))
-def test_composite_regions_are_normalised_sums_pixel_by_pixel(seed, levels):
-    regions = random_regions(seed, levels, rows=7)
-    merged = composite(regions, "v0")
-    assert merged.labels.shape == (1, *regions.labels.shape[1:])
-    assert np.abs(read(merged) - dense_sums(regions)).max() < 1e-6
-    tuples = {tuple(labels) for labels in regions.labels.flatten(1).T.tolist()} - {(NO_LABEL,) * levels}
-    assert merged.codebook.shape[0] == len(tuples)
-
-
-def test_many_levels_and_huge_or_tiny_embeddings_are_no_trouble():
-    labels = torch.randint(-1, 30_000, (8, 20, 20), dtype=torch.int32, generator=torch.Generator().manual_seed(0))
-    regions = Regions(labels, torch.nn.functional.normalize(torch.randn(30_000, 3), dim=1))
-    assert np.abs(read(composite(regions, "v0")) - dense_sums(regions)).max() < 1e-5
-    for dtype, size in ((torch.float16, 6e4), (torch.float32, 9e14), (torch.float32, 1e-38)):
-        codebook = torch.tensor([[size, 0.0], [size, size], [0.0, 0.0]]).to(dtype)
-        regions = Regions(torch.tensor([[[0, 2]], [[1, -1]]], dtype=torch.int32), codebook)
-        expected = np.array([[2, 1] / np.sqrt(5), [0, 0]])
-        assert np.abs(read(composite(regions, "v0")) - expected).max() < 1e-3
-    empty = Regions(torch.full((2, 3, 4), NO_LABEL, dtype=torch.int32), torch.ones(2, 5))
-    assert (composite(empty, "v0").labels == NO_LABEL).all()
-
-
-def test_tuples_are_summed_in_pieces_and_refused_where_their_codebook_would_be_huge(monkeypatch):
-    generator = torch.Generator().manual_seed(2)
-    labels = torch.randint(-1, 9, (3, 20, 20), dtype=torch.int32, generator=generator)
-    regions = Regions(labels, torch.nn.functional.normalize(torch.randn(9, 7, generator=generator), dim=1))
-    expected = composite(regions, "v0")
-    monkeypatch.setattr(levels, "BLOCK_FLOATS", 21)
-    assert torch.equal(composite(regions, "v0").codebook, expected.codebook)
-    monkeypatch.setattr(levels, "COMPOSITE_BYTES", expected.codebook.nbytes)
-    assert torch.equal(composite(regions, "v0").labels, expected.labels)
-    monkeypatch.setattr(levels, "COMPOSITE_BYTES", expected.codebook.nbytes - 1)
-    with pytest.raises(
-        InvalidFeatures, match=f"IMG_7.*{expected.codebook.shape[0]} tuples of 7 channels.*levels to rows"
-    ):
-        composite(regions, "IMG_7")
 
 
 def test_one_level_is_that_level_alone_and_all_else_stays_as_it_is():
@@ -86,7 +24,7 @@ def test_one_level_is_that_level_alone_and_all_else_stays_as_it_is():
     assert isinstance(result, Regions)
     assert torch.equal(result.labels, regions.labels[2:]) and result.codebook is regions.codebook
     assert at_levels(regions, "rows", "v0") is regions
-    assert all(at_levels(grid, levels, "v0") is grid for levels in ("rows", "composite", 0))
+    assert all(at_levels(grid, levels, "v0") is grid for levels in ("rows", 0))
 
 
 @pytest.mark.parametrize("observation", [random_regions(0, levels=2), random_grid(0)])

@@ -12,7 +12,7 @@ from liftcore.errors import InvalidSettings
 from liftcore.values.lift_options import LiftOptions
 from liftcore.values.settings import LiftSettings, Preset
 
-LEVELS = "'rows' or 'composite' or a valid integer"
+LEVELS = "'rows' or a valid integer"
 
 
 @pytest.mark.parametrize(
@@ -91,5 +91,5 @@ def test_keyword_arguments_of_a_lift_are_typed_as_its_settings() -> None:
         if isinstance(annotation, type) and issubclass(annotation, StrEnum):
             expected = annotation | Literal[tuple(str(value) for value in annotation)]
         elif annotation == LiftSettings.model_fields["levels"].annotation:
-            expected = Literal["rows", "composite"] | int
+            expected = Literal["rows"] | int
         assert hints[name] == expected, name
