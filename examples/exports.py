@@ -4,7 +4,7 @@
 python examples/exports.py scene.lift.safetensors words.safetensors out
 
 ``.glb`` opens in viewers of glTF, ``.spz`` in those of mobile phones, ``.ply`` in editors of splats. ``.json`` has
-COCO's masks in the views, ``.jsonl`` an object a line, and the ZIP all of it. The PLY is read again at the end.
+COCO's masks in the views, ``.jsonl`` an object a line. The PLY is read again at the end.
 """
 
 import sys
@@ -14,7 +14,7 @@ import numpy as np
 
 import liftcore as lc
 
-SUFFIXES = (".glb", ".spz", ".ply", ".json", ".jsonl", ".zip")
+SUFFIXES = (".glb", ".spz", ".ply", ".json", ".jsonl")
 
 
 def main(lift: str, table: str, out: str) -> None:

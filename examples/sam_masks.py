@@ -3,7 +3,7 @@
 # numpy, scipy and torch leave types of what they compute open
 """Lift masks of a segmenter with a vector each, as SAM and CLIP give them, and export every object.
 
-python examples/sam_masks.py scene.ply sparse/0 masks things.zip
+python examples/sam_masks.py scene.ply sparse/0 masks things.glb
 
 ``masks`` is a folder of an ``.npz`` a view, named as the view: ``masks`` [M, H, W] booleans, which may overlap, and
 ``vectors`` [M, F], the embedding of each.
@@ -26,7 +26,7 @@ def views_of(folder: Path) -> Iterator[tuple[str, lc.Regions]]:
 
 
 def main(splats_path: str, cameras_path: str, masks_path: str, out: str) -> None:
-    """Write ``out``: a ``.zip`` of all exports, or a ``.glb``, ``.ply``, ``.spz`` or ``.jsonl`` with labels."""
+    """Write ``out``: a ``.glb``, ``.ply``, ``.spz`` or ``.jsonl`` with labels."""
     splats, cameras = lc.read_splats(splats_path), lc.read_cameras(cameras_path)
     result = lc.lift(splats, cameras, views_of(Path(masks_path)))
     scene = result.scene(splats, cameras)

@@ -449,12 +449,13 @@ class NamedQuestion(Question):
 
 
 class ExportRequest(Words):
-    """The content of a ZIP: the answers of questions, every splat's best word, or the objects of the lift."""
+    """The labels of a file: the answers of questions, every splat's best word, or the objects of the lift."""
 
     of: Literal["questions", "words", "objects"] = Field("objects", description="the labels of the content")
     questions: Annotated[list[NamedQuestion], Field(max_length=QUESTIONS, fail_fast=True)] = Field(
         [], description="for content `questions`: each is a class of the labels"
     )
+    format: Literal["ply", "glb", "usdz", "names", "masks"] = Field("ply", description="the kind of file")
     view: str | None = Field(
         None, min_length=1, max_length=VIEW_CHARACTERS, description="the view of the masks; else all views"
     )

@@ -319,9 +319,10 @@ class Answers:
         return scene.blocks_of(None, request.get("channel", "splats"), view=view)
 
     def _export(self, request: Request) -> Iterable[bytes]:
-        """Return a ZIP of answers, of words or of objects."""
+        """Return a file with labels: those of answers, of words or of objects."""
         scene = self._scene(request)
         views = scene.metadata.views if request["of_view"] is None else (request["of_view"],)
+        views = views if request["what"] == "masks" else ()
         pixels = sum(math.prod(scene.cameras[view].photo_size) for view in views)
         if pixels > MASK_PIXELS:
             expected, got = f"views of at most {MASK_PIXELS} pixels together", f"{pixels} in {len(views)} views"
@@ -335,7 +336,7 @@ class Answers:
             source = self._segmentation(request)
         else:
             source = self._labelled_objects(request)
-        return scene.blocks_of(source, "bundle", view=request["of_view"])
+        return scene.blocks_of(source, request["what"], view=request["of_view"], suffix=request["suffix"])
 
     def _labelled_objects(self, request: Request) -> Catalogue | SceneTree:
         """Return the named objects of a lift by the names that people gave, with their parts."""

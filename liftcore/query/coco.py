@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,12 +16,7 @@ if TYPE_CHECKING:
     from liftcore.io.labels import Labels
 
 
-def masks_json(
-    scene: OpenedLift,
-    labels: Labels,
-    views: Sequence[str] | None = None,
-    on_view: Callable[[str, np.ndarray], None] | None = None,
-) -> Iterator[bytes]:
+def masks_json(scene: OpenedLift, labels: Labels, views: Sequence[str] | None = None) -> Iterator[bytes]:
     """Write the masks of all instances in views, in blocks, a view at a time.
 
     A pixel belongs to the instance with the most weight on its ray, in the photo's pixels. Masks are uncompressed run
@@ -29,8 +24,7 @@ def masks_json(
     labels of a tree, have masks, too: a pixel belongs to the smallest node with the most weight, and to its path.
 
     Args:
-        views: their names; None: the lifted ones. on_view: called with each name and the instances [H, W] i32 of its
-            pixels, 0 for none, before its block.
+        views: their names; None: the lifted ones.
 
     Raises:
         InvalidQuery: the labels have no instances.
@@ -54,7 +48,7 @@ def masks_json(
         "categories": [{"id": number, "name": name} for number, name in sorted(kinds.items())],
     }
     view_names = scene.metadata.views if views is None else views
-    return _blocks(scene, labels, instances, parts, head, view_names, on_view)
+    return _blocks(scene, labels, instances, parts, head, view_names)
 
 
 def _blocks(
@@ -64,15 +58,12 @@ def _blocks(
     parts: dict[int, dict[str, Any]],
     head: dict[str, Any],
     views: Sequence[str],
-    on_view: Callable[[str, np.ndarray], None] | None,
 ) -> Iterator[bytes]:
     images, count = [], 0
     depths = _part_tables(labels, parts)
     yield json.dumps(head, ensure_ascii=False)[:-1].encode() + b', "annotations": ['
     for place, view in enumerate(views, 1):
         number_map = value_map(scene, labels.columns["instance_id"], view)
-        if on_view is not None:
-            on_view(view, number_map)
         height, width = number_map.shape
         images.append({"id": place, "file_name": view, "width": width, "height": height})
         smallest = value_map(scene, labels.columns["node_id"], view) if parts else number_map

@@ -27,7 +27,7 @@ if TYPE_CHECKING:  # these load torch
     from liftcore.query.segment import Segmentation
     from liftcore.scene.cameras import Camera
 
-OF_LABELS = ("labelled", "prims", "names", "lines", "masks", "bundle")  # files with labels of all splats
+OF_LABELS = ("labelled", "prims", "names", "lines", "masks")  # files with labels of all splats
 FILES = {  # kind of a source -> the files that can be made of it
     "answer": ("object", "coloured", "scores", "selection", "mask", "attention", "overlay", *OF_LABELS),
     "answers": OF_LABELS,
@@ -40,7 +40,6 @@ FILES = {  # kind of a source -> the files that can be made of it
 
 BY_SUFFIX = {  # suffix of a name -> file of sources with several classes
     **dict.fromkeys((".glb", ".spz", ".usdc", ".usdz"), "labelled"), ".json": "masks", ".jsonl": "lines",
-    ".zip": "bundle",
 }  # fmt: skip
 OF_CATALOGUE = BY_SUFFIX | {".ply": "labelled"}  # a segmentation's .ply has its colours instead
 
@@ -63,7 +62,7 @@ def blocks_of(
     kind = "answers" if isinstance(source, Mapping) else kind
     default = (
         (OF_CATALOGUE if kind == "catalogue" else BY_SUFFIX).get(suffix)
-        if kind in ("segmentation", "catalogue", "scenetree", "answers") or suffix == ".zip"
+        if kind in ("segmentation", "catalogue", "scenetree", "answers")
         else None
     )
     content = content or default or FILES[kind][0]
@@ -144,17 +143,13 @@ def _of_labels(
     from liftcore.query.labels import labels
 
     columns = labels(scene, source)
-    if content == "bundle":
-        from liftcore.query.bundle import bundle
-
-        return bundle(scene, columns, view if isinstance(view, str) else None)
     if content in ("labelled", "prims"):
         prims = content == "prims"
         return labelled(scene.splat_file, columns, suffix or (".usdc" if prims else ".ply"), prims=prims)
     if content == "masks":
         from liftcore.query.coco import masks_json
 
-        return masks_json(scene, columns)
+        return masks_json(scene, columns, [view] if isinstance(view, str) else None)
     return [document_bytes(columns) if content == "names" else document_lines(columns)]
 
 

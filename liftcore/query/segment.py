@@ -312,21 +312,17 @@ def map_png(values: np.ndarray, segmentation: Segmentation) -> bytes:
 
     Above 255 words it is a grey image of 16 bits.
     """
-    return palette_png(values, [label.word for label in segmentation.named_words], segmentation.colours)
-
-
-def palette_png(values: np.ndarray, names: Sequence[str], colours: np.ndarray) -> bytes:
-    """Write values [H, W] as `map_png` does, with names of values from 1 and colours [n + 1, 3] u8 from 0."""
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
     text, content = PngInfo(), io.BytesIO()
-    text.add_text("legend", json.dumps(dict(enumerate(names, 1))))
-    if len(names) > 255:
+    words = [label.word for label in segmentation.named_words]
+    text.add_text("legend", json.dumps(dict(enumerate(words, 1))))
+    if len(words) > 255:
         picture = Image.fromarray(values.astype(np.uint16))
     else:
         picture = Image.fromarray(values.astype(np.uint8))
-        colours = colours.copy()
+        colours = segmentation.colours.copy()
         colours[0] = 0
         picture.putpalette(colours.tobytes())
     picture.save(content, format="PNG", pnginfo=text)

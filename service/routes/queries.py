@@ -46,7 +46,7 @@ from service.store import SERVICE, Owner
 
 NO_ENCODER: dict[str, Any] = {"encoder": None, "encoder_version": None}  # of a question without words
 REGION, SELECTION = "region:", "selection:"  # prefixes of examples that need the lift's packs, or a stored selection
-NPY, PNG, JSON, ZIP = "application/x-npy", "image/png", "application/json", "application/zip"
+NPY, PNG, JSON = "application/x-npy", "image/png", "application/json"
 # The outputs of a question, by name: media type, and what they are; pictures need a view, or a camera in a body
 Output = Literal["objects", "scores", "selection", "mask", "attention", "splats"]
 OUTPUTS: dict[Output, tuple[str, str]] = {
@@ -63,6 +63,14 @@ WORD_OUTPUTS: dict[WordOutput, tuple[str, str]] = {
     "labels": (NPY, "the number of each splat's word among those of `/query/segment`, from 1, or 0: int32 [P]"),
     "map": (PNG, "these numbers for a view's pixels, with a palette, and words by number as text `legend`"),
     "picture": (PNG, "a view tinted with the colours of its words, beside a legend"),
+}
+# Files with labels, by format: what `Scene.blocks_of` calls them, suffix, media type, and what they are
+EXPORTS: dict[str, tuple[str, str, str, str]] = {
+    "ply": ("labelled", ".ply", BINARY, "the splats with columns of numbers, which `names` explains"),
+    "glb": ("labelled", ".glb", BINARY, "glTF with feature ids and property tables"),
+    "usdz": ("labelled", ".usdz", BINARY, "OpenUSD, a subset of the splats for each object"),
+    "names": ("names", ".json", JSON, "names, colours, counts and boxes of the labels"),
+    "masks": ("masks", ".json", JSON, "COCO's masks of the objects in the views"),
 }
 
 
@@ -261,13 +269,13 @@ def segment_output(form: WordOutput, words: SegmentRequest, request: Request, de
     return respond(request, deps, work, WORD_OUTPUTS[form][0])
 
 
-@router.post("/query/export", responses=content_of(ZIP), response_class=Response)
+@router.post(
+    "/query/export", responses=content_of(BINARY, JSON), response_class=Response,
+    description="Export objects, words or questions as a file with labels.\n\n"
+    + _list({name: row[2:] for name, row in EXPORTS.items()}),
+)  # fmt: skip
 def export(parameters: ExportRequest, request: Request, deps: Deps, owner: Caller) -> Response:
-    """Export objects, words or queries as one ZIP: splats with labels, names, colours, boxes, counts, masks of views.
-
-    It holds `labels.ply`, `labels.json`, `instances.csv`, `legend.png`, `masks/VIEW.png`, `masks.json` (COCO) and
-    `truth.safetensors` (masks for a trade-off).
-    """
+    """Export objects, words or questions as a file with labels."""
     lift = deps.store.lift(owner, parameters.lift)
     work: dict[str, Any] = scene_request("export", lift, deps) | NO_ENCODER
     title = [parameters.of]
@@ -283,8 +291,10 @@ def export(parameters: ExportRequest, request: Request, deps: Deps, owner: Calle
     elif parameters.of == "words" or parameters.encoder is not None or parameters.table is not None:
         work = word_request("export", parameters, lift, deps, owner)
     name = "-".join(re.findall(r"[A-Za-z0-9]+", " ".join(title)))[:80] or "splats"
+    what, suffix, media_type, _ = EXPORTS[parameters.format]
     work |= {"of": parameters.of, "of_view": parameters.view, "object_labels": labels_of(lift, deps)}
-    return respond(request, deps, work, ZIP, f"{name}-{lift.id}.zip")
+    work |= {"what": what, "suffix": suffix}
+    return respond(request, deps, work, media_type, f"{name}-{lift.id}{suffix}")
 
 
 def labels_of(lift: models.Lift, deps: Parts) -> dict[str, tuple[str | None, bool]]:

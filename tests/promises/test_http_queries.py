@@ -69,6 +69,21 @@ def test_word_selects_its_cluster_in_numbers_arrays_and_pictures(
         assert client.get(link).status_code == 200, name
 
 
+def test_labels_are_exported_in_each_format(client: httpx.Client, lift: dict[str, Any]) -> None:
+    questions = [{"text": [word], "threshold": 0.5, "lift": lift["id"]} for word in WORDS]
+    body = {"lift": lift["id"], "of": "questions", "questions": questions, "view": "middle"}
+    files = {}
+    for name, start in {"ply": b"ply", "glb": b"glTF", "usdz": b"PK", "names": b"{", "masks": b"{"}.items():
+        reply = client.post("/query/export", json=body | {"format": name})
+        assert reply.status_code == 200 and reply.content.startswith(start), name
+        files[name] = reply.content
+    assert {entry["name"] for entry in json.loads(files["names"])["classes"]} == set(WORDS)
+    masks = json.loads(files["masks"])
+    assert {entry["name"] for entry in masks["categories"]} == set(WORDS)
+    assert [image["file_name"] for image in masks["images"]] == ["middle"]
+    assert_problem(client.post("/query/export", json=body | {"format": "zip"}), 422)
+
+
 def as_selection(link: str) -> str:
     return link.replace("/query/scores", "/query/selection")
 

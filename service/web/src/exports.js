@@ -4,14 +4,14 @@ import { questionLabel } from "./query.js";
 import { queryString } from "./question.js";
 import { storedKey, download, downloadBlob, problemText } from "./service.js";
 
-const MAX_EXPORTS = 16; // questions of a ZIP
+const MAX_EXPORTS = 16; // questions of a file
 
 export class ExportPanel {
   constructor({ query, layers, labels, objects, takePicture }) {
     Object.assign(this, { query, layers, labels, objects, takePicture });
     for (const button of document.querySelectorAll("[data-take]")) button.addEventListener("click", () => this.saveFile(button.dataset.take));
     byId("shot").addEventListener("click", async () => downloadBlob(await this.takePicture(), "splatlift.png"));
-    for (const [id, ofObjects] of [["take-everything", false], ["take-objects", true]]) byId(id).addEventListener("click", () => this.saveZip(ofObjects));
+    for (const [id, ofObjects] of [["take-everything", false], ["take-objects", true]]) byId(id).addEventListener("click", () => this.saveLabels(ofObjects));
     byId("copy-link").addEventListener("click", () => copyText(location.href));
     for (const name of ["curl", "python"]) byId(`copy-${name}`).addEventListener("click", () => copyText(byId(name).textContent));
   }
@@ -24,18 +24,19 @@ export class ExportPanel {
     return `${path}?${this.query.requestParameters(question, options)}`;
   }
 
-  // Save one ZIP of all questions or labels; with ofObjects, of the objects of the scene.
-  async saveZip(ofObjects) {
+  // Save a file with all questions or labels; with ofObjects, with the objects of the scene.
+  async saveLabels(ofObjects) {
+    const format = byId("take-format").value;
     const { questions, lift } = this.query;
     const labelBody = this.labels.isShown ? { of: "words", ...this.labels.vocabulary } : { of: "questions", questions: questions.filter(({ answer }) => answer).map(item => ({ ...this.query.requestBody(item), name: questionLabel(item).slice(0, 100) })) };
     const listedObjects = this.objects.exportedSets();
-    if (listedObjects.length > MAX_EXPORTS && this.objects.selections.length) notify(`A ZIP has at most ${MAX_EXPORTS} objects of an edited list: it has the first ${MAX_EXPORTS}.`);
+    if (listedObjects.length > MAX_EXPORTS && this.objects.selections.length) notify(`A file has at most ${MAX_EXPORTS} objects of an edited list: it has the first ${MAX_EXPORTS}.`);
     const encoder = lift.text_space === "none" ? {} : { encoder: lift.text_space };
-    const body = { lift: lift.id, ...(ofObjects && this.objects.selections.length ? { of: "questions", questions: listedObjects.slice(0, MAX_EXPORTS).map(item => ({ lift: lift.id, ...item, name: item.name.slice(0, 100) })) } : ofObjects ? { of: "objects", ...encoder } : labelBody) };
-    if (listedObjects.length <= MAX_EXPORTS || !ofObjects) notify("Making the ZIP. Masks of all views take some time.");
+    const body = { lift: lift.id, format, ...(ofObjects && this.objects.selections.length ? { of: "questions", questions: listedObjects.slice(0, MAX_EXPORTS).map(item => ({ lift: lift.id, ...item, name: item.name.slice(0, 100) })) } : ofObjects ? { of: "objects", ...encoder } : labelBody) };
+    if (format === "masks" && (listedObjects.length <= MAX_EXPORTS || !ofObjects)) notify("Masks of all views take some time.");
     try {
-      await download("/query/export", "splats.zip", body).catch(problem => (problem.argument === "encoder" ? download("/query/export", "splats.zip", { lift: lift.id, of: "objects" }) : Promise.reject(problem)));
-      notify("The ZIP is saved.");
+      await download("/query/export", "labels", body).catch(problem => (problem.argument === "encoder" ? download("/query/export", "labels", { lift: lift.id, format, of: "objects" }) : Promise.reject(problem)));
+      notify("The file is saved.");
     } catch (problem) {
       notify(problemText(problem), true);
     }
