@@ -26,8 +26,6 @@ from liftcore.lifting.operators import region_weights as region_weights
 from liftcore.lifting.operators import render as render
 from liftcore.lifting.pipeline import lift as lift
 from liftcore.lifting.pipeline import plan as plan
-from liftcore.lifting.planning.photos import PhotoPlan as PhotoPlan
-from liftcore.lifting.planning.photos import plan_photos as plan_photos
 from liftcore.lifting.planning.plan import Plan as Plan
 from liftcore.query.ask import VectorAnswer as VectorAnswer
 from liftcore.query.catalogue import Catalogue as Catalogue

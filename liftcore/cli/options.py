@@ -128,15 +128,11 @@ def shared_options() -> Parser:
     return shared
 
 
-def add_sources(parser: argparse.ArgumentParser, features: str = "+", without: str = "") -> None:
-    """Add the arguments of splats, cameras and feature packs.
-
-    Args:
-        features: their number, as ``nargs`` of argparse. without: help text about no features.
-    """
+def add_sources(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of splats, cameras and feature packs."""
     parser.add_argument("splats", type=Path, help="trained splats (.ply, .splat, .spz, .sog, or a checkpoint)")
     parser.add_argument("cameras", type=Path, help="COLMAP folder or .zip, transforms.json or cameras.json")
-    parser.add_argument("features", type=Path, nargs=features, help=f"feature packs (.safetensors){without}")
+    parser.add_argument("features", type=Path, nargs="+", help="feature packs (.safetensors)")
 
 
 def add_settings(parser: Parser) -> None:

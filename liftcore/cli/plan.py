@@ -1,21 +1,17 @@
-"""``splatlift plan``: plan a lift; without features, plan which photos to encode first."""
+"""``splatlift plan``: plan a lift."""
 
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
 
 from liftcore.cli.lift import plan_lines, settings_of
 from liftcore.cli.options import Parser, add_settings, add_sources, add_verbose, count
 from liftcore.cli.reply import reply
 
-if TYPE_CHECKING:
-    from liftcore import LiftSettings
-
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    add_sources(parser, "*", "; none: plan which photos to encode first")
+    add_sources(parser)
     add_settings(parser)
     add_verbose(parser)
     parser.add_argument(
@@ -28,8 +24,6 @@ def run(options: argparse.Namespace) -> int:
     from liftcore import plan_files
 
     settings = settings_of(options)
-    if not options.features:
-        return _photos(options, settings)
     plan = plan_files(options.splats, options.cameras, options.features, settings, threads=options.threads)
     views = {"lifted": list(plan.views), "left_out": list(plan.left_out)}
     device = {"kind": plan.device.kind, "name": plan.device.name}
@@ -41,14 +35,4 @@ def run(options: argparse.Namespace) -> int:
         "warnings": [*plan.warnings, *plan.input_warnings],
     }
     reply(document, as_json=options.json, lines=plan.lines() if options.verbose else plan_lines(plan))
-    return 0
-
-
-def _photos(options: argparse.Namespace, settings: LiftSettings) -> int:
-    """Print which photos to encode first."""
-    from liftcore import plan_photos, read_cameras, read_splats
-
-    splats = read_splats(options.splats, settings.kernel, colour=False)
-    plan = plan_photos(splats, read_cameras(options.cameras), settings, threads=options.threads, progress=True)
-    reply(plan.facts(), as_json=options.json, lines=plan.lines(verbose=options.verbose))
     return 0

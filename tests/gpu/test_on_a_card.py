@@ -111,7 +111,6 @@ def test_tensors_of_a_card_come_in(paths: list[Path]) -> None:
         assert torch.equal(ones, lc.render(splats_on_cpu, camera, torch.ones(60), device=device))
         lc.region_weights(splats, cameras, {"middle": regions}, device=device)
         assert lc.plan(splats, {"middle": corner}, {"middle": few}, device=device).views == ("middle",)
-    assert lc.plan_photos(splats, cameras).order
     assert result.segment(WORDS, torch.eye(3, 8).to("cuda"), splats).labels.max() >= 0
     answer = result.query(torch.eye(8)[0].to("cuda"), splats=splats)
     assert splats.means[answer.splats].shape[1] == 3

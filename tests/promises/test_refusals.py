@@ -108,7 +108,6 @@ ROWS: list[Row] = [
     (lc.LiftSettings.of, {"diagnostic_rays": 5_000_000}, T, "diagnostic_rays"),
     (lc.LocalEngine, {"threads": 0}, T, "threads"),
     (lc.open_engine, {"name": "slurm"}, T, "engine"),
-    (lc.plan_photos, {"splats": SCENE.splats, "cameras": SCENE.cameras, "settings": "fast"}, T, "settings"),
     (lc.CompositingParams, {"alpha_cap": 2}, T, "alpha_cap"),
     (lc.render, {"splats": SCENE.splats, "camera": [CAMERA], "values": np.ones(50)}, C, "camera"),
     (lc.render, {"splats": SCENE.splats, "camera": CAMERA, "values": np.ones(49)}, T, "values"),

@@ -367,7 +367,7 @@ def test_repr_of_every_public_value_is_one_line_with_its_size(scene):
     answer, words = result.query(vectors, splats=splats, threshold=0.1), ["a" * 90, "b"]
     segmentation, catalogue = result.segment(words, vectors, splats), result.objects(splats, words, vectors)
     sized = [splats, result, lc.region_weights(splats, cameras, views), answer, segmentation]
-    sized += [lc.plan(splats, cameras, views), lc.plan_photos(splats, cameras)]
+    sized += [lc.plan(splats, cameras, views)]
     long = lc.LiftSettings.of(**dict(lc.LiftSettings.of(quality="fast")))
     unsized = [cameras, cameras["v0"].replace(name="x" * 300), *views.values(), long, lc.LiftSettings.of()]
     unsized += [

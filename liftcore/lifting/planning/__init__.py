@@ -1,1 +1,1 @@
-"""Plans of lifts, before the first view: the views, the memory, the order of photos, contradictions of inputs."""
+"""Plans of lifts, before the first view: the views, the memory, contradictions of inputs."""
