@@ -1,4 +1,4 @@
-"""``splatlift transfer``: transfer a lift to an edited, compressed or retrained copy of its splats."""
+"""``splatlift transfer``: transfer a lift to an edited or compressed copy of its splats."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("lift", type=Path, help="a lift (.safetensors or .shards)")
     parser.add_argument("edited", type=Path, help="other splats of its scene, of any format")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="NEW", help="the lift to write")
-    matrix_help = "transform of the scene, a text file of 3 or 4 rows of 4 numbers; default: estimated"
+    matrix_help = "transform of the scene, a text file of 3 or 4 rows of 4 numbers; default: none"
     parser.add_argument("--matrix", type=Path, metavar="FILE", help=matrix_help)
     add_splats(parser)
 
@@ -31,14 +31,14 @@ def run(options: argparse.Namespace) -> int:
     scene = Scene(options.lift, splats=options.splats)
     file = check_output(options.output, [options.lift, scene.splat_file, options.edited], "lift")
     matrix = None if options.matrix is None else _matrix(options.matrix)
-    result = load_lift(options.lift).transferred(scene.splats, options.edited, matrix=matrix, progress=True)
+    result = load_lift(options.lift).transferred(scene.splats, options.edited, matrix=matrix)
     with writing(file):
         result.save(options.output, progress=True)
     facts = result.diagnostics["transfer"]
     document: dict[str, Any] = {"out": str(options.output), "splats": len(result), **facts, "warnings": []}
     if unmatched := facts["without_partner"]:
         document["warnings"] = [
-            f"{unmatched} of {len(result)} splats overlap with no splat of the lift, and have no feature"
+            f"{unmatched} of {len(result)} splats are near no splat of the lift, and have no feature"
         ]
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
@@ -55,10 +55,5 @@ def _matrix(path: Path) -> list[list[float]]:
 
 
 def _lines(document: dict[str, Any]) -> list[str]:
-    transform = document["moved"]
-    lines = [
-        f"{document['out']}: {document['splats']} splats, {document['rows']} of them rows of the lift, "
-        f"{document['mixed']} mixtures of overlapping splats, {document['without_partner']} without a match"
-    ]
-    lines += [] if transform is None else [f"  the scene was transformed, with scale {transform['scale']:.6g}"]
+    lines = [f"{document['out']}: {document['splats']} splats, {document['rows']} of them rows of the lift"]
     return lines + [f"warning: {warning}" for warning in document["warnings"]]

@@ -134,32 +134,27 @@ class LiftResult(Lift):
         """
         return self.scene(splats).catalogue(words, vectors, encoder=encoder)
 
-    def transferred(
-        self, old: Splats, new: Splats | Path | str, *, matrix: Any = None, progress: Progress | bool | None = None
-    ) -> LiftResult:
-        """Transfer the lift to other splats of its scene: cropped, reordered, compressed, moved or retrained.
+    def transferred(self, old: Splats, new: Splats | Path | str, *, matrix: Any = None) -> LiftResult:
+        """Transfer the lift to an edited copy of its splats: cropped, reordered, compressed or thinned.
 
-        ``diagnostics["transfer"]`` has the numbers of rows that are old ones, mixed of several, or without a partner,
-        and the similarity of the scenes (`liftcore.query.transfer`).
+        Each new splat takes the row of the nearest old one (`liftcore.query.transfer`). ``diagnostics["transfer"]``
+        has the number of such rows, and of splats that are near none.
 
         Args:
             old: splats that were lifted. new: Q others, in any order, or their file, whose path the lift stores.
-            matrix: [4, 4] or [3, 4], the similarity from the old frame to the new one; None: none, or an estimated
-                one. progress: as `liftcore.lift` has it.
+            matrix: [4, 4] or [3, 4], the similarity from the old frame to the new one, if the scene was moved.
 
         Raises:
-            InvalidSplats: other splats than were lifted, or no place of the new ones in the scene is clear.
+            InvalidSplats: other splats than were lifted, or less than half of the new ones are near an old one.
             InvalidInput: the matrix is no similarity.
         """
         from liftcore.io.splats import read_splats
         from liftcore.query.transfer import transfer
-        from liftcore.runtime.progress import shown_progress
         from liftcore.values.lift_file import input_file
 
-        with shown_progress(progress) as reporter:
-            if not isinstance(new, str | Path):
-                return transfer(self, old, new, matrix, reporter)
-            result = transfer(self, old, read_splats(new), matrix, reporter)
+        if not isinstance(new, str | Path):
+            return transfer(self, old, new, matrix)
+        result = transfer(self, old, read_splats(new), matrix)
         return replace(result, metadata=result.metadata.model_copy(update={"splats": input_file(Path(new))}))
 
     def arrays(self) -> dict[str, np.ndarray]:
