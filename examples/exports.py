@@ -3,8 +3,8 @@
 
 python examples/exports.py scene.lift.safetensors words.safetensors out
 
-``.glb`` opens in viewers of glTF, ``.spz`` in those of mobile phones, ``.ply`` in editors of splats. ``.json`` has
-COCO's masks in the views, ``.jsonl`` an object a line. The PLY is read again at the end.
+``.glb`` opens in viewers of glTF, ``.ply`` in editors of splats. ``.json`` has COCO's masks in the views. The PLY is
+read again at the end.
 """
 
 import sys
@@ -14,7 +14,7 @@ import numpy as np
 
 import liftcore as lc
 
-SUFFIXES = (".glb", ".spz", ".ply", ".json", ".jsonl")
+SUFFIXES = (".glb", ".ply", ".json")
 
 
 def main(lift: str, table: str, out: str) -> None:

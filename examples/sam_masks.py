@@ -26,7 +26,7 @@ def views_of(folder: Path) -> Iterator[tuple[str, lc.Regions]]:
 
 
 def main(splats_path: str, cameras_path: str, masks_path: str, out: str) -> None:
-    """Write ``out``: a ``.glb``, ``.ply``, ``.spz`` or ``.jsonl`` with labels."""
+    """Write ``out``: a ``.glb`` or ``.ply`` with labels."""
     splats, cameras = lc.read_splats(splats_path), lc.read_cameras(cameras_path)
     result = lc.lift(splats, cameras, views_of(Path(masks_path)))
     scene = result.scene(splats, cameras)

@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from liftcore import Answer, Catalogue, Scene, Segmentation
     from liftcore.models import SceneTree
 
-CONTENT_BY_SUFFIX = {".json": "masks", ".jsonl": "lines"}  # other suffixes: splats with labels
+CONTENT_BY_SUFFIX = {".json": "masks"}  # other suffixes: splats with labels
 
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
     add_lift(parser)
-    formats = ".glb, .usdz, .ply or .spz: splats with labels; .json: COCO masks in the views; .jsonl: objects"
+    formats = ".glb, .usdz or .ply: splats with labels; .spz or .splat: splats; .json: COCO masks in the views"
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=formats)
     source = parser.add_mutually_exclusive_group()
     source.add_argument(
@@ -34,8 +34,6 @@ def add_arguments(parser: Parser) -> None:
     source.add_argument("--all-words", action="store_true", help="label every splat with the encoder's best word")
     source.add_argument("--object", type=whole_number, metavar="ID", help="only one object of the lift")
     only_help = "with --text: only the selected splats"
-    prims_help = "for .usdc or .usdz: one prim for each object instead of subsets of one prim"
-    parser.add_argument("--prims", action="store_true", help=prims_help)
     parser.add_argument("--only", action="store_true", help=only_help)
     vocabulary_help = "without the options above: label the lift's objects with these words, a file with one a line"
     parser.add_argument("--vocabulary", type=Path, metavar="FILE", help=vocabulary_help)
@@ -49,7 +47,7 @@ def run(options: argparse.Namespace) -> int:
 
     suffix = options.output.suffix.lower()
     content = CONTENT_BY_SUFFIX.get(suffix, "labelled")
-    kind = {"masks": "json", "lines": "jsonl"}.get(content, "splats")
+    kind = "json" if content == "masks" else "splats"
     inputs = [path for path in (options.lift, options.table, options.words, options.vocabulary) if path]
     check_output(options.output, inputs, kind)
     if options.only and not options.text:
@@ -61,14 +59,8 @@ def run(options: argparse.Namespace) -> int:
     source = _source(options, scene)
     if isinstance(source, int) or options.only:
         content = "object"
-    elif suffix == ".splat" or source is None:
+    elif suffix in (".splat", ".spz") or source is None:
         content, source = "splats", None
-    if options.prims:
-        if content != "labelled" or suffix not in (".usdc", ".usdz"):
-            is_usd = suffix in (".usdc", ".usdz")
-            got = "splats without labels" if is_usd else f"an output that ends in {suffix or 'no suffix'}"
-            raise InvalidInput("--prims", expected="an output of labels that ends in .usdc or .usdz", got=got)
-        content = "prims"
     files, exports = {"output": options.output}, {"output": partial(scene.export, source=source, what=content)}
     if content == "labelled" and suffix == ".ply":
         names = options.output.with_name(f"{options.output.name}.json")

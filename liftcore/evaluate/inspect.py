@@ -108,9 +108,6 @@ def _reject_code(path: Path) -> None:
     if file_format is SplatFormat.CHECKPOINT:
         got = "a checkpoint of a trainer, which is a Python pickle"
         raise InvalidSplats("splats", expected="a format that holds no code", got=got, hint=EXPORT_PLY)
-    if file_format is SplatFormat.USD:
-        got, hint = "a USD scene, which may lead to other files", "send the splats as .glb, .ply, .spz or .sog"
-        raise InvalidSplats("splats", expected="a format that holds all in itself", got=got, hint=hint)
 
 
 def describe_splat_file(path: Path) -> dict[str, Any]:

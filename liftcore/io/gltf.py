@@ -8,8 +8,8 @@ are known (`liftcore.scene.world`). ``asset.extras`` stores the same, by which o
 files of other programs +Y is up and a unit is a metre, as the format defines.
 
 Labels are feature ids (``EXT_mesh_features``): ``_FEATURE_ID_0`` is the instance, ``_FEATURE_ID_1`` the class, 0 is
-none, and a property table of each (``EXT_structural_metadata``) has a row of each id. Other columns of splats are
-attributes with an underscore before their name.
+none. ``asset.extras`` has the document that describes them. Other columns of splats are attributes with an underscore
+before their name.
 
 Only the file itself is read: a .glb, or a .gltf with its buffers in data URIs.
 """
@@ -21,16 +21,14 @@ import binascii
 import json
 import re
 import struct
-from collections.abc import Mapping
-from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from liftcore.errors import InvalidInput, InvalidSplats
 from liftcore.io.files import open_regular
-from liftcore.io.labels import COLUMN, IDS, KINDS
+from liftcore.io.labels import COLUMN, IDS
 from liftcore.io.ply import MODEL
 from liftcore.io.quantised import MOST_GROWTH, Fields, joined_fields, logits
 from liftcore.scene.harmonics import band_rotation
@@ -39,17 +37,13 @@ from liftcore.scene.render_mode import mode_of_word
 from liftcore.scene.similarity import Similarity
 from liftcore.scene.world import UPRIGHT, world_of
 
-if TYPE_CHECKING:
-    pass
-
 EXTENSION = "KHR_gaussian_splatting"
-FEATURES, METADATA = "EXT_mesh_features", "EXT_structural_metadata"
-SUPPORTED_EXTENSIONS = {EXTENSION, FEATURES, METADATA, "KHR_mesh_quantization"}
+FEATURES = "EXT_mesh_features"
+SUPPORTED_EXTENSIONS = {EXTENSION, FEATURES, "EXT_structural_metadata", "KHR_mesh_quantization"}
 MAGIC, JSON_CHUNK, BINARY_CHUNK = b"glTF", b"JSON", b"BIN\0"
 MAX_JSON_BYTES = 64 << 20
 MAX_DEGREE = 3  # of harmonics
 MAX_NODES = 100_000
-MAX_TABLE_CELLS = 1 << 22  # of a property table
 MAX_ATTRIBUTES = 320  # of a primitive: those of splats, and MAX_COLUMNS others
 SPLAT_BYTES = 56  # of a decoded splat without its colours
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -57,15 +51,9 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 TO_FILE = np.diag([-1.0, -1.0, 1.0])  # RDF to LUF, and back
 TRANSFORM = {"matrix", "rotation", "scale", "translation"}  # of a node
 RENDER_MODE = "SplatRenderMode"
-WORLD = "splatlift_world"  # of asset.extras
+WORLD, LABELS = "splatlift_world", "splatlift_labels"  # of asset.extras
 METRES = UPRIGHT.model_copy(update={"metres_per_unit": 1.0})  # of a file without ``WORLD``
 SRGB = "srgb_rec709_display"
-BOXES = {  # numbers of each
-    "box_low": 3, "box_high": 3, "oriented_box_centre": 3, "oriented_box_axes": 9, "oriented_box_half_sizes": 3,
-}  # fmt: skip
-TABLE_TYPES = {"UINT8": "<u1", "INT8": "<i1", "UINT16": "<u2", "INT16": "<i2", "UINT32": "<u4", "INT32": "<i4",
-               "UINT64": "<u8", "INT64": "<i8", "FLOAT32": "<f4", "FLOAT64": "<f8"}  # fmt: skip
-TABLE_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 HINT = "export it again, or as PLY"
 
 
@@ -89,15 +77,6 @@ def _hint_of(extension: str) -> str:
     if "spz" in extension.lower():
         return "export its splats as .spz, which is read, as .ply, or as .glb without compression"
     return HINT
-
-
-def read_gltf_document(path: Path) -> dict[str, Any]:
-    """Read the property tables of feature ids: ``instances``, ``classes``, ``nodes``; may be empty.
-
-    Raises:
-        InvalidSplats: the file is malformed.
-    """
-    return _Asset(path).document()
 
 
 class _Asset:
@@ -222,69 +201,6 @@ class _Asset:
             coefficients = np.stack([read(harmonic_name(band, place), 3) for place in range(2 * band + 1)], axis=1)
             sh[:, band**2 : (band + 1) ** 2] = np.einsum("ij,njc->nic", band_rotation(band, rotation), coefficients)
         return fields | {"sh": sh, "extras": self._extras(primitive, count)}
-
-    def document(self) -> dict[str, Any]:
-        """Return the rows of property tables that feature ids refer to, with their numbers."""
-        tables = self._list(self._extension(self.json, METADATA), "propertyTables")
-        tables_by_kind: dict[str, Any] = {}
-        for _, primitive in self.splats():
-            for name, feature_set in self._feature_sets(primitive).items():
-                kind = KINDS[IDS.index(name)] if name in IDS else None
-                if kind is None or kind in tables_by_kind or "propertyTable" not in feature_set:
-                    continue
-                table = self._at(tables, feature_set["propertyTable"], "property table")
-                shift = 0 if feature_set.get("nullFeatureId") == 0 else 1
-                rows = enumerate(self._table_rows(table), shift)
-                tables_by_kind[kind] = [{name: number, **_document_row(row)} for number, row in rows if number]
-        return tables_by_kind
-
-    def _table_rows(self, table: dict[str, Any]) -> list[dict[str, Any]]:
-        schema = self._extension(self.json, METADATA).get("schema", {})
-        count, members = table.get("count"), self._at_key(self._at_key(schema, "classes"), table.get("class"))
-        properties = self._at_key(table, "properties")
-        if type(count) is not int or not 0 <= count * max(len(properties), 1) <= MAX_TABLE_CELLS:
-            raise self._broken(f"at most {MAX_TABLE_CELLS} cells of a property table", repr(count)[:40])
-        rows: list[dict[str, Any]] = [{} for _ in range(count)]
-        for key in properties:
-            member = self._at_key(self._at_key(members, "properties"), key)
-            is_array = member.get("array") and member.get("type") == "SCALAR" and "count" not in member
-            if is_array or (not member.get("array") and member.get("type") in ("STRING", *TABLE_WIDTHS)):
-                column = self._table_column(self._at_key(properties, key), member, count)
-                for row, value in zip(rows, column, strict=True):
-                    row[str(key)[:64]] = value
-        return rows
-
-    def _table_column(self, property_json: dict[str, Any], member: dict[str, Any], count: int) -> list[Any]:
-        values = self._view(property_json.get("values"))
-        if member["type"] == "STRING":
-            text = values.tobytes()
-            ends = self._ends(property_json, "string", count)
-            return [text[low:high].decode("utf-8", "replace") for low, high in pairwise(ends)]
-        width, code = TABLE_WIDTHS[member["type"]], TABLE_TYPES.get(str(member.get("componentType")), "<f4")
-        if member.get("array"):
-            ends = self._ends(property_json, "array", count)
-            if not 0 <= ends[-1] <= MAX_TABLE_CELLS:
-                raise self._broken(f"at most {MAX_TABLE_CELLS} values of a property", str(ends[-1]))
-            numbers = self._typed(values, code, ends[-1])
-            return [numbers[low:high].tolist() for low, high in pairwise(ends)]
-        numbers = self._typed(values, code, count * width).reshape(count, width)
-        rows: list[Any] = (numbers[:, 0] if width == 1 else numbers).tolist()
-        return rows
-
-    def _ends(self, property_json: dict[str, Any], kind: str, count: int) -> list[int]:
-        """Return the start of each row of a property of texts or arrays, and the end of the last."""
-        code = TABLE_TYPES.get(str(property_json.get(f"{kind}OffsetType", "UINT32")), "<u4")
-        ends = self._typed(self._view(property_json.get(f"{kind}Offsets")), code, count + 1).astype(np.int64)
-        if (np.diff(ends, prepend=0) < 0).any():
-            raise self._broken("rows one after the other", "offsets that go back")
-        rows: list[int] = ends.tolist()
-        return rows
-
-    def _typed(self, values: np.ndarray, code: str, count: int) -> np.ndarray:
-        required_bytes = count * np.dtype(code).itemsize
-        if len(values) < required_bytes:
-            raise self._broken(f"{required_bytes} bytes of a property", str(len(values)))
-        return values[:required_bytes].view(code)
 
     def _extras(self, primitive: dict[str, Any], count: int) -> dict[str, np.ndarray]:
         attributes = primitive["attributes"]
@@ -455,26 +371,6 @@ class _Asset:
 def _is_of_splats(primitive: Any) -> bool:
     extensions = primitive.get("extensions") if isinstance(primitive, dict) else None
     return isinstance(extensions, dict) and isinstance(extensions.get(EXTENSION), dict)
-
-
-def _document_row(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row of a property table as the document has it, with its boxes in the frame of PLYs."""
-    document_row = {key: value for key, value in row.items() if key not in BOXES}
-    row = {
-        key: value for key, value in row.items() if np.size(value) == BOXES.get(key)
-    }  # other programs may store anything
-    if {"box_low", "box_high"} <= row.keys():
-        corners = np.array([row["box_low"], row["box_high"]]) @ TO_FILE
-        document_row["box"] = {"low": corners.min(axis=0).tolist(), "high": corners.max(axis=0).tolist()}
-    if {"oriented_box_centre", "oriented_box_axes", "oriented_box_half_sizes"} <= row.keys():
-        axes = np.array(row["oriented_box_axes"]).reshape(3, 3) @ TO_FILE
-        centre = TO_FILE @ row["oriented_box_centre"]
-        document_row["oriented_box"] = {
-            "centre": centre.tolist(),
-            "axes": axes.tolist(),
-            "half_sizes": row["oriented_box_half_sizes"],
-        }
-    return document_row
 
 
 def harmonic_name(band: int, place: int) -> str:

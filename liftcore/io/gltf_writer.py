@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,19 +16,17 @@ from liftcore.io.gltf import (
     EXTENSION,
     FEATURES,
     JSON_CHUNK,
+    LABELS,
     MAGIC,
     MAX_DEGREE,
-    METADATA,
     RENDER_MODE,
     SRGB,
-    TABLE_TYPES,
-    TABLE_WIDTHS,
     TO_FILE,
     WIDTHS,
     WORLD,
     harmonic_name,
 )
-from liftcore.io.labels import IDS, KINDS, rows_by_id, stored_columns
+from liftcore.io.labels import IDS, stored_columns
 from liftcore.io.quantised import gaussian_rows
 from liftcore.runtime.version import __version__
 from liftcore.scene.harmonics import band_rotation, constant_terms
@@ -44,16 +41,6 @@ LARGEST_FILE = (1 << 32) - 1  # bytes; a .glb stores its size in 32 bits
 IDENTITY = [1.0, 0.0, 0.0, 0.0]  # w x y z
 CODES = {np.dtype(code): number for number, code in COMPONENTS.items()}
 NEAREST = "{kernel} splats as the nearest Gaussians: the format has the kernel 'ellipse' alone"
-MEMBERS = {  # of the rows of property tables: type, component type
-    "name": ("STRING", ""), "class_id": ("SCALAR", "UINT32"), "splats": ("SCALAR", "UINT32"),
-    "score": ("SCALAR", "FLOAT32"), "confidence": ("SCALAR", "FLOAT32"), "colour": ("VEC3", "UINT8"),
-    "box_low": ("VEC3", "FLOAT64"), "box_high": ("VEC3", "FLOAT64"),
-    "oriented_box_centre": ("VEC3", "FLOAT64"), "oriented_box_axes": ("MAT3", "FLOAT64"),
-    "oriented_box_half_sizes": ("VEC3", "FLOAT64"), "question": ("STRING", ""), "provenance": ("STRING", ""),
-    "kind": ("STRING", ""), "parent": ("SCALAR", "UINT32"), "depth": ("SCALAR", "UINT32"),
-    "path": ("SCALAR", "UINT32"), "parts": ("SCALAR", "UINT32"),
-}  # fmt: skip
-ARRAYS = ("path", "parts")  # members with any number of values in a row
 
 
 def gltf_blocks(splats: Splats, document: Mapping[str, Any] | None = None) -> Iterator[bytes]:
@@ -79,8 +66,9 @@ def gltf_blocks(splats: Splats, document: Mapping[str, Any] | None = None) -> It
     gltf: dict[str, Any] = {"asset": asset, "extensionsUsed": [EXTENSION]}
     if sets:
         primitive["extensions"][FEATURES] = {"featureIds": [_feature_set(columns, name, sets) for name in sets]}
-        gltf["extensions"] = {METADATA: _add_tables(binary, columns, document or {}, sets)}
-        gltf["extensionsUsed"] += [FEATURES, METADATA]
+        gltf["extensionsUsed"].append(FEATURES)
+    if document:
+        extras[LABELS] = document
     gltf |= {"scene": 0, "scenes": [{"nodes": [0]}], "nodes": [node], "meshes": [{"primitives": [primitive]}]}
     gltf |= {"accessors": binary.accessors, "bufferViews": binary.views, "buffers": [{"byteLength": binary.size}]}
     text = json.dumps(gltf, ensure_ascii=False, separators=(",", ":")).encode()
@@ -203,64 +191,5 @@ def _attribute_values(name: str, column: np.ndarray) -> np.ndarray:
 
 def _feature_set(columns: Mapping[str, np.ndarray], name: str, sets: Sequence[str]) -> dict[str, Any]:
     count = np.unique(columns[name][columns[name] > 0]).size
-    place = sets.index(name)
-    ids = {"featureCount": max(count, 1), "nullFeatureId": 0, "attribute": place, "propertyTable": place}
+    ids = {"featureCount": max(count, 1), "nullFeatureId": 0, "attribute": sets.index(name)}
     return ids | {"label": name.removesuffix("_id")}
-
-
-def _add_tables(
-    binary: _Binary, columns: Mapping[str, np.ndarray], document: Mapping[str, Any], sets: Sequence[str]
-) -> dict[str, Any]:
-    """Add the property tables of instances, classes and nodes: a row of each id, and a first one for 0, none."""
-    tables, classes = [], {}
-    for name, kind in zip(IDS, KINDS, strict=True):
-        if name not in sets:
-            continue
-        count = int(columns[name].max()) + 1
-        rows = [_table_row(document_row) for document_row in rows_by_id(dict(document), kind)]
-        rows += [{}] * (count - len(rows))
-        label, present = name.removesuffix("_id"), {key for row in rows for key in row}
-        complete = {
-            key for key in present if all(key in row for row in rows[1:] if row)
-        }  # properties that some rows lack are left out
-        members = {key: types for key, types in MEMBERS.items() if key in complete}
-        properties = {key: _add_property(binary, key, rows) for key in members}
-        tables.append({"name": kind, "class": label, "count": len(rows), "properties": properties})
-        schemas = {
-            key: {"type": kind}
-            | ({"componentType": component} if component else {})
-            | ({"array": True} if key in ARRAYS else {})
-            for key, (kind, component) in members.items()
-        }
-        classes[label] = {"name": label, "properties": schemas}
-    return {"schema": {"id": "splatlift", "classes": classes}, "propertyTables": tables}
-
-
-def _table_row(document_row: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert a row of the document to one of a property table, with its boxes in the file's frame."""
-    row = {key: value for key, value in document_row.items() if key in MEMBERS and value is not None}
-    if box := document_row.get("box"):
-        corners = np.array([box["low"], box["high"]]) @ TO_FILE
-        row |= {"box_low": corners.min(axis=0), "box_high": corners.max(axis=0)}
-    if box := document_row.get("oriented_box"):
-        axes = np.array(box["axes"]) @ TO_FILE  # rows; of MAT3 they are columns
-        row |= {"oriented_box_centre": TO_FILE @ box["centre"], "oriented_box_axes": axes.ravel()}
-        row |= {"oriented_box_half_sizes": box["half_sizes"]}
-    return row
-
-
-def _add_property(binary: _Binary, key: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
-    kind, component = MEMBERS[key]
-    if kind == "STRING":
-        texts = [str(row.get(key, "")).encode() for row in rows]
-        offsets = np.cumsum([0, *map(len, texts)]).astype("<u4")
-        return {"values": binary.view(b"".join(texts) or b"\0"), "stringOffsets": binary.view(offsets.tobytes())}
-    if key in ARRAYS:
-        arrays = [row.get(key, ()) for row in rows]
-        offsets = np.cumsum([0, *map(len, arrays)]).astype("<u4")
-        numbers = np.array([*chain(*arrays)], TABLE_TYPES[component])
-        return {"values": binary.view(numbers.tobytes() or bytes(4)), "arrayOffsets": binary.view(offsets.tobytes())}
-    values = np.zeros((len(rows), TABLE_WIDTHS[kind]), TABLE_TYPES[component])
-    for place, row in enumerate(rows):
-        values[place] = row.get(key, 0)
-    return {"values": binary.view(values.tobytes())}

@@ -71,7 +71,6 @@ class SplatFormat(StrEnum):
     SPZ = ".spz"
     SOG = ".sog"
     GLTF = ".glb"  # or .gltf, with KHR_gaussian_splatting
-    USD = "USD"  # .usdc, .usda or .usdz with particle fields, which may lead to other files
     CHECKPOINT = "checkpoint"  # of gsplat or nerfstudio: a pickle, if only of tensors
 
 
@@ -82,7 +81,6 @@ SUFFIX = {
     SplatFormat.SPZ: ".spz",
     SplatFormat.SOG: ".sog",
     SplatFormat.GLTF: ".glb",
-    SplatFormat.USD: ".usdc",
     SplatFormat.CHECKPOINT: ".pt",
 }
 PICKLED = (".pt", ".pth", ".ckpt", ".pkl")
@@ -122,7 +120,7 @@ _GLTF = FileKind(None, "a glTF model without splats (KHR_gaussian_splatting)", f
 _USD = FileKind(
     None,
     "a USD scene",
-    "if it holds splats, 'splatlift export' and read_splats open it here: send them as .glb or .ply",
+    "USD is written and not read: give the splats as .ply or .glb",
 )
 _STREAMED = FileKind(
     None, "a streamed SOG, whose levels of detail lie in many files", "give the .ply or .sog that it was made of"
@@ -428,7 +426,7 @@ def _by_magic(head: bytes) -> FileKind | None:
         identified = FileKind(None, "a Python pickle, which may run code when it is opened", EXPORT_PLY)
     if identified is _GLTF and b"KHR_gaussian_splatting" in head:
         return _splats_as(SplatFormat.GLTF)
-    return _splats_as(SplatFormat.USD) if identified is _USD else identified
+    return identified
 
 
 def _is_ksplat(head: bytes, size: int) -> bool:
@@ -583,7 +581,7 @@ def _of_names_in_zip(names: list[str], head_of: Callable[[str], bytes]) -> Itera
     yield _STREAMED if LOD_META in lasts else None
     yield _splats_as(SplatFormat.SOG) if sog_folder(names) is not None else None
     yield _splats_as(SplatFormat.CHECKPOINT) if any(name.endswith("/data.pkl") for name in names) else None
-    yield _splats_as(SplatFormat.USD) if names[0].lower().endswith((".usd", ".usda", ".usdc")) else None
+    yield _USD if names[0].lower().endswith((".usd", ".usda", ".usdc")) else None
     hint = "save each as .npy; 'splatlift pack npy' makes a feature pack of them"
     yield FileKind(None, "NumPy arrays (.npz)", hint) if suffixes == {".npy"} else None
     yield _BY_SUFFIX[".ssproj"] if "document.json" in lasts and ".ply" in suffixes else None

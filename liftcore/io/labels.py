@@ -12,13 +12,11 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.files import open_regular
 from liftcore.scene.kernel import NORMALS
 
 if TYPE_CHECKING:
@@ -28,7 +26,6 @@ FORMAT = "splatlift-labels/1"
 COLUMN = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]{0,63}")  # a name that readers of PLY take
 IDS = ("instance_id", "class_id", "node_id")  # columns of whole numbers, 0 for none
 MAX_COLUMNS = 256  # of a file that is not a PLY
-MAX_DOCUMENT_BYTES = 64 << 20
 KINDS = ("instances", "classes", "nodes")  # of the document, by the columns above
 
 
@@ -87,31 +84,8 @@ def document_bytes(labels: Labels) -> bytes:
     return json.dumps(labels.document, ensure_ascii=False, indent=1).encode() + b"\n"
 
 
-# Characters that JSON does not escape, and that readers of lines take for line ends
-LINE_ENDS = {ord(character): f"\\u{ord(character):04x}" for character in "\x85\u2028\u2029"}
-
-
-def document_lines(labels: Labels) -> bytes:
-    """Return the nodes if there are any, else the instances, as JSON Lines with the shared entries on each line."""
-    names = ("format", "made_by", "frame", "world", "unit")
-    shared = {name: labels.document[name] for name in names if name in labels.document}
-    objects = labels.document.get("nodes") or labels.document.get("instances", [])
-    rows = (json.dumps(item | shared, ensure_ascii=False).translate(LINE_ENDS) for item in objects)
-    return "".join(f"{row}\n" for row in rows).encode()
-
-
 def rows_by_id(document: dict[str, Any], kind: str) -> list[dict[str, Any]]:
     """Return the rows of one of KINDS, indexed by their ids; an empty row for an id without one."""
     name = IDS[KINDS.index(kind)]
     rows = {row[name]: row for row in document.get(kind, [])}
     return [rows.get(place, {}) for place in range(max(rows, default=0) + 1)]
-
-
-def read_document(path: Path) -> dict[str, Any]:
-    """Return the document of a JSON file; empty where there is none of its format, or no such file."""
-    try:
-        with open_regular(path) as handle:
-            document = json.loads(handle.read(MAX_DOCUMENT_BYTES))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return document if isinstance(document, dict) and document.get("format") == FORMAT else {}

@@ -31,7 +31,6 @@ OUTPUT_TYPES = {
     "pack": OutputType("a feature pack", (".safetensors",), "features"),
     "csv": OutputType("a table", (".csv",), None),
     "json": OutputType("JSON", (".json",), None),
-    "jsonl": OutputType("JSON Lines", (".jsonl",), None),
 }
 CONVERTED = (".sog", ".html", ".csv", ".compressed.ply", ".splat", ".spz")  # which splat-transform writes
 

@@ -20,15 +20,15 @@ from liftcore.io import ply
 from liftcore.io.checkpoint import read_checkpoint
 from liftcore.io.compressed_ply import read_compressed_ply
 from liftcore.io.files import whole_file
-from liftcore.io.gltf import read_gltf, read_gltf_document
+from liftcore.io.gltf import read_gltf
 from liftcore.io.gltf_writer import gltf_blocks
 from liftcore.io.kinds import CONVERT, SplatFormat, identify, wrong_kind
-from liftcore.io.labels import COLUMN, IDS, Labels, id_column, read_document
+from liftcore.io.labels import COLUMN, Labels
 from liftcore.io.quantised import Fields
 from liftcore.io.sog import is_bundled, read_sog, sog_files
 from liftcore.io.splat import ROW, read_splat, splat_blocks
-from liftcore.io.spz import read_spz, read_spz_document, spz_blocks
-from liftcore.io.usd import read_usd, read_usd_document, usd_blocks
+from liftcore.io.spz import read_spz, spz_blocks
+from liftcore.io.usd import usd_blocks
 from liftcore.runtime.arguments import as_path
 from liftcore.scene.harmonics import constant_terms
 from liftcore.scene.kernel import Kernel, kernel_named
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from liftcore.scene.world import WorldFrame
 
 
-EXPECTED = "splats as PLY, compressed PLY, .splat, .spz, .sog, .glb, .usdz or a checkpoint"
+EXPECTED = "splats as PLY, compressed PLY, .splat, .spz, .sog, .glb or a checkpoint"
 _READERS: dict[SplatFormat, Callable[..., Fields]] = {
     SplatFormat.COMPRESSED_PLY: read_compressed_ply,
     SplatFormat.SPLAT: read_splat,
@@ -51,18 +51,17 @@ _READERS: dict[SplatFormat, Callable[..., Fields]] = {
     SplatFormat.SOG: read_sog,
     SplatFormat.CHECKPOINT: read_checkpoint,
     SplatFormat.GLTF: read_gltf,
-    SplatFormat.USD: read_usd,
 }
 Document = Mapping[str, Any]  # of `liftcore.io.labels`
 _WRITERS: dict[str, Callable[[Splats, Document | None], Iterator[bytes]]] = {
     ".ply": lambda splats, _: ply.ply_blocks(splats),
     ".splat": lambda splats, _: splat_blocks(splats),
-    ".spz": spz_blocks,
+    ".spz": lambda splats, _: spz_blocks(splats),
     ".glb": gltf_blocks,
     ".usdc": usd_blocks,
     ".usdz": partial(usd_blocks, suffix=".usdz"),
 }
-WITH_COLUMNS = (".ply", ".glb", ".spz", ".usdc", ".usdz")  # formats that hold further numbers a splat
+WITH_COLUMNS = (".ply", ".glb", ".usdc", ".usdz")  # formats that hold further numbers a splat
 
 
 def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool = True) -> Splats:
@@ -104,8 +103,9 @@ def write_splats(path: Path | str, splats: Splats, columns: Mapping[str, Any] | 
 
     Args:
         path: a file. A name without a suffix is a PLY.
-        columns: of all but a ``.splat``, further numbers a splat: name -> [P] booleans or numbers of numpy or torch,
-            such as ``{"object": result.object, "score": answer.scores}``; one that the splats have is replaced.
+        columns: of all but ``.splat`` and ``.spz``, further numbers a splat: name -> [P] booleans or numbers of numpy
+            or torch, such as ``{"object": result.object, "score": answer.scores}``; one that the splats have is
+            replaced.
 
     Raises:
         InvalidSplats: ``splats`` are something else; columns have another number of rows, a name that PLY does not
@@ -289,21 +289,7 @@ def some_rows(path: Path, mask: np.ndarray, suffix: str = ".ply", world: WorldFr
     return write(replace(splats[mask], extras={}, layout=(), header=(), **frame), None)
 
 
-def with_columns(path: Path, columns: Mapping[str, np.ndarray]) -> Iterator[bytes]:
-    """Yield a file with further columns, as the bytes of a PLY in blocks; columns of the same name are replaced.
-
-    Args:
-        path: the file. columns: name -> [P] i32 or f32.
-
-    Raises:
-        InvalidSplats: the file is malformed, or has another number of splats.
-    """
-    return labelled(path, Labels(dict(columns), {}))
-
-
-def labelled(
-    path: Path, labels: Labels, suffix: str = ".ply", mask: np.ndarray | None = None, *, prims: bool = False
-) -> Iterator[bytes]:
+def labelled(path: Path, labels: Labels, suffix: str = ".ply", mask: np.ndarray | None = None) -> Iterator[bytes]:
     """Yield a file with labels, as the bytes of a PLY or of another format that has columns, in blocks.
 
     From a PLY to a PLY all else stays byte for byte; from another format the PLY has the layout of its kernel.
@@ -311,16 +297,12 @@ def labelled(
     Args:
         path: the file. labels: of its splats; columns that it has are replaced. suffix: of what is written.
             The document's ``world`` is that of the splats.
-        mask: [P] bool, the rows to keep; None: all. prims: of USD, True: each object is a prim (`usd_blocks`).
+        mask: [P] bool, the rows to keep; None: all.
 
     Raises:
         InvalidSplats: the file is malformed or has another number of splats, or the format holds no columns.
     """
     write = _writer_of(suffix, "suffix")
-    if prims:
-        if suffix not in (".usdc", ".usdz"):
-            raise InvalidSplats("suffix", expected=".usdc or .usdz, which have prims", got=repr(suffix))
-        write = partial(usd_blocks, suffix=suffix, prims=True)
     if suffix not in WITH_COLUMNS:
         raise InvalidSplats("suffix", expected=" or ".join(WITH_COLUMNS) + ", which hold labels", got=repr(suffix))
     if suffix == ".ply" and mask is None and format_of(path) is SplatFormat.PLY:
@@ -335,38 +317,6 @@ def labelled(
     world = world_of(labels.document["world"]) if "world" in labels.document else splats.world
     splats = replace(splats, extras={**splats.extras, **columns}, layout=layout, world=world)
     return write(splats, labels.document)
-
-
-def read_labels(path: Path | str) -> Labels:
-    """Read the labels in a splat file: columns of ``instance_id`` and ``class_id``, and their document.
-
-    A PLY has its document beside it (``NAME.ply.json``), if anywhere.
-
-    Raises:
-        InvalidSplats: the file is malformed, or has no such column.
-    """
-    path = as_path(path)
-    splats = read_splats(path)
-    columns = {name: column.cpu().numpy() for name, column in splats.extras.items()}
-    if not set(IDS) & columns.keys():
-        hint = "splatlift export writes such files"
-        raise InvalidSplats(str(path), expected=f"a column {' or '.join(IDS)}", got="none", hint=hint)
-    columns = {name: id_column(values) if name in IDS else values for name, values in columns.items()}
-    return Labels(columns, {"world": splats.world.model_dump(mode="json"), **_document_of(path)})
-
-
-def _document_of(path: Path) -> dict[str, Any]:
-    match format_of(path):
-        case SplatFormat.GLTF:
-            return read_gltf_document(path)
-        case SplatFormat.USD:
-            return read_usd_document(path)
-        case SplatFormat.SPZ:
-            return read_spz_document(path)
-        case SplatFormat.PLY:
-            return read_document(path.with_name(f"{path.name}.json"))
-        case _:
-            return {}
 
 
 def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:

@@ -8,22 +8,20 @@ sizes of the sections' zstd streams, then these.
 
 The frame is right, up, back (RUB) unless an extension declares another of 16. PLYs and cameras are in right, down,
 front (RDF): axes are turned, and quaternions and harmonics with them. A flag records that the splats were trained
-antialiased. The format is of nianticlabs/spz. What is written has version 3, which every reader knows, or version 4
-where splats have labels, which are an extension (`liftcore.io.spz_labels`).
+antialiased. The format is of nianticlabs/spz. What is written has version 3, which every reader knows.
 """
 
 from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.labels import stored_columns
 from liftcore.io.quantised import (
     MOST_GROWTH,
     REST_INDICES,
@@ -35,10 +33,8 @@ from liftcore.io.quantised import (
     logits,
     smallest_three,
 )
-from liftcore.io.spz_labels import label_record, read_label_record, records
 from liftcore.scene.harmonics import SH_C0, band_rotation
 from liftcore.scene.render_mode import RenderMode, RenderModel
-from liftcore.scene.world import world_of
 
 if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
@@ -119,39 +115,20 @@ def read_spz(path: Path, *, colour: bool = True) -> Fields:
         (table,) = struct.unpack_from("<I", start, HEADER_BYTES)
         zone = content[STREAMS_HEADER_BYTES : max(table, STREAMS_HEADER_BYTES)]
         frame, sections = _declared_frame(zone, path), _streams(content, table, streams, sizes, path)
-        labels = read_label_record(zone, count) if flags & HAS_EXTENSIONS else None
     else:
         body = np.frombuffer(_inflate(unpacking, unpacking.unconsumed_tail, sum(sizes), path), np.uint8)
         behind = _inflate(unpacking, unpacking.unconsumed_tail, 0, path)
         frame = _declared_frame(behind, path) if flags & HAS_EXTENSIONS else RUB
-        sections, labels = np.split(body, np.cumsum(sizes)[:-1]), None
+        sections = np.split(body, np.cumsum(sizes)[:-1])
     fields = _decode(sections, version, degree if colour else 0, 2.0**-bits, frame, colour=colour)
     fields["render_mode"] = RenderMode(RenderModel.ANTIALIASED, FLAG) if flags & ANTIALIASED else None
-    if labels:
-        fields |= {"world": world_of(labels.document.get("world"))} | ({"extras": labels.columns} if colour else {})
     return fields
 
 
-def read_spz_document(path: Path) -> dict[str, Any]:
-    """Read the document of the labels in a file of version 4; empty without labels."""
-    with path.open("rb") as handle:
-        start = handle.read(STREAMS_HEADER_BYTES)
-        if start[:4] != MAGIC:
-            return {}
-        _, count, *_ = _header(start, path)
-        (table,) = struct.unpack_from("<I", start, HEADER_BYTES)
-        labels = read_label_record(handle.read(max(table - STREAMS_HEADER_BYTES, 0)), count)
-    return labels.document if labels else {}
-
-
-def spz_blocks(splats: Splats, document: Mapping[str, Any] | None = None) -> Iterator[bytes]:
+def spz_blocks(splats: Splats) -> Iterator[bytes]:
     """Yield the bytes of an ``.spz`` file of any splats (`gaussian_rows`), in blocks, in the format's frame.
 
     Means have as many fractional bits as their reach leaves, 20 at most. Harmonics above degree 3 are left out.
-    Splats with extras make a file of version 4, which holds these and the document.
-
-    Args:
-        splats: P. document: of `liftcore.io.labels`, or None.
 
     Raises:
         InvalidSplats: a mean lies beyond what 24 bits reach.
@@ -167,28 +144,11 @@ def spz_blocks(splats: Splats, document: Mapping[str, Any] | None = None) -> Ite
         for section, part in zip(sections, _encode(block, bits, (degree + 1) ** 2 - 1), strict=True):
             section.append(part.tobytes())
     flags = ANTIALIASED if splats.antialiased else 0
-    if columns := stored_columns(splats):
-        head = (MAGIC, 4, splats.count, degree, bits, flags | HAS_EXTENSIONS)
-        document = {"world": splats.world.model_dump(mode="json"), **(document or {})}
-        yield from _version_4(head, label_record(columns, document), [b"".join(section) for section in sections])
-        return
     packing = zlib.compressobj(wbits=31)
     header = struct.pack(HEADER, MAGIC, WRITTEN_VERSION, splats.count, degree, bits, flags, 0)
     for part in (header, *(part for section in sections for part in section)):
         yield packing.compress(part)
     yield packing.flush()
-
-
-def _version_4(head: tuple[Any, ...], extensions: bytes, sections: list[bytes]) -> Iterator[bytes]:
-    import zstandard
-
-    stored_sections = [section for section in sections if section]
-    packed = [zstandard.ZstdCompressor(level=9).compress(section) for section in stored_sections]
-    yield struct.pack(HEADER, *head, len(packed)) + struct.pack("<I12x", STREAMS_HEADER_BYTES + len(extensions))
-    yield extensions
-    for stream, section in zip(packed, stored_sections, strict=True):
-        yield struct.pack("<QQ", len(stream), len(section))
-    yield from packed
 
 
 def _encode(rows: GaussianRows, bits: int, higher: int) -> tuple[np.ndarray, ...]:
@@ -285,9 +245,18 @@ def _streams(content: bytes, table: int, streams: int, sizes: list[int], path: P
     return sections + [np.empty(0, np.uint8)] * (len(sizes) - len(stream_sizes))
 
 
+def _records(extensions: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield number and payload of each extension; of a truncated one the rest."""
+    at = 0
+    while at + 8 <= len(extensions):
+        kind, size = struct.unpack_from("<II", extensions, at)
+        yield kind, extensions[at + 8 : at + 8 + size]
+        at += 8 + size
+
+
 def _declared_frame(extensions: bytes, path: Path) -> int:
     """Return the frame that one of these extensions declares; RUB if none does."""
-    for kind, payload in records(extensions):
+    for kind, payload in _records(extensions):
         if kind == FRAME_EXTENSION and len(payload) == 4:
             (frame,) = struct.unpack("<I", payload)
             if frame > len(FRAMES):

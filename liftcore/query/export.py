@@ -27,7 +27,7 @@ if TYPE_CHECKING:  # these load torch
     from liftcore.query.segment import Segmentation
     from liftcore.scene.cameras import Camera
 
-OF_LABELS = ("labelled", "prims", "names", "lines", "masks")  # files with labels of all splats
+OF_LABELS = ("labelled", "names", "masks")  # files with labels of all splats
 FILES = {  # kind of a source -> the files that can be made of it
     "answer": ("object", "coloured", "scores", "selection", "mask", "attention", "overlay", *OF_LABELS),
     "answers": OF_LABELS,
@@ -39,7 +39,7 @@ FILES = {  # kind of a source -> the files that can be made of it
 }
 
 BY_SUFFIX = {  # suffix of a name -> file of sources with several classes
-    **dict.fromkeys((".glb", ".spz", ".usdc", ".usdz"), "labelled"), ".json": "masks", ".jsonl": "lines",
+    **dict.fromkeys((".glb", ".spz", ".usdc", ".usdz"), "labelled"), ".json": "masks",
 }  # fmt: skip
 OF_CATALOGUE = BY_SUFFIX | {".ply": "labelled"}  # a segmentation's .ply has its colours instead
 
@@ -138,19 +138,18 @@ def _of_labels(
     suffix: str,
     view: str | Camera | None,
 ) -> Iterable[bytes]:
-    from liftcore.io.labels import document_bytes, document_lines
+    from liftcore.io.labels import document_bytes
     from liftcore.io.splats import labelled
     from liftcore.query.labels import labels
 
     columns = labels(scene, source)
-    if content in ("labelled", "prims"):
-        prims = content == "prims"
-        return labelled(scene.splat_file, columns, suffix or (".usdc" if prims else ".ply"), prims=prims)
+    if content == "labelled":
+        return labelled(scene.splat_file, columns, suffix or ".ply")
     if content == "masks":
         from liftcore.query.coco import masks_json
 
         return masks_json(scene, columns, [view] if isinstance(view, str) else None)
-    return [document_bytes(columns) if content == "names" else document_lines(columns)]
+    return [document_bytes(columns)]
 
 
 def _require_view(view: str | Camera | None) -> str | Camera:
@@ -163,7 +162,7 @@ def object_splats(scene: OpenedLift, answer: Answer, suffix: str = ".ply") -> It
     """Write the splats of an answer's objects as a file, in blocks; a PLY has all their properties unchanged.
 
     They are those of `objects` and masks, without unassigned splats; of more than are grouped, all selected ones.
-    Other formats than PLY and ``.splat`` have their labels, too.
+    A ``.glb`` and USD have their labels, too.
 
     Raises:
         InvalidQuery: no splat is selected, or the object is absent: most viewers open no file without splats; or
@@ -185,7 +184,7 @@ def object_splats(scene: OpenedLift, answer: Answer, suffix: str = ".ply") -> It
         )
     is_ungrouped = answer.count > MOST_SPLATS and not answer.query.keeps_some
     mask = answer.selected if is_ungrouped else objects(scene, answer).numbers >= 0
-    if suffix in (".glb", ".spz", ".usdc", ".usdz") and not is_ungrouped:
+    if suffix in (".glb", ".usdc", ".usdz") and not is_ungrouped:
         return labelled(scene.splat_file, labels(scene, answer), suffix, mask)
     return some_rows(scene.splat_file, mask, suffix, scene.world)
 

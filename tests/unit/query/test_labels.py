@@ -10,15 +10,24 @@ import pytest
 
 from liftcore.cli import main
 from liftcore.errors import InvalidQuery
-from liftcore.io.labels import Labels, document_lines
-from liftcore.io.splats import read_labels, read_splats
+from liftcore.io.labels import Labels
+from liftcore.io.splats import read_splats
 from liftcore.query.coco import run_lengths
 from liftcore.query.question import Query
 from liftcore.query.scene import Scene
 from liftcore.query.terms import Region, Vector
 from tests.tiny_scene import CHANNELS, SPLATS_A_CLUSTER, VIEWS, WORDS, text_table
 from tests.unit.query.test_catalogue import with_parts
-from tests.unit.scene.test_usd import needs_usd
+from tests.unit.scene.test_gltf import document_of
+
+
+def read_labels(path: Path) -> Labels:
+    """Read the columns and the document of a ``.ply`` or a ``.glb``."""
+    columns = {name: column.numpy() for name, column in read_splats(path).extras.items()}
+    if path.suffix == ".glb":
+        return Labels(columns, document_of(path))
+    return Labels(columns, json.loads(path.with_name(f"{path.name}.json").read_text(encoding="utf-8")))
+
 
 EYE = np.eye(3, CHANNELS, dtype=np.float32)
 CLUSTER = np.repeat(np.arange(3), SPLATS_A_CLUSTER)
@@ -70,7 +79,7 @@ def tree_scene(scene: Scene, tmp_path: Path) -> Scene:
     return Scene(tmp_path / "parts.lift.safetensors", scene.splats, scene.cameras)
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".glb", ".spz", pytest.param(".usdc", marks=needs_usd)])
+@pytest.mark.parametrize("suffix", [".ply", ".glb"])
 def test_files_of_a_tree_come_back_with_paths_and_the_smallest_nodes(
     tree_scene: Scene, tmp_path: Path, suffix: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -97,14 +106,8 @@ def test_files_of_a_tree_come_back_with_paths_and_the_smallest_nodes(
         assert list(tree_node["path"]) == [tree_node["instance_id"]]
 
 
-def test_lines_and_masks_of_a_tree_have_its_parts(tree_scene: Scene, tmp_path: Path) -> None:
+def test_masks_of_a_tree_have_its_parts(tree_scene: Scene, tmp_path: Path) -> None:
     tree = tree_scene.tree()
-    tree_scene.export(tmp_path / "o.jsonl", tree)
-    lines = [json.loads(line) for line in (tmp_path / "o.jsonl").read_text(encoding="utf-8").splitlines()]
-    assert [record["path"] for record in lines] == [[1], [2], [3], [1, 4], [1, 5]]
-    text = document_lines(Labels({}, {"instances": [{"name": "a\u2028b\x85\u2029"}]}))
-    (line,) = text.decode().splitlines()
-    assert json.loads(line)["name"] == "a\u2028b\x85\u2029"
     tree_scene.export(tmp_path / "m.json", tree)
     document = json.loads((tmp_path / "m.json").read_text(encoding="utf-8"))
     assert document["categories"] == [{"id": 0, "name": "object"}]
@@ -128,13 +131,6 @@ def test_run_lengths_are_columns_and_begin_with_zeros() -> None:
     assert run_lengths(np.array([[1, 0], [1, 0], [0, 1]])) == {1: [0, 2, 3, 1]}
     assert run_lengths(np.array([[0, 7], [2, 7]])) == {2: [1, 1, 2], 7: [2, 2]}
     assert run_lengths(np.zeros((2, 2))) == {}
-
-
-def test_objects_are_lines_of_json(scene: Scene, tmp_path: Path) -> None:
-    scene.export(tmp_path / "o.jsonl", scene.catalogue(WORDS, EYE))
-    lines = [json.loads(line) for line in (tmp_path / "o.jsonl").read_text(encoding="utf-8").splitlines()]
-    assert sorted(record["name"] for record in lines) == sorted(WORDS)
-    assert all({"box", "oriented_box", "score", "views", "frame"} <= record.keys() for record in lines)
 
 
 def test_the_command_writes_what_the_suffix_says(
@@ -169,7 +165,6 @@ def test_the_command_writes_what_the_suffix_says(
     assert all(np.array_equal(ply.columns[name], values) for name, values in labelled.columns.items())
     assert read_splats(export("object.glb", "--object", "1")).count == SPLATS_A_CLUSTER
     assert read_splats(export("scene.spz")).count == 3 * SPLATS_A_CLUSTER
-    assert len(export("objects.jsonl").read_text().splitlines()) == 3
     labels = read_labels(export("lamp.glb", "--text", "lamp", "--only", *words[1:]))
     assert {entry["name"] for entry in labels.document["instances"]} == {"lamp"} and (
         labels.columns["class_id"] == 1

@@ -22,7 +22,7 @@ from liftcore.io.gltf_writer import gltf_blocks
 from liftcore.io.kinds import SplatFormat
 from liftcore.io.labels import Labels
 from liftcore.io.quantised import gaussian_rows
-from liftcore.io.splats import format_of, labelled, read_labels, read_places, read_splats, write_splats
+from liftcore.io.splats import format_of, labelled, read_places, read_splats, write_splats
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
 from tests.scenes import random_splats
@@ -141,19 +141,22 @@ def labels() -> Labels:
     return Labels({name: values.astype(kinds[name]) for name, values in columns.items()}, document)
 
 
-@pytest.mark.parametrize("suffix", [".glb", ".spz"])
-def test_labels_come_back_with_names_boxes_and_all_that_is_said_of_them(suffix: str, tmp_path: Path) -> None:
+def document_of(path: Path) -> dict[str, Any]:
+    return parts_of(path)[0]["asset"]["extras"]["splatlift_labels"]
+
+
+def test_labels_come_back_and_the_document_is_in_the_file(tmp_path: Path) -> None:
     expected = labels()
     write_splats(tmp_path / "s.ply", some_splats())
-    (tmp_path / f"s{suffix}").write_bytes(b"".join(labelled(tmp_path / "s.ply", expected, suffix)))
-    copy = read_labels(tmp_path / f"s{suffix}")
-    assert {kind: copy.document[kind] for kind in ("instances", "classes")} == expected.document
+    (tmp_path / "s.glb").write_bytes(b"".join(labelled(tmp_path / "s.ply", expected, ".glb")))
+    assert document_of(tmp_path / "s.glb") == expected.document
+    extras = read_splats(tmp_path / "s.glb").extras
     for name, values in expected.columns.items():
-        np.testing.assert_array_equal(copy.columns[name], values)
+        np.testing.assert_array_equal(extras[name], values)
     mask = np.arange(P) % 3 == 1
-    (tmp_path / "t").write_bytes(b"".join(labelled(tmp_path / "s.ply", expected, suffix, mask)))
-    subset = read_labels(tmp_path / "t")
-    assert [row["name"] for row in subset.document["classes"]] == ["plate"] and set(subset.columns["class_id"]) == {1}
+    (tmp_path / "t.glb").write_bytes(b"".join(labelled(tmp_path / "s.ply", expected, ".glb", mask)))
+    assert [row["name"] for row in document_of(tmp_path / "t.glb")["classes"]] == ["plate"]
+    assert set(read_splats(tmp_path / "t.glb").extras["class_id"].tolist()) == {1}
 
 
 def test_feature_ids_of_others_count_from_one_with_zero_for_none(tmp_path: Path) -> None:
@@ -169,9 +172,8 @@ def test_feature_ids_of_others_count_from_one_with_zero_for_none(tmp_path: Path)
     assert extras["class_id"].tolist() == [1, 2] * 20  # of an attribute alone, every id is a feature
 
 
-@pytest.mark.parametrize("suffix", [".glb", ".spz"])
-def test_columns_come_back_or_are_refused(suffix: str, tmp_path: Path) -> None:
-    path, splats = tmp_path / f"s{suffix}", some_splats()
+def test_columns_come_back_or_are_refused(tmp_path: Path) -> None:
+    path, splats = tmp_path / "s.glb", some_splats()
     columns = {f"c{number}": np.full(P, number / 4, np.float32) for number in range(256)}
     write_splats(path, splats, columns)
     extras = read_splats(path).extras
@@ -180,7 +182,7 @@ def test_columns_come_back_or_are_refused(suffix: str, tmp_path: Path) -> None:
     }
     ids = np.tile([3.0, np.nan, -1.0, 4e9], P // 4)  # as editors may leave them
     write_splats(path, splats, {"instance_id": ids})
-    assert read_labels(path).columns["instance_id"].tolist() == [3, 0, 0, 0] * (P // 4)
+    assert read_splats(path).extras["instance_id"].tolist() == [3, 0, 0, 0] * (P // 4)
     with pytest.raises(InvalidSplats, match="whole numbers"):
         write_splats(path, splats, {"tag": np.full(P, 4_000_000_000, np.uint32)})
     with pytest.raises(InvalidSplats, match="at most"):
@@ -193,22 +195,14 @@ def test_columns_that_would_share_an_attribute_are_refused(tmp_path: Path) -> No
             write_splats(tmp_path / "s.glb", some_splats(), {name: np.arange(P) for name in names})
 
 
-def test_tables_and_numbers_of_others_may_be_anything(tmp_path: Path) -> None:
+def test_attributes_of_others_may_have_any_number(tmp_path: Path) -> None:
     write_splats(tmp_path / "s.glb", some_splats(), {"instance_id": np.arange(P) % 3})
     document, binary = parts_of(tmp_path / "s.glb")
     document["meshes"][0]["primitives"][0]["attributes"]["_FEATURE_ID_" + "9" * 5000] = 0
-    metadata = document["extensions"]["EXT_structural_metadata"]
-    member = {"type": "SCALAR", "componentType": "FLOAT32"}
-    metadata["schema"]["classes"]["instance"]["properties"] = {"box_low": member, "box_high": member}
-    metadata["propertyTables"][0]["properties"] = {name: {"values": 0} for name in ("box_low", "box_high")}
-    result = read_labels(join(tmp_path / "t.glb", document, binary))
-    assert [set(row) for row in result.document["instances"]] == [{"instance_id"}] * 2
+    extras = read_splats(join(tmp_path / "t.glb", document, binary)).extras
+    assert extras["instance_id"].tolist() == (np.arange(P) % 3).tolist()
 
 
-def test_labels_change_nothing_else_of_an_spz(tmp_path: Path) -> None:
-    write_splats(tmp_path / "s.ply", some_splats())
-    write_splats(tmp_path / "plain.spz", some_splats())
-    (tmp_path / "labelled.spz").write_bytes(b"".join(labelled(tmp_path / "s.ply", labels(), ".spz")))
-    without_labels, with_labels = read_splats(tmp_path / "plain.spz"), read_splats(tmp_path / "labelled.spz")
-    for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
-        assert torch.equal(getattr(without_labels, name), getattr(with_labels, name)), name
+def test_spz_holds_no_columns(tmp_path: Path) -> None:
+    with pytest.raises(InvalidSplats, match=r"\.ply or \.glb"):
+        write_splats(tmp_path / "s.spz", some_splats(), {"instance_id": np.arange(P)})

@@ -15,8 +15,9 @@ from plyfile import PlyData
 
 import liftcore as lc
 from liftcore.evaluate.inspect import describe_cameras, describe_splats
+from liftcore.io.labels import Labels
 from liftcore.io.splat import splat_blocks
-from liftcore.io.splats import read_places, read_splats, some_rows, with_columns, write_splats
+from liftcore.io.splats import labelled, read_places, read_splats, some_rows, write_splats
 from liftcore.io.spz import spz_blocks
 from liftcore.lifting import pipeline
 from liftcore.lifting.engines.base import LocalEngine
@@ -200,7 +201,7 @@ def test_every_file_gives_the_positions_that_it_holds(name: str, tmp_path: Path)
     (tmp_path / "some.ply").write_bytes(b"".join(some_rows(path, mask)))
     assert np.abs(read_splats(tmp_path / "some.ply").positions() - actual.positions()[mask]).max() <= ROUNDING
     numbers = {"object": np.arange(200, dtype=np.int32)}
-    (tmp_path / "more.ply").write_bytes(b"".join(with_columns(path, numbers)))
+    (tmp_path / "more.ply").write_bytes(b"".join(labelled(path, Labels(numbers, {}))))
     assert np.abs(read_splats(tmp_path / "more.ply").positions() - actual.positions()).max() <= ROUNDING
     # The formats of viewers are about the origin: they have no room for it.
     for suffix, blocks in ((".splat", splat_blocks), (".spz", spz_blocks)):

@@ -16,7 +16,8 @@ import torch
 import liftcore as lc
 from liftcore.errors import InvalidSettings, InvalidSplats
 from liftcore.evaluate.inspect import inspect_file
-from liftcore.io.splats import read_splats, some_rows, with_columns, write_splats
+from liftcore.io.labels import Labels
+from liftcore.io.splats import labelled, read_splats, some_rows, write_splats
 from liftcore.query.render import _as_trained as params_of_renders
 from liftcore.query.scene import Scene
 from liftcore.scene.kernel import Kernel
@@ -178,7 +179,7 @@ def test_exports_say_how_their_splats_were_trained(tmp_path: Path) -> None:
     for suffix in (".ply", ".spz"):
         (tmp_path / f"copy{suffix}").write_bytes(b"".join(some_rows(mip, mask, suffix)))
         assert read_splats(tmp_path / f"copy{suffix}").antialiased
-    (tmp_path / "c.ply").write_bytes(b"".join(with_columns(mip, {"score": np.ones(40, np.float32)})))
+    (tmp_path / "c.ply").write_bytes(b"".join(labelled(mip, Labels({"score": np.ones(40, np.float32)}, {}))))
     assert read_splats(tmp_path / "c.ply").antialiased
     mip_ply = ply_saying(tmp_path, "comment SplatRenderMode: mip")
     (tmp_path / "c.ply").write_bytes(b"".join(some_rows(mip_ply, mask)))

@@ -1,7 +1,8 @@
-"""OpenUSD particle fields, written and read back, with a subset of points an object."""
+"""OpenUSD particle fields, one an object, as OpenUSD itself reads them."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -9,12 +10,15 @@ import numpy as np
 import pytest
 
 from liftcore.errors import InvalidSplats, Unavailable
-from liftcore.evaluate.inspect import inspect_file
-from liftcore.io.kinds import SplatFormat
-from liftcore.io.splats import format_of, labelled, read_labels, read_places, read_splats, write_splats
-from liftcore.io.usd import open_library, usd_blocks
+from liftcore.io.quantised import gaussian_rows
+from liftcore.io.splats import labelled, read_splats, write_splats
+from liftcore.io.usd import open_library
 from liftcore.scene.kernel import Kernel
-from tests.unit.scene.test_gltf import P, assert_same, labels, some_splats
+from liftcore.scene.quaternions import rotation_matrices
+from liftcore.scene.world import WorldFrame
+from tests.unit.scene.test_gltf import P, labels, some_splats
+
+TO_FILE = np.diag([1.0, -1.0, -1.0])  # right, down, front to right, up, back
 
 
 def has_usd() -> bool:
@@ -32,122 +36,61 @@ needs_usd = pytest.mark.skipif(not HAS_USD, reason="usd-core is not installed: i
 def test_without_the_library_the_extra_is_named(tmp_path: Path) -> None:
     with pytest.raises(Unavailable, match=r"splatlift\[formats\]"):
         write_splats(tmp_path / "s.usdc", some_splats())
-    (tmp_path / "t.usdc").write_bytes(b"PXR-USDC" + bytes(90))
-    with pytest.raises(Unavailable, match=r"splatlift\[formats\]"):
-        read_splats(tmp_path / "t.usdc")
 
 
-def test_a_scene_that_may_lead_elsewhere_is_not_taken_from_strangers(tmp_path: Path) -> None:
-    (tmp_path / "t.usdc").write_bytes(b"PXR-USDC" + bytes(90))
-    assert format_of(tmp_path / "t.usdc") is SplatFormat.USD
-    with pytest.raises(InvalidSplats, match="may lead to other files"):
-        inspect_file(tmp_path / "t.usdc", "splats", trusted=False)
+@pytest.mark.parametrize("name", ["t.usdc", "t.usdz", "t.ply"])
+def test_usd_is_refused_with_what_to_give(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(b"PXR-USDC" + bytes(90))
+    with pytest.raises(InvalidSplats, match=r"a USD scene; .*\.ply or \.glb"):
+        read_splats(tmp_path / name)
 
 
 @needs_usd
 @pytest.mark.parametrize("kernel", Kernel)
 @pytest.mark.parametrize("suffix", [".usdc", ".usdz"])
-def test_every_kernel_comes_back_as_the_gaussians_that_were_written(
+def test_objects_are_particle_fields_with_their_rows_and_validators_find_nothing(
     kernel: Kernel, suffix: str, tmp_path: Path
 ) -> None:
-    write_splats(tmp_path / f"s{suffix}", some_splats(kernel))
-    assert format_of(tmp_path / f"s{suffix}") is SplatFormat.USD
-    assert_same(read_splats(tmp_path / f"s{suffix}"), some_splats(kernel))
-
-
-@needs_usd
-def test_objects_are_subsets_index_for_index_and_validators_find_nothing(tmp_path: Path) -> None:
-    pxr = open_library()
-    expected = labels()
-    write_splats(tmp_path / "s.ply", some_splats())
-    (tmp_path / "s.usdc").write_bytes(b"".join(labelled(tmp_path / "s.ply", expected, ".usdc")))
-    actual = read_labels(tmp_path / "s.usdc")
-    assert {kind: actual.document[kind] for kind in expected.document} == expected.document
-    for name, values in expected.columns.items():
-        np.testing.assert_array_equal(actual.columns[name], values)
-    stage = pxr.Usd.Stage.Open(str(tmp_path / "s.usdc"))
-    for row in expected.document["instances"]:
-        subset = pxr.UsdGeom.Subset.Get(stage, f"/Scene/Splats/instance_{row['instance_id']}")
-        inside = np.flatnonzero(expected.columns["instance_id"] == row["instance_id"])
-        assert list(subset.GetIndicesAttr().Get()) == inside.tolist()
-        assert list(pxr.UsdSemantics.LabelsAPI(subset.GetPrim(), "class").GetLabelsAttr().Get()) == [row["name"]]
-    validation = import_module("pxr.UsdValidation")
-    validators = validation.ValidationRegistry().GetOrLoadAllValidators()
-    assert len(validators) > 10 and not validation.ValidationContext(validators).Validate(stage)
-
-
-@needs_usd
-@pytest.mark.parametrize("suffix", [".usdc", ".usdz"])
-@pytest.mark.parametrize("kernel", Kernel)
-def test_objects_as_prims_of_their_own_come_back_row_for_row(kernel: Kernel, suffix: str, tmp_path: Path) -> None:
-    pxr, expected = open_library(), labels()
-    write_splats(tmp_path / "s.ply", some_splats(kernel))
-    (tmp_path / f"s{suffix}").write_bytes(b"".join(labelled(tmp_path / "s.ply", expected, suffix, prims=True)))
-    actual, splats = read_labels(tmp_path / f"s{suffix}"), read_splats(tmp_path / f"s{suffix}")
-    assert_same(splats, some_splats(kernel))
-    np.testing.assert_array_equal(read_places(tmp_path / f"s{suffix}"), splats.positions())
-    assert {kind: actual.document[kind] for kind in expected.document} == expected.document
-    assert actual.columns.keys() == expected.columns.keys()
-    for name, values in expected.columns.items():
-        np.testing.assert_array_equal(actual.columns[name], values)
+    pxr, expected, splats = open_library(), labels(), some_splats(kernel)
+    write_splats(tmp_path / "s.ply", splats)
+    (tmp_path / f"s{suffix}").write_bytes(b"".join(labelled(tmp_path / "s.ply", expected, suffix)))
     stage = pxr.Usd.Stage.Open(str(tmp_path / f"s{suffix}"))
-    for row in expected.document["instances"]:
-        prim = stage.GetPrimAtPath(f"/Scene/instance_{row['instance_id']}")
-        inside = np.flatnonzero(expected.columns["instance_id"] == row["instance_id"])
-        assert len(prim.GetAttribute("positions").Get()) == len(inside)
-        assert list(pxr.UsdSemantics.LabelsAPI(prim, "class").GetLabelsAttr().Get()) == [row["name"]]
+    (rows,) = gaussian_rows(splats)
+    names = {row["instance_id"]: row["name"] for row in expected.document["instances"]}
+    for number in (0, *names):
+        prim = stage.GetPrimAtPath(f"/Scene/instance_{number}" if number else "/Scene/Splats")
+        inside = np.flatnonzero(expected.columns["instance_id"] == number)
+
+        def read(name: str, prim=prim) -> np.ndarray:
+            return np.array(prim.GetAttribute(name).Get())
+
+        assert read("primvars:splatlift_row").tolist() == inside.tolist()
+        np.testing.assert_array_equal(read("primvars:class_id"), expected.columns["class_id"][inside])
+        np.testing.assert_allclose(read("positions"), splats.positions()[inside] @ TO_FILE, atol=1e-6)
+        np.testing.assert_allclose(read("scales"), rows.scales[inside], rtol=1e-6)
+        np.testing.assert_allclose(read("opacities"), rows.opacities[inside], atol=1e-6)
+        turns = rotation_matrices(np.roll(read("orientations"), 1, axis=1).astype(np.float64))
+        np.testing.assert_allclose(turns, TO_FILE @ rotation_matrices(rows.quats[inside]), atol=1e-5)
+        terms = read("radiance:sphericalHarmonicsCoefficients").reshape(len(inside), -1, 3)
+        assert splats.sh is not None
+        np.testing.assert_allclose(terms[:, 0], splats.sh[inside, 0], atol=1e-6)
+        if number:
+            label = pxr.UsdSemantics.LabelsAPI(prim, "class").GetLabelsAttr().Get()
+            assert list(label) == [names[number]]
     validation = import_module("pxr.UsdValidation")
     validators = validation.ValidationRegistry().GetOrLoadAllValidators()
     assert len(validators) > 10 and not validation.ValidationContext(validators).Validate(stage)
-    stage.RemovePrim("/Scene/instance_1")
-    stage.GetRootLayer().Export(str(tmp_path / "cut.usdc"))
-    assert read_splats(tmp_path / "cut.usdc").count == P - np.count_nonzero(expected.columns["instance_id"] == 1)
 
 
 @needs_usd
-def test_prims_are_of_usd_and_of_labels_alone(tmp_path: Path) -> None:
-    write_splats(tmp_path / "s.ply", some_splats())
-    with pytest.raises(InvalidSplats, match="which have prims"):
-        labelled(tmp_path / "s.ply", labels(), ".glb", prims=True)
-    with pytest.raises(InvalidSplats, match="prims: expected a column instance_id"):
-        b"".join(usd_blocks(some_splats(), prims=True))
-
-
-@needs_usd
-def test_stages_of_others_are_turned_and_their_subsets_are_instances(tmp_path: Path) -> None:
+def test_stage_says_up_and_metres(tmp_path: Path) -> None:
     pxr = open_library()
-    write_splats(tmp_path / "s.usdc", some_splats(), {"instance_id": np.arange(P) % 3})
+    write_splats(tmp_path / "s.usdc", replace(some_splats(), world=WorldFrame(up=(3, 4, 0), metres_per_unit=0.25)))
     stage = pxr.Usd.Stage.Open(str(tmp_path / "s.usdc"))
-    pxr.UsdGeom.PrimvarsAPI(pxr.UsdVol.ParticleField3DGaussianSplat.Get(stage, "/Scene/Splats")).RemovePrimvar(
-        "instance_id"
-    )
-    pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.z)
-    pxr.UsdGeom.XformCommonAPI(stage.GetPrimAtPath("/Scene")).SetTranslate((1.0, 2.0, 3.0))
-    stage.GetRootLayer().Export(str(tmp_path / "t.usda"))
-    actual = read_splats(tmp_path / "t.usda")
-    # What was up (z) is minus y, what was y is to the front.
-    turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) @ np.diag([1.0, -1.0, -1.0])
-    assert_same(actual, some_splats().transformed(rotation=turn, translation=[1.0, -3.0, 2.0]))
-    assert sorted(np.unique(actual.extras["instance_id"], return_counts=True)[1].tolist()) == [13, 13, 14]
+    assert pxr.UsdGeom.GetStageMetersPerUnit(stage) == 0.25 and pxr.UsdGeom.GetStageUpAxis(stage) == "Y"
 
 
 @needs_usd
-@pytest.mark.parametrize("degree", [-1, 2, 100_000, None])
-def test_harmonics_that_do_not_fit_their_degree_are_refused(degree: int | None, tmp_path: Path) -> None:
-    pxr = open_library()
-    write_splats(tmp_path / "s.usdc", some_splats())
-    stage = pxr.Usd.Stage.Open(str(tmp_path / "s.usdc"))
-    attribute = stage.GetPrimAtPath("/Scene/Splats").GetAttribute("radiance:sphericalHarmonicsDegree")
-    attribute.Block() if degree is None else attribute.Set(degree)
-    stage.GetRootLayer().Export(str(tmp_path / "t.usdc"))
-    with pytest.raises(InvalidSplats, match=r"harmonics|sphericalHarmonics"):
-        read_splats(tmp_path / "t.usdc")
-
-
-@needs_usd
-def test_columns_come_back_or_are_refused(tmp_path: Path) -> None:
-    ids = np.tile([3.0, np.nan, -1.0, 4e9], P // 4)
-    write_splats(tmp_path / "s.usdc", some_splats(), {"instance_id": ids})
-    assert read_labels(tmp_path / "s.usdc").columns["instance_id"].tolist() == [3, 0, 0, 0] * (P // 4)
+def test_columns_that_usd_has_no_name_for_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidSplats, match="letters, digits and underscores"):
         write_splats(tmp_path / "s.usdc", some_splats(), {"a.b": np.zeros(P)})

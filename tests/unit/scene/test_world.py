@@ -13,12 +13,10 @@ import pytest
 
 import liftcore as lc
 from liftcore.errors import InvalidInput
-from liftcore.io.splats import labelled, read_labels, read_splats, write_splats
+from liftcore.io.splats import labelled, read_splats, write_splats
 from liftcore.io.transforms import FRAME_FILE
-from liftcore.io.usd import open_library
 from liftcore.scene.world import UNKNOWN, UPRIGHT, WorldFrame
 from tests.unit.scene.test_gltf import FILES, assert_same, join, labels, parts_of, some_splats, write
-from tests.unit.scene.test_usd import needs_usd
 
 SIDEWAYS = WorldFrame(up=(3, 4, 0), metres_per_unit=0.25)
 WORLDS = [UNKNOWN, UPRIGHT, SIDEWAYS, WorldFrame(up=(0, 1, 0)), WorldFrame(metres_per_unit=40)]
@@ -67,12 +65,11 @@ def test_a_frame_moves_with_its_scene() -> None:
 
 
 @pytest.mark.parametrize("world", WORLDS, ids=repr)
-@pytest.mark.parametrize("suffix", [".glb", *(pytest.param(usd, marks=needs_usd) for usd in (".usdc", ".usdz"))])
-def test_a_file_has_its_frame_and_its_splats_as_they_were(world: WorldFrame, suffix: str, tmp_path: Path) -> None:
+def test_a_file_has_its_frame_and_its_splats_as_they_were(world: WorldFrame, tmp_path: Path) -> None:
     for origin in ((0.0, 0.0, 0.0), (5e5, -2e4, 300.0)):
         splats = replace(some_splats(), world=world, origin=origin)
-        write_splats(tmp_path / f"s{suffix}", splats)
-        copy = read_splats(tmp_path / f"s{suffix}")
+        write_splats(tmp_path / "s.glb", splats)
+        copy = read_splats(tmp_path / "s.glb")
         assert copy.world == world
         np.testing.assert_allclose(copy.positions(), splats.positions(), rtol=1e-12, atol=1e-6)
         assert_same(replace(copy, origin=splats.origin, means=splats.means), splats)
@@ -103,38 +100,15 @@ def test_gltf_of_others_is_in_metres_with_y_up() -> None:
     assert read_splats(FILES / "degree3.sog.decoded.ply").world == UNKNOWN
 
 
-@needs_usd
-def test_usd_has_the_metadata_of_the_stage_and_says_only_what_others_wrote(tmp_path: Path) -> None:
-    pxr = open_library()
-    write_splats(tmp_path / "s.usdc", replace(some_splats(), world=SIDEWAYS))
-    stage = pxr.Usd.Stage.Open(str(tmp_path / "s.usdc"))
-    assert pxr.UsdGeom.GetStageMetersPerUnit(stage) == 0.25 and pxr.UsdGeom.GetStageUpAxis(stage) == "Y"
-    stage.GetRootLayer().ClearCustomLayerData()
-    stage.GetRootLayer().Export(str(tmp_path / "other.usdc"))
-    actual = read_splats(tmp_path / "other.usdc")
-    assert actual.world == WorldFrame(up=(0, -1, 0), metres_per_unit=0.25)
-    assert_same(
-        actual, some_splats().transformed(rotation=shortest_turn(np.array(SIDEWAYS.up), np.array([0, -1.0, 0])))
-    )
-    for name in ("upAxis", "metersPerUnit"):
-        stage.ClearMetadata(name)
-    stage.GetRootLayer().Export(str(tmp_path / "silent.usdc"))
-    assert read_splats(tmp_path / "silent.usdc").world == UNKNOWN
-
-
-@pytest.mark.parametrize("suffix", [".glb", ".spz", pytest.param(".usdz", marks=needs_usd)])
-def test_labels_bring_their_frame_along(suffix: str, tmp_path: Path) -> None:
+def test_labels_bring_their_frame_along(tmp_path: Path) -> None:
     write_splats(tmp_path / "s.ply", some_splats())
     label_table = labels()
     label_table.document["world"] = SIDEWAYS.model_dump(mode="json")
-    (tmp_path / f"o{suffix}").write_bytes(b"".join(labelled(tmp_path / "s.ply", label_table, suffix)))
-    world = read_labels(tmp_path / f"o{suffix}").document["world"]
-    assert WorldFrame.model_validate(world) == SIDEWAYS
+    (tmp_path / "o.glb").write_bytes(b"".join(labelled(tmp_path / "s.ply", label_table, ".glb")))
     for colour in (True, False):
-        splats = read_splats(tmp_path / f"o{suffix}", colour=colour)
-        assert splats.world == SIDEWAYS
-    write_splats(tmp_path / f"again{suffix}", read_splats(tmp_path / f"o{suffix}"))
-    assert read_splats(tmp_path / f"again{suffix}").world == SIDEWAYS
+        assert read_splats(tmp_path / "o.glb", colour=colour).world == SIDEWAYS
+    write_splats(tmp_path / "again.glb", read_splats(tmp_path / "o.glb"))
+    assert read_splats(tmp_path / "again.glb").world == SIDEWAYS
 
 
 WRONG: list[dict[str, Any]] = [
