@@ -24,9 +24,6 @@ how cameras are read
 - Lenses: COLMAP's SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV, OPENCV_FISHEYE,
   SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, SIMPLE_FISHEYE and FISHEYE, and
   nerfstudio's k1 to k4, p1, p2. Others are errors.
-- A panorama P (EQUIRECTANGULAR of both) becomes six cameras, the faces of a
-  cube: P@front, P@right, P@back, P@left, P@up and P@down. All six read the
-  features of the photo P.
 """
 
 

@@ -45,12 +45,10 @@ from liftcore.runtime.progress import Progress, shown_progress
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.compositing import CompositingParams
 from liftcore.scene.drawing import in_photo
-from liftcore.scene.panorama import with_panoramas
 from liftcore.scene.render_mode import rendering_reason, rendering_warnings
 from liftcore.scene.splats import Splats
 from liftcore.scene.views import cameras_of_views, first_names
 from liftcore.solve.diagnostics import is_stretched, shape_warnings
-from liftcore.values.lens import photo_as_pinhole_sees
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.pack import Views, pair, read_features
 from liftcore.values.settings import LiftSettings
@@ -139,8 +137,8 @@ def _check(
     notes += [f"cameras: {text}" for text in cameras.warnings]
     if trained.antialiased:
         notes.append(f"splats: rendered antialiased: {rendering_reason(splats.render_mode, True)}")
-    files, panoramas = _paired_photos(photos, cameras, features is not None, wrong, notes)
-    sizes = {name: _photo_of(cameras[name], panoramas[name]) for name in files}
+    files = _paired_photos(photos, cameras, features is not None, wrong, notes)
+    sizes = {name: cameras[name].photo_size for name in files}
     headers = {name: read_header(file) for name, file in files.items()}
     notes += [f"photos: {line}" for line in orientation_warnings(readings_of(headers, sizes), "their cameras")]
     misshapen, found_wrong = _other_shapes(headers, sizes)
@@ -148,9 +146,7 @@ def _check(
     comparable = {name: file for name, file in files.items() if name not in misshapen}
     names = evenly_spaced(list(comparable) or list(cameras), VIEWS)
     with_photo = [name for name in names if name in comparable]
-    pictures = {
-        name: _photo(files[name], sizes[name], cameras[name].photo_size, panoramas[name]) for name in with_photo
-    }
+    pictures = {name: _photo(files[name], sizes[name], cameras[name].photo_size) for name in with_photo}
     raster, views, renders = open_raster(splats, CPU), [], {}
     unfilled: dict[str, np.ndarray] = {}
     for number, name in enumerate(names):
@@ -166,7 +162,7 @@ def _check(
     wrong += _unlike_photos(views, pictures, renders, headers, _Scaled(raster, splats, cameras, trained, background))
     figures: dict[str, float] = {}
     if features is not None:
-        figures, found_wrong = _check_features(features, cameras, files, panoramas)
+        figures, found_wrong = _check_features(features, cameras, files)
         paired_features = pair(features, cameras)[0]
         notes += [
             f"features: {text}"
@@ -187,18 +183,14 @@ def _check(
 
 def _paired_photos(
     photos: Mapping[str, Path], cameras: Cameras, featured: bool, wrong: list[str], notes: list[str]
-) -> tuple[dict[str, Path], dict[str, Camera | None]]:
-    """Pair cameras with photos: camera -> photo, and camera -> itself if its photo is a panorama, else None.
+) -> dict[str, Path]:
+    """Pair cameras with photos: camera -> photo.
 
     Args:
         featured: True if there are features. wrong, notes: lists that messages about the pairs are added to.
     """
-    paired = cameras_of_views(photos, with_panoramas(cameras))
-    photo_of = {name: photos[view] for view, name in paired.items()}
-    faces = {name: camera.face.photo for name, camera in cameras.items() if camera.face is not None}
-    files = {name: photo_of[photo] for name, photo in faces.items() if photo in photo_of and name not in photo_of}
-    panoramas = frozenset(files)  # of which a file is the panorama, and not the camera's own photo
-    files |= {name: file for name, file in photo_of.items() if name in cameras}
+    paired = cameras_of_views(photos, cameras)
+    files = {name: photos[view] for view, name in paired.items()}
     if not photos:
         consequence = "so the features alone tell" if featured else "so nothing tells"
         notes.append(f"photos: none were given, {consequence} whether these cameras are those of the splats")
@@ -214,7 +206,7 @@ def _paired_photos(
             [f"photos: {len(without_photo)} cameras have none: {first_names(without_photo)}"] if without_photo else []
         )
         notes += [f"photos: {len(unpaired)} have no camera: {first_names(unpaired)}"] if unpaired else []
-    return files, {name: cameras[name] if name in panoramas else None for name in files}
+    return files
 
 
 def evenly_spaced(names: Sequence[str], count: int) -> list[str]:
@@ -244,12 +236,6 @@ def _background(
     return float(bool(gains) and _median(gains) > 0)
 
 
-def _photo_of(camera: Camera, panorama: Camera | None) -> tuple[int, int]:
-    """Return width and height of a camera's photo; for a face of a ``panorama``, those of the full panorama."""
-    face = None if panorama is None else panorama.face
-    return camera.photo_size if face is None else (face.width, face.height)
-
-
 def _other_shapes(
     headers: Mapping[str, PhotoHeader], sizes: Mapping[str, tuple[int, int]]
 ) -> tuple[set[str], list[str]]:
@@ -275,16 +261,13 @@ def _other_shapes(
     ]
 
 
-def _photo(path: Path, like: tuple[int, int], size: tuple[int, int], panorama: Camera | None) -> np.ndarray:
-    """Read a photo [H, W, 3] f32 in 0..1 at a size (width, height); of a ``panorama`` the image of that face.
+def _photo(path: Path, like: tuple[int, int], size: tuple[int, int]) -> np.ndarray:
+    """Read a photo [H, W, 3] f32 in 0..1 at a size (width, height).
 
     Args:
         like: width and height that decide the photo's orientation.
     """
     image = read_image(path, like)[0]
-    if panorama is not None and panorama.face is not None:
-        full_image = image.resize((panorama.face.width, panorama.face.height), Image.Resampling.BOX)
-        image = Image.fromarray(photo_as_pinhole_sees(np.asarray(full_image), panorama))
     return np.asarray(image.resize(size, Image.Resampling.BOX), np.float32) / 255
 
 
@@ -446,7 +429,7 @@ def _median(values: Sequence[float]) -> float:
 
 
 def _check_features(
-    features: Views, cameras: Cameras, files: Mapping[str, Path], panoramas: Mapping[str, Camera | None]
+    features: Views, cameras: Cameras, files: Mapping[str, Path]
 ) -> tuple[dict[str, float], list[str]]:
     """Measure features: medians over some views, and messages of what is wrong."""
     views = pair(features, cameras)[0]
@@ -459,7 +442,7 @@ def _check_features(
         elif isinstance(observed, Regions) and name in files:
             labels = observed.labels[-1].numpy()
             size = (labels.shape[1], labels.shape[0])
-            photo = _photo(files[name], size, size, panoramas[name]).mean(axis=2)
+            photo = _photo(files[name], size, size).mean(axis=2)
             mirrored = max(_edges(labels[:, ::-1], photo), _edges(labels[::-1], photo))
             rows.append((_edges(labels, photo), mirrored))
     figures, wrong = {}, unlike_maps(grids)

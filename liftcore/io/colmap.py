@@ -18,7 +18,6 @@ from liftcore.scene.cameras import (
     behind_lens,
     cameras_from,
     check_count,
-    faces_of,
     read_views,
 )
 from liftcore.scene.distortion import Brown, Distortion, Fisheye
@@ -78,9 +77,11 @@ COLMAP_MODELS = (
 )
 MODELS_BY_NAME = {model.name: model for model in COLMAP_MODELS}
 PANORAMA = "EQUIRECTANGULAR"
-READ_MODELS = ", ".join(
-    model.name for model in COLMAP_MODELS if model.distortion is not None or model.name == PANORAMA
+PINHOLES = (
+    "a panorama is no picture of a pinhole: make pinhole photos of it, with nerfstudio's ns-process-data "
+    "--camera-type equirectangular or COLMAP's panorama_sfm.py, and train and lift on those"
 )
+READ_MODELS = ", ".join(model.name for model in COLMAP_MODELS if model.distortion is not None)
 
 
 @dataclass(frozen=True)
@@ -157,7 +158,7 @@ def read_image_names(folder: Path) -> list[str]:
 
 
 def _cameras(name: str, image: _Image, sensors: Mapping[int, _Sensor], files: tuple[Path, Path]) -> list[Camera]:
-    """Return the view of an image, or the six of a panorama; cameras that no image uses may be of any model."""
+    """Return the view of an image; cameras that no image uses may be of any model."""
     sensor, source = sensors.get(image.camera), str(files[1])
     if sensor is None:
         raise InvalidCameras(source, expected="images of known cameras", got=f"{name!r} of camera {image.camera}")
@@ -167,8 +168,6 @@ def _cameras(name: str, image: _Image, sensors: Mapping[int, _Sensor], files: tu
         raise InvalidPose(f"{source} image {name!r}", expected=expected, got=got)
     pose[:3, :3] = rotation_matrices(np.array(image.quaternion))
     pose[:3, 3] = image.translation
-    if sensor.model.name == PANORAMA:
-        return faces_of(name, sensor.width, sensor.height, pose)
     intrinsics, distortion = calibration(sensor.model, sensor.parameters, f"{files[0]} camera {image.camera}")
     camera = Camera.pinhole(name, sensor.width, sensor.height, *intrinsics, viewmat=pose)
     return [camera if distortion is None else behind_lens(camera, distortion)]
@@ -314,7 +313,8 @@ def calibration(model: CameraModel, parameters: Sequence[float], source: str) ->
         InvalidCameras: a parameter is missing, too many or not finite, or the model is one that is not read.
     """
     if model.distortion is None:
-        raise InvalidCameras(source, expected=f"a camera of {READ_MODELS}", got=model.name, hint=UNDISTORT)
+        hint = PINHOLES if model.name == PANORAMA else UNDISTORT
+        raise InvalidCameras(source, expected=f"a camera of {READ_MODELS}", got=model.name, hint=hint)
     if len(parameters) != model.parameters:
         raise InvalidCameras(
             source, expected=f"{model.parameters} parameters of {model.name}", got=str(len(parameters))

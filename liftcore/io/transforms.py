@@ -17,7 +17,7 @@ from typing import Any, Self
 import numpy as np
 
 from liftcore.errors import InvalidCameras, InvalidInput
-from liftcore.io.colmap import PANORAMA, Intrinsics, distortion_of
+from liftcore.io.colmap import PANORAMA, PINHOLES, Intrinsics, distortion_of
 from liftcore.io.json_file import FORMATS, entry, matrix, number, pixels, read_json
 from liftcore.io.photos import PhotoHeader, PhotosBeside
 from liftcore.scene.cameras import (
@@ -27,7 +27,6 @@ from liftcore.scene.cameras import (
     InvalidPose,
     behind_lens,
     check_count,
-    faces_of,
     pose_from,
     read_views,
     viewmat_of,
@@ -173,10 +172,9 @@ def transforms_of(cameras: Mapping[str, Camera]) -> dict[str, Any]:
 
 
 def _cameras(name: str, keys: ChainMap[str, Any], source: str, photos: PhotosBeside | None) -> list[Camera]:
-    """Return the view of a frame, or the six of a panorama."""
+    """Return the view of a frame."""
     location = f"{source} frame {name!r}"
-    panorama = keys.get("camera_model") == PANORAMA
-    distortion = None if panorama else _distortion(keys, location)
+    distortion = _distortion(keys, location)
     width, height = _size(keys, location, photos)
     with pose_from():
         rows = matrix(keys.get("transform_matrix"), (3, 4), 4, f"{location} transform_matrix")
@@ -184,8 +182,6 @@ def _cameras(name: str, keys: ChainMap[str, Any], source: str, photos: PhotosBes
         got = " ".join(f"{value:g}" for value in rows[3])
         raise InvalidPose(f"{location} transform_matrix", expected="0 0 0 1 as the last row", got=got)
     pose = viewmat_of(rows[:3, :3] * CAMERA_AXES["opengl"], rows[:3, 3])
-    if panorama:
-        return faces_of(name, width, height, pose)
     intrinsics = _intrinsics(keys, width, height, location)
     camera = Camera.pinhole(name, width, height, *intrinsics, viewmat=pose)
     return [camera if distortion is None else behind_lens(camera, distortion)]
@@ -254,9 +250,8 @@ def _distortion(keys: ChainMap[str, Any], location: str) -> Distortion | None:
     other = next((key for scope in keys.maps for key in OTHER_LENSES if scope.get(key)), None)
     if model not in (*PERSPECTIVE, FISHEYE) or other:
         got = other or repr(model)[:60]
-        raise InvalidCameras(
-            location, expected=f"a perspective camera, {FISHEYE} or {PANORAMA}", got=got, hint=UNDISTORT
-        )
+        hint = PINHOLES if model == PANORAMA or other in ("equirectangular", "latlong") else UNDISTORT
+        raise InvalidCameras(location, expected=f"a perspective camera or {FISHEYE}", got=got, hint=hint)
     fisheye = model == FISHEYE or bool(keys.get("is_fisheye"))
     candidates = [
         coefficients for scope in keys.maps if (coefficients := _nonzero_coefficients(scope, location)) is not None

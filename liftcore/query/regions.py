@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from liftcore.errors import InvalidFeatures, InvalidQuery, NotFound
+from liftcore.errors import InvalidQuery, NotFound
 from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.question import CoveringRegion
 from liftcore.query.terms import Region
@@ -23,14 +22,10 @@ def regions_of(scene: OpenedLift, view: str, argument: str) -> Regions:
         NotFound: the packs lack the view. InvalidQuery: it is a grid. InvalidLift: a pack moved or changed.
     """
     from liftcore.scene.views import cameras_of_views
-    from liftcore.values.pack import pair
     from liftcore.values.views import Regions
 
     packs = scene.packs
     name = cameras_of_views([view], packs.views).get(view)
-    if name is None and "@" in view and view in scene.cameras:
-        with suppress(InvalidFeatures):
-            packs, name = pair(packs, {view: scene.cameras[view]})[0], view  # a face of a panorama
     if name is None:
         raise NotFound(argument, expected="a view of the lift's feature packs", got=repr(view))
     view_regions = packs[name]

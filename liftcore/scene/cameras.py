@@ -16,7 +16,6 @@ from liftcore.runtime.one_line import join_names, one_line
 from liftcore.scene.compositing import MAX_SIDE
 from liftcore.scene.distortion import Distortion, Lens, Rectangle, shared_lens
 from liftcore.scene.origin import FILE_ORIGIN, MAP_REACH, Origin
-from liftcore.scene.panorama import TURNS, Face
 from liftcore.scene.similarity import Similarity
 from liftcore.scene.views import cameras_of_views, composed, without_image_suffix
 from liftcore.scene.world import UNKNOWN, WorldFrame
@@ -69,7 +68,6 @@ class Camera:
         K: [3, 3] pixels, (fx 0 cx; 0 fy cy; 0 0 1), likewise.
         width: pixels. height: pixels.
         lens: of a distorted photo, which this pinhole stands for; None: the photo has no distortion.
-        face: of a panorama, whose features this pinhole reads; None: of no panorama.
         name: the image's name without its extension; pairs the view with its features. Kept composed (NFC).
 
     Raises:
@@ -83,7 +81,6 @@ class Camera:
     width: int
     height: int
     lens: Lens | None
-    face: Face | None
     name: str
 
     def __init__(
@@ -94,7 +91,6 @@ class Camera:
         height: int,
         *,
         lens: Lens | None = None,
-        face: Face | None = None,
         name: str = "",
     ) -> None:
         if not isinstance(name, str):
@@ -103,7 +99,7 @@ class Camera:
             hint = "read_cameras reads lenses of COLMAP and nerfstudio; undistorted photos need none"
             raise InvalidCameras(f"camera {name!r} lens", expected="a Lens, or None", got=repr(lens)[:80], hint=hint)
         fields = {"viewmat": _matrix(viewmat), "K": _matrix(K), "width": _pixels(width), "height": _pixels(height)}
-        for field, value in {**fields, "lens": lens, "face": face, "name": composed(name)}.items():
+        for field, value in {**fields, "lens": lens, "name": composed(name)}.items():
             object.__setattr__(self, field, value)
         if not (0 < self.width <= MAX_SIDE and 0 < self.height <= MAX_SIDE):
             self._refuse("size", f"width and height, whole numbers in 1..{MAX_SIDE}", f"{width!r} x {height!r}")
@@ -183,7 +179,7 @@ class Camera:
         return replace(self, viewmat=pose)
 
     def __repr__(self) -> str:
-        kind = ["distorted"] * bool(self.lens) + ["of a panorama"] * bool(self.face)
+        kind = ["distorted"] * bool(self.lens)
         numbers = {"fx": self.fx, "fy": self.fy, "cx": self.cx, "cy": self.cy}
         K = [f"{name}={value:.6g}" for name, value in numbers.items()]
         return one_line(self, repr(self.name[-NAME_SHOWN:]), f"{self.width}x{self.height}", *K, *kind)
@@ -520,33 +516,9 @@ def behind_lens(camera: Camera, distortion: Distortion) -> Camera:
         ) from None
 
 
-def faces_of(name: str, width: int, height: int, viewmat: np.ndarray) -> list[Camera]:
-    """Return the six faces of a panorama: pinholes of 90 degrees, square.
-
-    Args:
-        name: of the panorama. width: pixels of its photo. height: likewise. viewmat: [4, 4] world to its camera.
-
-    Raises:
-        InvalidCameras: a size or the pose is out of range.
-    """
-    Camera.pinhole(name, width, height, 1.0, 1.0, 0.0, 0.0, viewmat)  # refuses under the panorama's own name
-    faces = []
-    for turn in TURNS:
-        face, pose = Face(name, width, height, turn), np.array(viewmat, dtype=np.float64)
-        pose[:3] = face.rotation @ pose[:3]
-        lens = (face.side, face.side, face.fx, face.fy, face.side / 2, face.side / 2)
-        faces.append(Camera.pinhole(f"{name}@{turn}", *lens, viewmat=pose).replace(face=face))
-    return faces
-
-
 def photo_sizes(photos: Collection[str], cameras: Cameras) -> dict[str, tuple[int, int]]:
-    """Return photo's name -> width and height in pixels, from its camera or panorama."""
-    panoramas = {
-        camera.face.photo: (camera.face.width, camera.face.height) for camera in cameras.values() if camera.face
-    }
-    sizes = {name: camera.photo_size for name, camera in cameras.items()}
-    paired = cameras_of_views(photos, [*sizes, *(name for name in panoramas if name not in sizes)])
-    return {photo: sizes.get(name) or panoramas[name] for photo, name in paired.items()}
+    """Return photo's name -> width and height in pixels, from its camera."""
+    return {photo: cameras[name].photo_size for photo, name in cameras_of_views(photos, cameras).items()}
 
 
 def drawn_by(camera: Camera) -> Camera:
@@ -566,20 +538,15 @@ def pixel_of(camera: Camera, x: int, y: int) -> tuple[int, int] | None:
 
 
 def distortion_warning(views: Sequence[Camera]) -> list[str]:
-    """Return warnings of distorted views and faces of panoramas, if there are any."""
-    faces = sum(camera.face is not None for camera in views)
-    warnings = (
-        [f"{faces} of {len(views)} views are faces of panoramas, and read the features of those"] if faces else []
-    )
+    """Return a warning of distorted views, if there are any."""
     shares = [camera.lens.share for camera in views if camera.lens is not None]
     if not shares:
-        return warnings
+        return []
     least = min(shares)
     lifted = "nearly all" if least > NEARLY_ALL else f"{least:.0%} or more"
     return [
-        *warnings,
         f"{len(shares)} of {len(views)} views are of distorted photos, of each of which {lifted} is "
-        "lifted: features must be of the photos as they were taken, not of undistorted ones",
+        "lifted: features must be of the photos as they were taken, not of undistorted ones"
     ]
 
 

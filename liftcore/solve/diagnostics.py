@@ -280,7 +280,7 @@ def shape_warnings(packs: Views, views: Sequence[Camera]) -> list[str]:
     odd, stretched = [], []
     for camera in views:
         size = packs.map_size(camera.name)
-        photo = _photo(packs, camera)
+        photo = camera.photo_size
         if _odd(size, photo):
             odd.append(camera)
         elif is_stretched(size, photo):
@@ -298,13 +298,8 @@ def shape_warnings(packs: Views, views: Sequence[Camera]) -> list[str]:
 
 
 def _shapes(packs: Views, camera: Camera) -> str:
-    (width, height), (W, H) = packs.map_size(camera.name), _photo(packs, camera)
+    (width, height), (W, H) = packs.map_size(camera.name), camera.photo_size
     return f" ({camera.name}: {width}x{height} for {W}x{H})"
-
-
-def _photo(packs: Views, camera: Camera) -> tuple[int, int]:
-    face = (packs.seeing(camera.name) or camera).face  # None of a map of the face itself
-    return camera.photo_size if face is None else (face.width, face.height)
 
 
 def _odd(size: tuple[int, int], photo: tuple[int, int]) -> bool:

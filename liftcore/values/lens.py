@@ -1,4 +1,4 @@
-"""Maps of a distorted photo or a panorama, resampled to the pinhole of a camera."""
+"""Maps of a distorted photo, resampled to the pinhole of a camera."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -9,12 +9,11 @@ from torch import Tensor
 
 from liftcore.scene.cameras import Camera
 from liftcore.scene.distortion import Lens
-from liftcore.scene.panorama import Face
 from liftcore.values.views import FeatureGrid, Regions, ViewFeatures
 
 BAND_VALUES = 1 << 22  # of a grid, carried at a time in float32
 BAND_PIXELS = 1 << 15  # distorted at a time: their arrays fit in the cache
-KEPT_PINHOLES = 6  # whose labels' places are kept: mostly one lens took all photos, or all are panoramas
+KEPT_PINHOLES = 6  # whose labels' places are kept: mostly one lens took all photos
 
 
 def as_pinhole_sees(observation: ViewFeatures, camera: Camera) -> ViewFeatures:
@@ -24,7 +23,7 @@ def as_pinhole_sees(observation: ViewFeatures, camera: Camera) -> ViewFeatures:
     pinhole's size. A grid keeps the size of its cells, and each is read bilinearly where the ray of its centre
     meets the photo: smoother than the given one by less than a cell.
     """
-    if camera.lens is None and camera.face is None:
+    if camera.lens is None:
         return observation
     if isinstance(observation, Regions):
         return Regions.unchecked(_labels(observation.labels, camera), observation.codebook)
@@ -33,19 +32,11 @@ def as_pinhole_sees(observation: ViewFeatures, camera: Camera) -> ViewFeatures:
 
 def grid_sides(height: int, width: int, camera: Camera) -> tuple[int, int]:
     """Return rows and columns of a grid [height, width] of the camera's photo, as its pinhole sees it."""
-    photo = camera.lens or camera.face
+    photo = camera.lens
     if photo is None:
         return height, width
     rows, columns = height * camera.height / photo.height, width * camera.width / photo.width
     return max(1, round(rows)), max(1, round(columns))
-
-
-def photo_as_pinhole_sees(photo: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return [height, width, C], the nearest pixels of a photo [h, w, C]; the photo itself if it is undistorted."""
-    if camera.lens is None and camera.face is None:
-        return photo
-    places = _label_places(_pinhole(camera), *photo.shape[:2]).numpy()
-    return photo.reshape(-1, photo.shape[2])[places].reshape(camera.height, camera.width, -1)
 
 
 def _labels(labels: Tensor, camera: Camera) -> Tensor:
@@ -77,9 +68,7 @@ def _grid(grid: Tensor, camera: Camera) -> Tensor:
         (np.arange(columns) + 0.5) * camera.width / columns, (np.arange(rows) + 0.5) * camera.height / rows
     )
     x, y = _shares(*centres, _pinhole(camera))
-    u, v = x * width - 0.5, (y * height - 0.5).clip(0, height - 1)
-    if camera.face is None:  # a panorama's last column meets its first
-        u = u.clip(0, width - 1)
+    u, v = (x * width - 0.5).clip(0, width - 1), (y * height - 0.5).clip(0, height - 1)
     left, top = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
     cells = grid.reshape(-1, channels)
     carried = torch.empty((*x.shape, channels), dtype=grid.dtype)
@@ -90,7 +79,7 @@ def _grid(grid: Tensor, camera: Camera) -> Tensor:
         for row in (0, 1):
             for column in (0, 1):
                 share = (1 - np.abs(u - left - column)) * (1 - np.abs(v - top - row))
-                place = (top + row).clip(max=height - 1) * width + (left + column) % width
+                place = (top + row).clip(max=height - 1) * width + (left + column).clip(max=width - 1)
                 features = cells[torch.from_numpy(place[band_rows])].to(torch.float32)
                 total += features * torch.from_numpy(share[band_rows].astype(np.float32))[..., None]
         carried[band_rows] = total.to(grid.dtype)
@@ -98,9 +87,9 @@ def _grid(grid: Tensor, camera: Camera) -> Tensor:
 
 
 class _Pinhole(NamedTuple):
-    """A camera of a photo that is not its own picture, by what its maps depend on."""
+    """A camera of a distorted photo, by what its maps depend on."""
 
-    photo: Lens | Face
+    photo: Lens
     width: int
     height: int
     cx: float
@@ -108,10 +97,9 @@ class _Pinhole(NamedTuple):
 
 
 def _pinhole(camera: Camera) -> _Pinhole:
-    photo = camera.lens or camera.face
-    if photo is None:
-        raise ValueError("the camera has no lens, and is no face of a panorama")
-    return _Pinhole(photo, camera.width, camera.height, camera.cx, camera.cy)
+    if camera.lens is None:
+        raise ValueError("the camera has no lens")
+    return _Pinhole(camera.lens, camera.width, camera.height, camera.cx, camera.cy)
 
 
 def _shares(u: np.ndarray, v: np.ndarray, pinhole: _Pinhole) -> tuple[np.ndarray, np.ndarray]:

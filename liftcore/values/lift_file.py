@@ -331,7 +331,7 @@ def poses_of(cameras: Sequence[Camera]) -> str:
     for camera in cameras:
         total.update(camera.viewmat.tobytes() + camera.K.tobytes())
         description = (unicodedata.normalize("NFC", camera.name), camera.width, camera.height, camera.lens)
-        total.update(repr(description if camera.face is None else (*description, camera.face)).encode())
+        total.update(repr(description).encode())
     return total.hexdigest()
 
 

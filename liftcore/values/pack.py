@@ -107,7 +107,7 @@ class Views(Mapping[str, ViewFeatures]):
         """Return the tensors of a view by part (labels and codebook, or grid), from the header alone."""
         specs = dict(self._find(view).specs)
         camera = self.seeing(view)
-        if camera is None or (camera.lens is None and camera.face is None):
+        if camera is None or camera.lens is None:
             return specs
         if "grid" in specs:
             height, width, channels = specs["grid"].shape
@@ -212,20 +212,12 @@ def read_features(*paths: str | Path) -> Views:
 def pair(views: Views, cameras: Mapping[str, Camera]) -> tuple[Views, list[str]]:
     """Return the views that have a camera, named like it, and the names of views without one, to skip with a warning.
 
-    A panorama's view is one of each of its faces; a view that is named like a face is a map of the face itself.
-
     Raises:
         InvalidFeatures: no view has a camera.
     """
-    faces: dict[str, list[str]] = {}
-    for name, camera in cameras.items():
-        if camera.face is not None:
-            faces.setdefault(camera.face.photo, []).append(name)
-    names = require_pairs(views.views, {*cameras, *faces})
-    face_views = {face: view for view, name in names.items() for face in faces.get(name, [])}
-    camera_views = {name: view for view, name in names.items() if name not in faces}
-    paired_cameras = {**cameras, **{name: cameras[name].replace(face=None) for name in camera_views}}
-    return views.seen_by(face_views | camera_views, paired_cameras), [view for view in views if view not in names]
+    names = require_pairs(views.views, cameras)
+    by_camera = {name: view for view, name in names.items()}
+    return views.seen_by(by_camera, cameras), [view for view in views if view not in names]
 
 
 def write_pack(

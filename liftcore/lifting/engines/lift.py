@@ -194,7 +194,7 @@ def _open_pieces(folder: Path, identity: str) -> Path:
 
 def _facts(camera: Camera) -> list[Any]:
     size = camera.width, camera.height
-    return [camera.name, *size, camera.K.tolist(), camera.viewmat.tolist(), repr(camera.lens or camera.face)]
+    return [camera.name, *size, camera.K.tolist(), camera.viewmat.tolist(), repr(camera.lens)]
 
 
 class InBlocks(LiftSteps[Job]):

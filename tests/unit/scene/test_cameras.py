@@ -82,6 +82,17 @@ def test_distorted_photos_and_all_of_a_fisheye_have_a_lens(
         assert cameras.distorted == (("frame 1",) if lens else ())
 
 
+def test_panoramas_are_refused_with_what_to_make_of_them(tmp_path: Path) -> None:
+    panoramas = {1: (17, "EQUIRECTANGULAR", (640.0, 480.0))}
+    paths = [
+        write_files(tmp_path / files.__name__, files(panoramas, FIRST_IMAGE)) for files in (binary_files, text_files)
+    ]
+    paths.append(with_json(tmp_path, {**TRANSFORMS, "camera_model": "EQUIRECTANGULAR"}))
+    for path in paths:
+        with pytest.raises(InvalidCameras, match=r"got '?EQUIRECTANGULAR.*make pinhole photos of it"):
+            read_cameras(path)
+
+
 RECORD = {
     "img_name": "r_0",
     "width": 9,
