@@ -266,19 +266,6 @@ def test_photos_beside_documents_that_name_them_are_no_masks(tmp_path: Path) -> 
         prompt_views(write(tmp_path / "twice", a=twice))
 
 
-def test_photos_that_label_studio_renamed_are_known(tmp_path: Path) -> None:
-    prefixes = [f"images/{prefix}-IMG_{k}.jpg" for k, prefix in enumerate(("1f2e3d4c", "01234567"))]
-    dates = ["20240101-IMG_0.jpg", "20240102-IMG_1.jpg"]
-    for name, files, views in (
-        ("a", prefixes, ["images/IMG_0", "images/IMG_1"]),
-        ("b", dates, [date[:-4] for date in dates]),
-    ):
-        content = coco((0, 1, MUG_POLYGON), (1, 1, MUG_POLYGON))
-        for image, file in zip(content["images"], files, strict=True):
-            image["file_name"] = file
-        assert [*prompt_views(write(tmp_path / name, a=content)).views] == views
-
-
 def test_counts_in_pythons_text_of_bytes_are_counts(tmp_path: Path) -> None:
     """``str`` of pycocotools' bytes; where counts have a backslash, that of the text is doubled."""
     masks = [np.zeros((94, 60), bool) for _ in range(2)]

@@ -336,15 +336,6 @@ def test_any_name_of_a_view_can_be_pointed_at(view: str, x: int, y: int) -> None
         assert parse_example(str(example)) == example
 
 
-@pytest.mark.parametrize("notation", [
-    "", ":1,2", "v:1.5,2", "v:1", "splat:-1", "region:v:1", "splat:" + "9" * 5000, "v:box:1,2,3", "v:box:1,2,3,4,5,6",
-    "v:box:nan,2,3,4", "v:box:1,2,3,inf", "v:box:", "v:stroke:1,2,3", "v:stroke:1,2,3,4,", "v:stroke:1;2,3,4",
-])  # fmt: skip
-def test_what_points_nowhere_is_refused(notation: str) -> None:
-    with pytest.raises(InvalidQuery, match="like"):
-        parse_example(notation)
-
-
 @pytest.mark.parametrize("area", ["box", "stroke"])
 def test_an_area_without_corners_is_a_pixel_only_of_a_view_so_named(scene: Scene, area: str) -> None:
     unfinished = Query(like=[f"middle:{area}:6,12"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.cli import main
 from liftcore.query.question import Query
 from liftcore.query.scene import Scene
 from liftcore.text.table import TableEncoder
@@ -28,15 +26,6 @@ def candidates_of(scene: Scene, *like: str, unlike: tuple[str, ...] = ()) -> lis
     """Return the id and kind of each candidate."""
     query = Query(like=list(like), unlike=list(unlike))
     return [(candidate.id, candidate.kind) for candidate in scene.ask(query).candidates]
-
-
-def test_a_splat_means_its_part_and_then_the_whole(nested: Scene) -> None:
-    first, second, other = (f"splat:{np.flatnonzero(nested.members(node))[0]}" for node in (3, 4, 1))
-    assert candidates_of(nested, first) == [(3, "part"), (0, "object")]
-    assert candidates_of(nested, other) == [(1, "object")]
-    assert candidates_of(nested, first, second) == [(0, "object")]
-    assert candidates_of(nested, first, other) == []
-    assert candidates_of(nested, first, unlike=(second,)) == [(3, "part")]
 
 
 def test_a_part_that_is_nearly_all_of_its_whole_is_not_offered_beside_it(scene: Scene, tmp_path: Path) -> None:
@@ -61,16 +50,6 @@ def test_a_pixel_means_what_weighs_most_on_its_ray_and_its_set_is_asked_alone(ne
     assert candidate.splats == int(nested.members(1).sum())
     by_set = nested.ask(Query(sets=[candidate.set]))
     np.testing.assert_array_equal(by_set.selected, nested.members(1))
-
-
-def test_the_command_names_them(nested: Scene, capsys: pytest.CaptureFixture[str]) -> None:
-    row = np.flatnonzero(nested.members(4))[0]
-    assert main(["query", str(nested.path), "--like", f"splat:{row}", "--json"]) == 0
-    candidates = json.loads(capsys.readouterr().out)["answer"]["candidates"]
-    rows = [(candidate["id"], candidate["kind"], candidate["share"]) for candidate in candidates]
-    assert rows == [(4, "part", 1.0), (0, "object", 1.0)]
-    assert main(["query", str(nested.path), "--like", f"splat:{row}"]) == 0
-    assert "may be object:4, part" in capsys.readouterr().out
 
 
 def test_a_part_that_no_word_stands_for_may_be_any_part_of_its_thing(nested: Scene) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,14 +11,13 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.cli import main
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound
 from liftcore.query.catalogue import catalogue, table_csv
 from liftcore.query.result import LiftResult, load_lift
 from liftcore.query.scene import Scene
 from liftcore.values.lift_file import save_lift
 from liftcore.values.settings import LiftSettings
-from tests.tiny_scene import CHANNELS, SPLATS_A_CLUSTER, VIEWS, WORDS, text_table
+from tests.tiny_scene import CHANNELS, SPLATS_A_CLUSTER, VIEWS, WORDS
 
 EYE = np.eye(3, CHANNELS, dtype=np.float32)
 
@@ -37,15 +35,6 @@ def test_each_object_has_its_place_its_views_and_the_nearest_word(scene: Scene) 
     lines = list(csv.DictReader(io.StringIO(table_csv(listing).decode())))
     assert [line["name"] for line in lines] == [obj.name for obj in listing.objects]
     assert [int(line["splats"]) for line in lines] == [SPLATS_A_CLUSTER] * 3
-
-
-def test_a_lift_from_before_opens_and_says_that_it_holds_none(scene: Scene, tmp_path: Path) -> None:
-    save_lift(replace(scene.lift, object=None, object_views=None), tmp_path / "old.lift")
-    old = catalogue(Scene(tmp_path / "old.lift"))
-    assert old.objects == () and "grids have no masks" in old.explanation
-    save_lift(replace(scene.lift, object_views=None), tmp_path / "half.lift")
-    with pytest.raises(InvalidLift, match="object and object_views, or neither"):
-        load_lift(tmp_path / "half.lift")
 
 
 def test_a_draft_says_that_it_looked_for_no_objects_and_what_finds_them(scene: Scene, tmp_path: Path) -> None:
@@ -92,28 +81,6 @@ def test_parts_have_paths_places_and_names_of_what_their_own_masks_say(scene: Sc
         saved.members(5)
 
 
-def test_the_command_lists_the_tree_and_writes_its_nodes_by_their_paths(
-    scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with_parts(scene).save(tmp_path / "parts.lift.safetensors")
-    command = ["objects", str(tmp_path / "parts.lift.safetensors"), "--tree", "--into", str(tmp_path / "things")]
-    assert main(command) == 0
-    stdout = capsys.readouterr().out
-    assert "3 objects with 2 parts\n" in stdout and "3, part: " in stdout
-    names = ["object-0", "object-0-3", "object-0-4", "object-1", "object-2"]
-    assert sorted(path.stem for path in (tmp_path / "things").iterdir()) == names
-    assert main([*command, "--json"]) == 0
-    answer = json.loads(capsys.readouterr().out)["answer"]
-    assert answer["world"] == {"up": None, "metres_per_unit": None} and answer["unit"] == "scene units"
-    sizes = [node["size"] for node in answer["nodes"]]
-    assert main([*command, "--distance", "0", "0", "0", "0", "0", "2", "1", "--json"]) == 0
-    answer = json.loads(capsys.readouterr().out)["answer"]
-    assert answer["unit"] == "metres" and answer["world"]["metres_per_unit"] == 0.5
-    assert [[2 * side for side in node["size"]] for node in answer["nodes"]] == sizes
-    assert main([*command[:3], "--up", "0", "0", "0"]) == 2 and "--up: expected" in capsys.readouterr().err
-    assert main([*command, "--features"]) != 0
-
-
 def test_rows_of_a_lift_keep_their_part_of_the_tree(scene: Scene) -> None:
     lift = with_parts(scene)
     assert lift.node is not None
@@ -143,33 +110,6 @@ def test_a_tree_that_is_none_is_refused(scene: Scene, tmp_path: Path, change: di
 def test_words_without_directions_are_refused(scene: Scene, vectors: np.ndarray | None) -> None:
     with pytest.raises(InvalidQuery, match="words: expected"):
         catalogue(scene, WORDS, vectors)
-
-
-def test_the_command_lists_names_and_writes_them(
-    tiny_lift: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "words.safetensors").write_bytes(text_table())
-    (splats,) = tiny_lift.parent.glob("*.ply")
-    files = ["--csv", str(tmp_path / "things.csv"), "--splats", str(splats), "--into", str(tmp_path / "things")]
-    options = ["--vocabulary", str(tmp_path / "words.safetensors"), "--features", "--json"]
-    assert main(["objects", str(tiny_lift), *options, *files]) == 0
-    answer = json.loads(capsys.readouterr().out)["answer"]
-    assert {obj["name"] for obj in answer["objects"]} == set(WORDS) and answer["count"] == 3
-    assert len(answer["objects"][0]["feature"]) == CHANNELS
-    assert (tmp_path / "things.csv").read_text().count("\n") == 4
-    assert sorted(path.name for path in (tmp_path / "things").iterdir()) == [f"object-{k}.ply" for k in range(3)]
-    assert main(["objects", str(tiny_lift)]) == 0 and "3 objects" in capsys.readouterr().out
-    assert main(["objects", str(tiny_lift), "--json"]) == 0
-    assert {obj["name"] for obj in json.loads(capsys.readouterr().out)["answer"]["objects"]} == {None}
-
-
-def test_a_folder_that_is_splats_gets_no_objects(tiny_lift: Path, tmp_path: Path) -> None:
-    for name in ("meta.json", "lod-meta.json"):
-        folder = tmp_path / name.removesuffix(".json")
-        folder.mkdir()
-        (folder / name).write_text(json.dumps({part: {} for part in ("means", "scales", "quats")}))
-        assert main(["objects", str(tiny_lift), "--splats", str(folder)]) == 2
-        assert [path.name for path in folder.iterdir()] == [name]
 
 
 def test_objects_without_splats_are_left_out(scene: Scene, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from liftcore.query.coco import run_lengths
 from liftcore.query.question import Query
 from liftcore.query.scene import Scene
 from liftcore.query.terms import Region, Vector
-from tests.tiny_scene import CHANNELS, SPLATS_A_CLUSTER, VIEWS, WORDS, text_table
+from tests.tiny_scene import CHANNELS, VIEWS, WORDS, text_table
 from tests.unit.query.test_catalogue import with_parts
 from tests.unit.scene.test_gltf import document_of
 
@@ -30,11 +30,6 @@ def read_labels(path: Path) -> Labels:
 
 
 EYE = np.eye(3, CHANNELS, dtype=np.float32)
-CLUSTER = np.repeat(np.arange(3), SPLATS_A_CLUSTER)
-
-
-def of_words(scene: Scene) -> Labels:
-    return scene.labels(scene.segment(WORDS, EYE))
 
 
 def test_every_source_gives_instances_that_lie_in_their_boxes(scene: Scene) -> None:
@@ -131,55 +126,6 @@ def test_run_lengths_are_columns_and_begin_with_zeros() -> None:
     assert run_lengths(np.array([[1, 0], [1, 0], [0, 1]])) == {1: [0, 2, 3, 1]}
     assert run_lengths(np.array([[0, 7], [2, 7]])) == {2: [1, 1, 2], 7: [2, 2]}
     assert run_lengths(np.zeros((2, 2))) == {}
-
-
-def test_the_command_writes_what_the_suffix_says(
-    tiny_lift: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "words.safetensors").write_bytes(text_table())
-    words = ["--all-words", "--table", str(tmp_path / "words.safetensors")]
-
-    def export(name: str, *options: str) -> Path:
-        assert main(["export", str(tiny_lift), "-o", str(tmp_path / name), *options]) == 0
-        return tmp_path / name
-
-    labelled = read_labels(export("scene.glb", *words))
-    assert sorted(entry["name"] for entry in labelled.document["classes"]) == sorted(WORDS)
-    for value in range(3):
-        assert len(set(labelled.columns["class_id"][value == CLUSTER])) == 1
-    ply = read_labels(export("scene.ply", *words))
-    for entry, other in zip(ply.document["instances"], labelled.document["instances"], strict=True):
-        exact = (
-            "instance_id",
-            "class_id",
-            "name",
-            "splats",
-            "colour",
-            "box",
-            "oriented_box",
-            "question",
-            "provenance",
-        )
-        assert [entry[key] for key in exact] == [other[key] for key in exact]
-        assert entry["score"] == pytest.approx(other["score"], abs=1e-6)
-    assert all(np.array_equal(ply.columns[name], values) for name, values in labelled.columns.items())
-    assert read_splats(export("object.glb", "--object", "1")).count == SPLATS_A_CLUSTER
-    assert read_splats(export("scene.spz")).count == 3 * SPLATS_A_CLUSTER
-    labels = read_labels(export("lamp.glb", "--text", "lamp", "--only", *words[1:]))
-    assert {entry["name"] for entry in labels.document["instances"]} == {"lamp"} and (
-        labels.columns["class_id"] == 1
-    ).all()
-    capsys.readouterr()
-    export("object.ply", "--object", "1", "--json")
-    assert json.loads(capsys.readouterr().out)["splats"] == SPLATS_A_CLUSTER  # that are in the file
-    for wrong in (["-o", "s.obj"], ["-o", "s.glb", "--only"], ["-o", "s.glb", "--object", "9"]):
-        assert main(["export", str(tiny_lift), *wrong]) == 2
-    assert not Path("s.glb").exists()
-    cameras = '{"camera_model": "PINHOLE", "frames": []}'  # of another program, where the names would go
-    (tmp_path / "mine.ply.json").write_text(cameras)
-    assert main(["export", str(tiny_lift), "-o", str(tmp_path / "mine.ply"), *words]) == 2
-    assert (tmp_path / "mine.ply.json").read_text() == cameras and not (tmp_path / "mine.ply").exists()
-    assert export("scene.ply", *words).exists()  # its own file of names is replaced
 
 
 def test_answers_that_were_added_are_labelled_too(scene: Scene) -> None:

@@ -9,13 +9,9 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from plyfile import PlyData
 
 import liftcore as lc
-from liftcore import cli
 from liftcore.errors import InvalidQuery
-from liftcore.io.cameras import read_cameras
-from liftcore.io.inria import write_inria_cameras
 from liftcore.io.splats import read_splats
 from liftcore.query.colours import NO_CLUSTER_COLOUR
 from liftcore.query.render import render
@@ -24,7 +20,6 @@ from liftcore.query.scene import Scene
 from liftcore.query.segment import best_words, map_png, named_ply, picture_png, segment, word_map
 from liftcore.query.splat_colours import view_colours
 from liftcore.query.terms import Pixel, SplatTerm, Vector
-from liftcore.scene.cameras import Cameras
 from tests.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH, text_table
 
 EYE = np.eye(CHANNELS, dtype=np.float32)
@@ -163,82 +158,11 @@ def test_coloured_splats_have_the_colours_of_their_words(clear: Scene, tmp_path:
     assert tuple(segmentation.colours[0]) == NO_CLUSTER_COLOUR
 
 
-def test_labels_go_out_as_columns_and_a_document(tiny_lift: Path, tmp_path: Path, capsys) -> None:
-    out = tmp_path / "labels.ply"
-    (tmp_path / "table.safetensors").write_bytes(text_table())
-    command = ["segment", str(tiny_lift), "--table", str(tmp_path / "table.safetensors"), "--json", "--labelled"]
-    assert cli.main([*command, str(out)]) == 0
-    assert json.loads(capsys.readouterr().out)["files"] == {"labelled": str(out), "names": f"{out}.json"}
-    document = json.loads((tmp_path / "labels.ply.json").read_text(encoding="utf-8"))
-    assert (document["frame"], document["splats"]) == ("file", 60)
-    names = {entry["class_id"]: entry["name"] for entry in document["classes"]}
-    assert set(names.values()) == {"apple", "book", "lamp"}
-    rows = PlyData.read(out)["vertex"]
-    source = PlyData.read(tiny_lift.with_name("s.ply"))["vertex"]
-    assert all(np.array_equal(rows[column.name], source[column.name]) for column in source.properties)
-    assert [names[value] for value in rows["class_id"][::20]] == ["apple", "book", "lamp"]
-    assert rows["score"].min() > 0.5 and rows["class_id"].dtype == np.int32
-    for entry in document["instances"]:
-        inside = rows["instance_id"] == entry["instance_id"]
-        assert set(rows["class_id"][inside]) == {entry["class_id"]} and inside.sum() == entry["splats"]
-        box, axes = entry["oriented_box"], np.array(entry["oriented_box"]["axes"])
-        places = np.stack([rows[axis][inside] for axis in "xyz"], axis=1) - box["centre"]
-        assert (np.abs(places @ axes.T) <= np.array(box["half_sizes"]) + 1e-5).all()
-        assert np.linalg.det(axes) == pytest.approx(1)
-    assert cli.main([*command, str(tiny_lift)]) == 2
-
-
 def test_best_words_of_an_example_come_first(clear: Scene) -> None:
     words = ["apple", "book", "lamp"]
     for example in (SplatTerm(SPLATS_A_CLUSTER), Pixel("middle", 16, HEIGHT // 2), Vector(tuple(2 * EYE[1]))):
         best = best_words(clear, example, words, EYE[:3], 2)
         assert best[0].word == "book" and best[0].score > 0.7 and len(best) == 2
-
-
-def test_command_names_splats_and_examples(tiny_lift: Path, tmp_path: Path, capsys) -> None:
-    (tmp_path / "table.safetensors").write_bytes(text_table())
-    (tmp_path / "words.txt").write_text("apple\nlamp\n\napple\n")
-    ends = {"labels": "png", "picture": "png", "coloured": "ply", "splat_labels": "npy"}
-    files = {kind: tmp_path / f"{kind}.{end}" for kind, end in ends.items()}
-    options = [part for kind, path in files.items() for part in (f"--{kind.replace('_', '-')}", str(path))]
-    command = ["segment", str(tiny_lift), "--table", str(tmp_path / "table.safetensors")]
-    assert cli.main([*command, "--view", "middle", *options, "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
-    assert {label["word"] for label in document["answer"]["named_words"]} == {"apple", "book", "lamp"}
-    assert (document["words"], document["answer"]["splats"]) == (3, 60)
-    assert document["files"] == {kind: str(path) for kind, path in files.items()}
-    values = np.load(files["splat_labels"])
-    for label in document["answer"]["named_words"]:
-        assert (values == label["value"]).sum() == label["splats"]
-    arguments = [*command, "--words", str(tmp_path / "words.txt"), "--example", "splat:0", "--top", "1"]
-    assert cli.main([*arguments, "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
-    (best,) = document["examples"]
-    assert best["example"] == "splat:0" and best["words"][0]["word"] == "apple"
-    assert cli.main(arguments) == 0
-    assert capsys.readouterr().out.startswith("splat:0: apple ")
-    assert cli.main([*command, "--words", str(tmp_path / "words.txt")]) == 0
-    assert "2 of 2 words" in capsys.readouterr().out
-    for wrong in (["--labels", "l.png"], ["--words", str(tmp_path / "none.txt")], ["--example", "nothing"]):
-        assert cli.main([*command, *wrong]) == 2
-        assert capsys.readouterr().err.count("\n") == 1
-
-
-def test_a_camera_of_ones_own_is_seen_from(tiny_lift: Path, tmp_path: Path, capsys) -> None:
-    cameras = read_cameras(tiny_lift.parent / "c.json")
-    own_file, file_of_two = tmp_path / "own.json", tmp_path / "two.json"
-    write_inria_cameras(Cameras((cameras["middle"].replace(name="mine"),)), own_file)
-    write_inria_cameras(Cameras((cameras["middle"].replace(name="mine"), cameras["left"])), file_of_two)
-    command = ["query", str(tiny_lift), "--like", "splat:0", "--mask"]
-    assert cli.main([*command, str(tmp_path / "lift.png"), "--view", "middle"]) == 0
-    assert cli.main([*command, str(tmp_path / "own.png"), "--camera", str(own_file)]) == 0
-    assert "view mine" in capsys.readouterr().out
-    assert cli.main([*command, str(tmp_path / "of_two.png"), "--camera", str(file_of_two), "--view", "mine"]) == 0
-    for name in ("own.png", "of_two.png"):
-        assert (tmp_path / name).read_bytes() == (tmp_path / "lift.png").read_bytes()
-    capsys.readouterr()
-    assert cli.main([*command, str(tmp_path / "m.png"), "--camera", str(file_of_two)]) == 2
-    assert "--camera: expected one camera, got 2 of them" in capsys.readouterr().err
 
 
 def test_one_word_names_splats_without_a_margin(clear: Scene) -> None:

@@ -10,7 +10,7 @@ import torch
 
 from liftcore.query.ask import answers, ask, resolve_query
 from liftcore.query.presence import References
-from liftcore.query.question import METHODS, Query
+from liftcore.query.question import Query
 from liftcore.query.scene import Scene
 from liftcore.query.selection import CompetingWords, correct_by_objects, part_nodes, parts_of_words
 from liftcore.query.threshold import find_threshold
@@ -64,20 +64,6 @@ def thin(scene: Scene, table: TableEncoder) -> Scene:
     return lifted(scene, pictures(table, words, 0.2))
 
 
-def test_query_of_a_thin_object_does_not_select_the_scene(thin: Scene, table: TableEncoder) -> None:
-    scores = ask(thin, Query.of(("cat",), threshold=0.0), table).scores
-    above_threshold = scores >= find_threshold(scores).value
-    assert above_threshold.mean() > 0.5  # which the histogram alone selects
-    answer = ask(thin, "cat", table)
-    assert answer.present is not False
-    assert answer.selected[OBJECTS == 0].mean() > 0.4
-    assert answer.selected.sum() < 3 * CAT
-    assert "other words are nearer" in answer.threshold.explanation
-    for method in ("paper", 0.0):  # an explicit method or threshold is applied as it is
-        by_method = ask(thin, Query.of(("cat",), threshold=method), table)
-        assert np.array_equal(by_method.selected, by_method.scores >= np.float32(by_method.threshold.value))
-
-
 def test_competition_keeps_what_the_histogram_finds_well(thin: Scene, table: TableEncoder) -> None:
     answer = ask(thin, "curtain", table)
     assert answer.threshold.value == find_threshold(answer.scores).value
@@ -92,32 +78,6 @@ def test_selection_has_the_same_bits_together_and_alone(thin: Scene, table: Tabl
     for batched, resolved_query in zip(answers(thin, resolved_queries), resolved_queries, strict=True):
         (single,) = answers(thin, [resolved_query])
         assert np.array_equal(batched.selected, single.selected) and batched.threshold == single.threshold
-
-
-@pytest.mark.parametrize("method", [*METHODS, 0.0, -1.0])
-@pytest.mark.parametrize("level", [0.0, 0.25])
-def test_equal_or_zero_scores_select_nothing_and_say_why(scene: Scene, method: str | float, level: float) -> None:
-    rows = np.zeros((60, 4))
-    rows[:, :2] = level, (1 - level**2) ** 0.5
-    axis = TableEncoder("axis", ("x",), np.eye(4, dtype=np.float32)[:1])
-    answer = ask(lifted(scene, rows), Query.of(("x",), threshold=method), axis)
-    assert answer.count == 0 and not answer.clear
-    assert answer.threshold.value == np.inf and "nothing is selected" in answer.threshold.explanation
-
-
-def test_words_of_a_pack_compete_with_each_other(scene: Scene) -> None:
-    """Four words in one table: a splat with another nearer word is not selected."""
-    axes = np.eye(8, dtype=np.float32)
-    rows = np.repeat(axes[:3], 20, axis=0)
-    rows[20:40, 0] = 0.9  # nearer to the second word, but also like the first
-    rows = noisy(rows, 0.02)
-    pack = TableEncoder("pack", ("one", "two", "three", "first"), axes[[0, 1, 2, 0]])
-    threshold = find_threshold(ask(lifted(scene, rows), Query.of(("one",), threshold=0.0), pack).scores).value
-    assert (ask(lifted(scene, rows), Query.of(("one",), threshold=threshold), pack).selected).sum() == 40
-    answer = ask(lifted(scene, rows), "one", pack)  # "first" is the same word, and takes nothing
-    assert np.flatnonzero(answer.selected).tolist() == list(range(20))
-    combined = ask(lifted(scene, rows), Query.of(("one", "two")), pack)
-    assert np.flatnonzero(combined.selected).tolist() == list(range(40))
 
 
 def test_presence_hidden_by_hubs_is_unsure_and_selected(scene: Scene, table: TableEncoder) -> None:

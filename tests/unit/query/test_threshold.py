@@ -74,7 +74,6 @@ def test_auto_takes_no_score_below_least() -> None:
     assert 0.4 < above.value < 0.6 and above.explanation.startswith("Above 0.4 the share")
     for least in (-0.9, 2.0):  # below all, or where there is nothing
         assert find_threshold(scores, least=least) == anywhere
-    assert find_threshold(scores, "paper", least=0.6) == find_threshold(scores, "paper")
 
 
 def test_auto_says_when_nothing_stands_apart() -> None:
@@ -100,11 +99,6 @@ def test_scores_that_are_equal_or_none_say_so(method: str) -> None:
         threshold = find_threshold(torch.full((count,), 0.25), method)
         assert threshold.value == 0.25 and "no valley" in threshold.explanation
     assert find_threshold(torch.empty(0), method).value == math.inf
-
-
-def test_paper_splits_scores_without_a_valley_and_says_so() -> None:
-    threshold = find_threshold(torch.linspace(0, 1, 10_000) ** 0.5, "paper")  # the histogram only rises
-    assert 0.4 < threshold.value < 0.8 and "Otsu's split" in threshold.explanation and not threshold.clear
 
 
 def test_weights_count_like_repeated_scores() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from liftcore.errors import InvalidSplats, Unavailable
 from liftcore.io.quantised import gaussian_rows
-from liftcore.io.splats import labelled, read_splats, write_splats
+from liftcore.io.splats import labelled, write_splats
 from liftcore.io.usd import open_library
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.quaternions import rotation_matrices
@@ -36,13 +36,6 @@ needs_usd = pytest.mark.skipif(not HAS_USD, reason="usd-core is not installed: i
 def test_without_the_library_the_extra_is_named(tmp_path: Path) -> None:
     with pytest.raises(Unavailable, match=r"splatlift\[formats\]"):
         write_splats(tmp_path / "s.usdc", some_splats())
-
-
-@pytest.mark.parametrize("name", ["t.usdc", "t.usdz", "t.ply"])
-def test_usd_is_refused_with_what_to_give(name: str, tmp_path: Path) -> None:
-    (tmp_path / name).write_bytes(b"PXR-USDC" + bytes(90))
-    with pytest.raises(InvalidSplats, match=r"a USD scene; .*\.ply or \.glb"):
-        read_splats(tmp_path / name)
 
 
 @needs_usd

@@ -7,23 +7,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
 from liftcore.io.cameras import read_cameras
-from liftcore.lifting.checkpoint import Checkpoint, request_digest
+from liftcore.lifting.checkpoint import Checkpoint
 from liftcore.lifting.files import lift_files
 from liftcore.query.result import LiftResult
-from liftcore.raster.base import ViewRequest
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.runtime.device import CPU, Device
-from liftcore.scene.cameras import Camera
-from liftcore.scene.compositing import CompositingParams, Weighting
 from liftcore.values.lift_file import TENSORS
 from liftcore.values.pack import write_pack
 from liftcore.values.settings import LiftSettings
-from liftcore.values.views import NO_LABEL, FeatureGrid, Regions
+from liftcore.values.views import FeatureGrid, Regions
 from tests.scenes import observed, write_scene
 
 pytestmark = pytest.mark.slow
@@ -93,36 +89,6 @@ def test_killed_lift_goes_on_from_its_last_view_to_the_same_bits(
     assert_same(uninterrupted, resumed)
 
 
-@pytest.mark.parametrize("blank", [("v1",), ("v0", "v1", "v2")])
-def test_views_that_meet_no_label_are_kept_and_not_walked_again(
-    tmp_path: Path, rasterized_views: list[str], blank: tuple[str, ...]
-) -> None:
-    splats, cameras, _ = write_scene(tmp_path, 3)
-    features = tmp_path / "blank.safetensors"
-    views = {camera.name: observed(3, k, grids=False) for k, camera in enumerate(read_cameras(cameras).values())}
-    for name in blank:
-        regions = views[name]
-        assert isinstance(regions, Regions)
-        views[name] = replace(regions, labels=torch.full_like(regions.labels, NO_LABEL))
-    write_pack(features, views, {"encoder": "random"})
-    scene, checkpoint = (splats, cameras, features), Checkpoint(tmp_path / "kept", seconds=0)
-    uninterrupted = lifted(scene, threads=1)
-    rasterized_views.clear()
-    for at in (1, 2):
-        kill_lift(scene, "geometry", at, threads=1, checkpoint=checkpoint)
-    resumed = lifted(scene, threads=1, checkpoint=checkpoint)
-    assert rasterized_views == ["v0", "v1", "v2"]
-    assert_same(uninterrupted, resumed)
-
-
-def test_lift_killed_while_it_solves_walks_no_view_again(tmp_path: Path, rasterized_views: list[str]) -> None:
-    scene, checkpoint = write_scene(tmp_path, 4), Checkpoint(tmp_path / "kept")
-    kill_lift(scene, "solve", 1, checkpoint=checkpoint)
-    resumed = lifted(scene, checkpoint=checkpoint)
-    assert sorted(rasterized_views) == ["v0", "v1", "v2"]
-    assert_same(lifted(scene), resumed)
-
-
 @pytest.mark.parametrize("grids", [False, True])
 def test_other_features_of_the_same_regions_walk_no_view_again(
     tmp_path: Path, rasterized_views: list[str], grids: bool
@@ -144,53 +110,6 @@ def test_other_features_of_the_same_regions_walk_no_view_again(
     assert_same(lifted((splats, cameras, second), stored), resumed)
 
 
-@pytest.mark.parametrize("field", ["pose", "focal", "labels", "codebook", "stride", "power", "pixels"])
-def test_an_answer_is_to_one_question_alone(field: str) -> None:
-    request = view_request()
-    camera, regions = request.camera, request.observation
-    assert isinstance(regions, Regions)
-    pose = camera.viewmat.copy()
-    pose[0, 3] += 1e-9
-    labels = regions.labels.clone()
-    labels[0, 1, 2] += 1
-    second = {
-        "pose": replace(request, camera=replace(camera, viewmat=pose)),
-        "focal": replace(request, camera=camera.replace(fx=camera.fx + 1e-9)),
-        "labels": replace(request, observation=replace(regions, labels=labels)),
-        "codebook": replace(request, observation=replace(regions, codebook=torch.zeros(4, 2))),
-        "stride": replace(request, params=CompositingParams(stride=2)),
-        "power": replace(request, weighting=Weighting(power=2)),
-        "pixels": replace(request, pixels=request.pixels + 1),
-    }[field]
-    assert request_digest(second, "") != request_digest(request, "")
-    features = replace(regions, codebook=torch.ones_like(regions.codebook))
-    assert request_digest(replace(request, observation=features), "") == request_digest(request, "")
-
-
-def test_regions_and_cells_of_the_same_size_are_other_questions() -> None:
-    request = view_request()
-    assert request_digest(replace(request, observation=FeatureGrid(torch.zeros(1, 3, 2))), "") != request_digest(
-        request, ""
-    )
-
-
-def test_files_that_are_no_answers_stay_in_the_folder(tmp_path: Path) -> None:
-    scene, checkpoint = write_scene(tmp_path, 9), Checkpoint(tmp_path / "kept", seconds=0)
-    checkpoint.folder.mkdir()
-    foreign_files = [
-        checkpoint.folder / name for name in ("thesis.tex", "000001.safetensors.bak", "scene.safetensors")
-    ]
-    stale = [
-        checkpoint.folder / name
-        for name in ("000007.safetensors", f"{'0a' * 32}.safetensors", f".{'0a' * 32}.safetensors.0123abcd.part")
-    ]
-    for path in [*foreign_files, *stale]:
-        path.write_bytes(b"words")
-    lifted(scene, checkpoint=checkpoint)
-    assert all(path.read_bytes() == b"words" for path in foreign_files)
-    assert not any(path.exists() for path in stale)
-
-
 def _views(cameras: Path, seed: int, grids: bool) -> list[tuple[str, Regions | FeatureGrid]]:
     """Return the views of the pack that `write_scene` writes."""
     return [(camera.name, observed(seed, k, grids=grids)) for k, camera in enumerate(read_cameras(cameras).values())]
@@ -202,12 +121,6 @@ def _other_encoder(observation: Regions | FeatureGrid) -> Regions | FeatureGrid:
     if isinstance(observation, Regions):
         return replace(observation, codebook=codebook)
     return FeatureGrid(codebook.reshape(*observation.grid.shape[:2], 5))
-
-
-def view_request() -> ViewRequest:
-    camera = Camera.pinhole("v", 8, 6, 9.0, 9.0, 4.0, 3.0, np.eye(4))
-    regions = Regions(torch.zeros(1, 6, 8, dtype=torch.int32), torch.zeros(3, 2))
-    return ViewRequest(camera, regions, CompositingParams(), Weighting(), torch.zeros(2, 2, dtype=torch.int32))
 
 
 def test_checkpoint_of_another_device_is_never_used(
@@ -223,18 +136,6 @@ def test_checkpoint_of_another_device_is_never_used(
     result = lifted(scene, LiftSettings.of(device="cpu"), checkpoint=checkpoint)
     assert len(rasterized_views) == 6
     assert result.metadata.diagnostics["device"] == facts
-
-
-@pytest.mark.parametrize("length", [0, 200])
-def test_file_that_is_not_whole_is_walked_again(tmp_path: Path, rasterized_views: list[str], length: int) -> None:
-    scene = write_scene(tmp_path, 6)
-    checkpoint = Checkpoint(tmp_path / "kept", seconds=0)
-    uninterrupted = lifted(scene, checkpoint=checkpoint)
-    blocks = sorted(checkpoint.folder.iterdir())
-    blocks[1].write_bytes(blocks[1].read_bytes()[:length])
-    rasterized_views.clear()
-    assert_same(uninterrupted, lifted(scene, checkpoint=checkpoint))
-    assert len(rasterized_views) == 1
 
 
 def test_lift_without_room_for_its_checkpoint_goes_on(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from liftcore.solve import consensus
-from liftcore.solve.consensus import MOST_SPLATS, MOST_WITNESSES, OBSERVES, PRIOR, mask_consensus
+from liftcore.solve.consensus import OBSERVES, PRIOR, mask_consensus
 from liftcore.solve.membership import BELONGS, FAINT
 from liftcore.solve.reweight import SHARPNESS, reweighting_factors
 from liftcore.values.levels import region_levels
@@ -154,26 +154,6 @@ def test_more_tuples_than_the_first_table_holds_are_distinguished() -> None:
 def test_a_scene_without_entries_has_none(splats: int) -> None:
     W = stacked([of_dense(np.zeros((splats, 3)))] * 2, splats)
     assert consensus_of(W, np.zeros(6, np.int8)).shape == (0,)
-
-
-def test_a_card_reads_the_samples_of_the_processor() -> None:
-    """Of regions of more splats than are sampled, and splats of more views than are read."""
-    rng, splats, views = np.random.default_rng(11), 2 * MOST_SPLATS, MOST_WITNESSES + 6
-    parts = []
-    for _ in range(views):
-        view = np.zeros((splats, 5))  # of a large and a small region, and three on the other level
-        for columns, shares in (([0, 1], [0.9, 0.1]), ([2, 3, 4], [0.7, 0.2, 0.1])):
-            rows = np.flatnonzero(rng.random(splats) < 0.6)
-            view[rows, rng.choice(columns, rows.size, p=shares)] = rng.uniform(0.02, 3.0, rows.size)
-        parts.append(of_dense(view))
-    W, levels = stacked(parts, splats), np.tile([0, 0, 1, 1, 1], views).astype(np.int8)
-    sizes, views_of_splats = torch.bincount(W.region), torch.bincount(W.runs(W.indptr, W.region)[1])
-    assert int(sizes.max()) > MOST_SPLATS > int(sizes.min())
-    assert int(views_of_splats.max()) > MOST_WITNESSES > int(views_of_splats.min())
-    means = torch.from_numpy(rng.normal(size=(splats, 3)))
-    for order in (None, means):
-        expected = mask_consensus(W, levels, means=order)
-    assert abs(mask_consensus(W, levels) - expected).max() > 1e-4, "the samples depend on the order"
 
 
 def test_the_level_of_a_region_is_where_it_is_labelled() -> None:
