@@ -27,10 +27,11 @@ Key = Annotated[
 ]  # fmt: skip
 LastEvent = Annotated[int, Header(alias="Last-Event-ID", ge=0, le=2**53, description="the last that the client has")]
 KNOWN: dict[int | str, dict[str, Any]] = {200: {"model": Job, "description": "The job that the same key made before"}}
+FIELDS = {name: {"type": "string"} for name in ("id", "event", "data")}
 EVENTS: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "Server-sent events: `state`, `plan` and `progress`, with JSON as their data",
-        "content": {"text/event-stream": {"schema": {"type": "string"}}},
+        "content": {"text/event-stream": {"schema": {"type": "object", "properties": FIELDS}}},  # of one event
     },
     204: {"description": "The job has ended, and the client has its last event"},
 }
