@@ -1,4 +1,4 @@
-"""Transfer of a lift to other splats of its scene: equal rows and mixtures."""
+"""Transfer of a lift to other splats of its scene: equal rows, mixtures, and an aligned scene after a motion."""
 
 from __future__ import annotations
 
@@ -10,12 +10,18 @@ import numpy as np
 import pytest
 import torch
 
+from liftcore.cli import main
+from liftcore.errors import InvalidSplats
 from liftcore.io.splats import write_splats
-from liftcore.query.result import LiftResult
+from liftcore.query.question import Query
+from liftcore.query.result import LiftResult, load_lift
 from liftcore.query.scene import Scene
+from liftcore.query.terms import SplatTerm
+from liftcore.scene.similarity import Similarity
 from liftcore.scene.splats import Splats
 from tests.tiny_scene import SPLATS_A_CLUSTER
 
+MOVE = {"scale": 2.5, "rotation": (0.8, 0.2, -0.4, 0.3), "translation": (10.0, -4.0, 7.0)}
 CLUSTER = np.repeat(np.arange(3), SPLATS_A_CLUSTER)
 
 

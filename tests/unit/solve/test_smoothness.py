@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+import liftcore as lc
 from liftcore.cli.reply import smoothing_line
 from liftcore.lifting.files import lift_files
 from liftcore.scene.neighbours import SplatGraph
@@ -20,6 +21,7 @@ from liftcore.scene.splats import Splats
 from liftcore.solve.smooth import STEPS, smooth
 from liftcore.values.settings import LiftSettings
 from tests.scenes import random_splats, write_scene
+from tests.unit.command_line import run
 from tests.unit.scene.test_neighbours import dense
 
 SEEDS = st.integers(0, 2**16)
