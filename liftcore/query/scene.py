@@ -374,8 +374,9 @@ class Scene(OpenedLift):
             what: of an answer object, coloured, scores, selection, mask, attention or overlay; of a segmentation
                 coloured, labels, picture or splat_labels; of a catalogue csv; of all these and of a tree labelled
                 (splats with labels), names (of the labels) or masks (COCO's JSON, in the views); of the scene a
-                channel of `render`, or splats; of an array npy, or mask of booleans [H, W]. Empty: the first of these; of a
-                segmentation or a catalogue as a .glb or .usdz labelled (a catalogue as a .ply, too), .json masks.
+                channel of `render`, or splats; of an array npy, or mask of booleans [H, W]. Empty: the first of
+                these; of a segmentation or a catalogue as a .glb or .usdz labelled (a catalogue as a .ply, too),
+                .json masks.
             view: of pictures, as in `view_mask`; of masks the name of the only one.
             suffix: of its name, where there are several formats.
             view_mask: the answer's mask in the view, if it is cached. photo: of the view, for an overlay.

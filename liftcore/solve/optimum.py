@@ -3,8 +3,8 @@
 A ray has a row of B for each labelled level (one for a grid), so its row of A counts as often. In r random
 projections ``G = E R`` of the channels, x^ minimises ``L(x) = |A x - B R|^2`` over all rays of the lift's stride,
 with weights of power 1. Least squares are linear in B, so x^ R is the solution for B R; with R Gaussian / sqrt(r),
-squared lengths and so L keep their expectation (the ratio's relative error is about sqrt(2 / r), less if residuals have
-many directions). A is in memory, 12 bytes for each splat on a ray: take a stride for large photos.
+squared lengths and so L keep their expectation (the ratio's relative error is about sqrt(2 / r), less if residuals
+have many directions). A is in memory, 12 bytes for each splat on a ray: take a stride for large photos.
 
 **The theorem and its beta.** Where the rows of A sum to one, Jensen gives ``L(x') <= J(x')`` with
 ``J(x) = sum_ij A_ij |x_j - B_i|^2``, and the closed form x' minimises J, so ``L(x') <= J(x^)``. Now with
