@@ -28,7 +28,7 @@ ROLES = {  # kind of file of each argument
 }  # fmt: skip
 ORDER = ("splats", "cameras", "features")
 ORDERED = ("lift", "plan", "check", "tradeoff")  # commands that take splats, cameras and features
-PRESETS = "default, row-sum, tikhonov, argmax, top-k, front-mass, centre or mean"
+PRESETS = "default, row-sum, tikhonov, argmax or top-k"
 
 
 @contextmanager

@@ -87,11 +87,8 @@ CANDIDATES = (  # in the order in which the budget is spent; a candidate overrid
     Candidate("smoothness 4", "preset", {"smoothness": 4.0}, 2.0),
     Candidate("tikhonov + aggregation", "preset", {"preset": "tikhonov", "aggregation": True}, 2.5),
     Candidate("balanced", "dial", {"quality": "balanced"}),
-    Candidate("front-mass", "preset", {"preset": "front-mass"}),
     Candidate("argmax", "preset", {"preset": "argmax"}),
-    Candidate("centre", "preset", {"preset": "centre"}),
     Candidate("top-k", "preset", {"preset": "top-k"}, 1.5),  # traverses tiles twice
-    Candidate("mean", "preset", {"preset": "mean"}),
 )
 
 

@@ -76,10 +76,6 @@ class Raster(Protocol):
         """
         ...
 
-    def adjoint(self, camera: Camera, values: Tensor, params: CompositingParams) -> Tensor:
-        """Return ``A^T Y``: values [H, W, C] f32 -> [P, C] f32, the transpose of the render; never strided."""
-        ...
-
     def row_sums(self, camera: Camera, params: CompositingParams) -> Tensor:
         """Return ``A 1``: [H, W] f32 (Property 2)."""
         ...
@@ -131,13 +127,6 @@ def check_rows(values: Tensor, splats: int) -> None:
     """Refuse values that are not [P, C] (InvalidInput)."""
     if values.ndim != 2 or values.shape[0] != splats:
         raise InvalidInput("values", expected=f"one row for each of {splats} splats", got=f"{list(values.shape)}")
-
-
-def check_image(values: Tensor, camera: Camera) -> None:
-    """Refuse values that are not [H, W, C] (InvalidInput)."""
-    if values.ndim != 3 or values.shape[:2] != (camera.height, camera.width):
-        expected = f"an image of {camera.height} rows of {camera.width} pixels"
-        raise InvalidInput("values", expected=expected, got=f"{list(values.shape)}")
 
 
 def check_labels(labels: Tensor, splats: int) -> None:

@@ -22,7 +22,6 @@ from liftcore.scene.compositing import (
     MAX_LOG_SCALE,
     NEAR_PLANE,
     CompositingParams,
-    Selection,
     Weighting,
     check_antialiased,
 )
@@ -226,28 +225,17 @@ def reading_matrix(observation: ViewFeatures, width: int, height: int) -> tuple[
 
 
 def selected_weights(
-    A: np.ndarray, splats: Splats, camera: Camera, params: CompositingParams, weighting: Weighting
+    A: np.ndarray, splats: Splats, camera: Camera, weighting: Weighting
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return A' [H * W, P], the selected weights of A to their power, and the ambiguous rays [H * W] bool."""
-    depths = camera_depths(splats, camera)
-    order = np.argsort(depths.astype(np.float32), kind="stable")
+    """Return A' [H * W, P], the weights of A that count to their power, and the ambiguous rays [H * W] bool."""
+    if not weighting.top_k:
+        return A**weighting.power, np.zeros(A.shape[0], bool)
+    order = np.argsort(camera_depths(splats, camera).astype(np.float32), kind="stable")
     w = A[:, order]  # near to far
-    if weighting.selection is Selection.TOP_K:
-        counts, cut = _largest(w, weighting.count)
-    elif weighting.selection is Selection.FRONT_MASS:
-        opacity_in_front = np.cumsum(w, axis=1) - w  # 1 - T before the splat
-        counts = opacity_in_front < weighting.mass
-        cut = ((np.abs(opacity_in_front - weighting.mass) < EDGE_BAND) & (w > 0)).any(axis=1)
-    elif weighting.selection is Selection.CENTRE:
-        counts, cut = (part[:, order] for part in _centres(A, splats, camera, params))
-        cut = cut.any(axis=1)
-    else:
-        counts, cut = np.ones_like(w, bool), np.zeros(w.shape[0], bool)
-    counts &= (w > 0) & (w >= weighting.floor)
-    cut = cut | (np.abs(w - weighting.floor) < EDGE_BAND * weighting.floor).any(axis=1)
+    counts, cut = _largest(w, weighting.top_k)
     selected = np.zeros_like(A)
-    selected[:, order] = np.where(counts, w**weighting.power, 0.0)
-    return selected, np.asarray(cut)
+    selected[:, order] = np.where(counts & (w > 0), w**weighting.power, 0.0)
+    return selected, cut
 
 
 def strided_rays(camera: Camera, params: CompositingParams) -> np.ndarray:
@@ -268,26 +256,6 @@ def _largest(w: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
     return counts, (following > 0) & (last - following < EDGE_BAND * last)
 
 
-def _centres(
-    A: np.ndarray, splats: Splats, camera: Camera, params: CompositingParams
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return masks [H * W, P]: the strided ray nearest to each centre, and the rays of centres near a border."""
-    counts, cut = np.zeros_like(A, bool), np.zeros_like(A, bool)
-    pose = camera.about(splats.origin).viewmat
-    for j, mean in enumerate(splats.means.double().numpy()):
-        x, y, z = pose[:3, :3] @ mean + pose[:3, 3]
-        if z <= 0:
-            continue
-        centre = np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
-        steps = (centre - 0.5 - np.array(params.offset)) / params.stride + 0.5  # whole numbers at the cells' borders
-        column, row = np.floor(steps).astype(int) * params.stride + np.array(params.offset)
-        if 0 <= column < camera.width and 0 <= row < camera.height:
-            counts[row * camera.width + column, j] = True
-        if (np.abs(steps - np.round(steps)) < EDGE_BAND).any():
-            cut[:, j] = A[:, j] > 0
-    return counts, cut
-
-
 class ReferenceRaster:
     """The dense reference as a backend (``liftcore.raster.base.Raster``), for conformance tests."""
 
@@ -301,7 +269,7 @@ class ReferenceRaster:
         S, ray = reading_matrix(observation, camera.width, camera.height)
         A = dense_view(self.splats, camera, params).A
         strided = strided_rays(camera, params)
-        selected = selected_weights(A, self.splats, camera, params, weighting)[0]
+        selected = selected_weights(A, self.splats, camera, weighting)[0]
         W = selected[ray[strided[ray]]].T @ S[strided[ray]]
         total_weight = (
             dense_view(self.splats, camera, replace(params, opacity_logit_scale=1.0)).A[strided].sum(axis=0)
@@ -329,11 +297,6 @@ class ReferenceRaster:
         """Return ``A X`` by a dense product."""
         image = dense_view(self.splats, camera, params).A @ values.double().numpy()
         return torch.from_numpy(image.astype(np.float32)).reshape(camera.height, camera.width, -1)
-
-    def adjoint(self, camera: Camera, values: Tensor, params: CompositingParams) -> Tensor:
-        """Return ``A^T Y`` by a dense product."""
-        Y = values.double().numpy().reshape(camera.height * camera.width, -1)
-        return torch.from_numpy((dense_view(self.splats, camera, params).A.T @ Y).astype(np.float32))
 
     def row_sums(self, camera: Camera, params: CompositingParams) -> Tensor:
         """Return ``A 1``."""

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
-from enum import StrEnum
 from numbers import Real
 
 from liftcore.errors import InvalidInput, InvalidSettings
@@ -65,24 +64,12 @@ class CompositingParams:
         return one_line(self, *(f"{field.name}={getattr(self, field.name)!r}" for field in changed_fields))
 
 
-class Selection(StrEnum):
-    """The selection of a ray's weights."""
-
-    ALL = "all"
-    TOP_K = "top-k"  # the k largest of the ray, equal ones near to far (argmax lifting: k = 1; Dr. Splat)
-    FRONT_MASS = "front-mass"  # those in front of which less than a share of the light was taken (VALA's gate)
-    CENTRE = "centre"  # one ray a splat: that of the pixel which holds its projected centre (Occam's LGS)
-
-
 @dataclass(frozen=True)
 class Weighting:
-    """The definition of a splat's weight on a ray: a selection of ``w = alpha T``, to a power."""
+    """The definition of a splat's weight on a ray: ``w = alpha T``, to a power."""
 
-    power: int = 1  # 0, 1 or 2 of what was selected; 0: each kept weight counts one
-    selection: Selection = Selection.ALL
-    count: int = 1  # k of top-k, at most MOST_OF_A_RAY
-    mass: float = 0.75  # of front-mass: a weight counts while 1 - T before it is below this
-    floor: float = 0.0  # a smaller weight counts none, in every selection
+    power: int = 1  # 1 or 2
+    top_k: int = 0  # only the k largest of a ray count, equal ones near to far (argmax lifting: 1); 0: all
 
 
 def check_antialiased(kernel: Kernel, antialiased: bool) -> None:
@@ -104,16 +91,12 @@ def check_weighting(weighting: Weighting) -> None:
     """Refuse what is out of its range.
 
     Raises:
-        InvalidInput: the power, the count, the mass or the floor.
+        InvalidInput: the power or top_k.
     """
-    if weighting.power not in (0, 1, 2):
-        raise InvalidInput("power", expected="0, 1 or 2", got=str(weighting.power))
-    if weighting.selection is Selection.TOP_K and not 1 <= weighting.count <= MOST_OF_A_RAY:
-        raise InvalidInput("count", expected=f"1 to {MOST_OF_A_RAY} weights of a ray", got=str(weighting.count))
-    if weighting.selection is Selection.FRONT_MASS and not 0 < weighting.mass <= 1:
-        raise InvalidInput("mass", expected="above 0 and at most 1", got=str(weighting.mass))
-    if not weighting.floor >= 0:
-        raise InvalidInput("floor", expected="0 or more", got=str(weighting.floor))
+    if weighting.power not in (1, 2):
+        raise InvalidInput("power", expected="1 or 2", got=str(weighting.power))
+    if not 0 <= weighting.top_k <= MOST_OF_A_RAY:
+        raise InvalidInput("top_k", expected=f"0 to {MOST_OF_A_RAY} weights of a ray", got=str(weighting.top_k))
 
 
 def every_pixel(params: CompositingParams) -> CompositingParams:

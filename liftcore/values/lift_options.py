@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal, TypedDict
 
-from liftcore.scene.compositing import Selection
 from liftcore.values.settings import Quality
 
 if TYPE_CHECKING:
@@ -15,10 +14,7 @@ class LiftOptions(TypedDict, total=False):
     """The fields of `LiftSettings` but the preset, which is an argument of its own; a test holds them equal."""
 
     quality: Quality | Literal["exact", "balanced", "fast", "draft"]
-    selection: Selection | Literal["all", "top-k", "front-mass", "centre"]
-    k: int
-    mass: float
-    weight_floor: float
+    top_k: int
     power: int
     lift_gain: float
     render_gain: float

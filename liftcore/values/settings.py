@@ -21,7 +21,6 @@ from liftcore.scene.compositing import (
     LARGEST_ALPHA,
     MOST_OF_A_RAY,
     CompositingParams,
-    Selection,
     Weighting,
     check_antialiased,
 )
@@ -33,7 +32,6 @@ if TYPE_CHECKING:  # it loads torch
     from liftcore.scene.splats import Splats
 
 TIKHONOV_GAIN = 1.2  # lambda of the paper's Tikhonov Guidance (App. Tikhonov, lambda sweep)
-VISIBLE_WEIGHT = 0.05  # a splat that weighs less at its centre is hidden there, or hardly there at all
 NO_MASKS = "grids, or maps without a label"
 _MAX_TEXT = 80  # characters of a wrong value in an error
 DIRECTIONS = 256  # no loss with masks; 128 lower the mask IoU by .0025 with few views (docs/results.md)
@@ -51,20 +49,14 @@ class Preset(StrEnum):
     TIKHONOV = "tikhonov"  # x_j = sum w~^2 b / sum w~^2 with alpha~ = sigmoid(1.2 theta)
     ARGMAX = "argmax"  # the largest w of a ray alone
     TOP_K = "top-k"  # the 40 largest w of a ray (Dr. Splat's paper)
-    FRONT_MASS = "front-mass"  # the front splats, until three quarters of the light are taken (VALA's gate)
-    CENTRE = "centre"  # one ray a splat and view, through its projected centre (Occam's LGS)
-    MEAN = "mean"  # the same ray, and the plain mean over the views that see the splat (Semantic Gaussians)
 
 
 _PRESETS: dict[Preset, dict[str, Any]] = {
     Preset.DEFAULT: {"robust": True},
     Preset.ROW_SUM: {},
     Preset.TIKHONOV: {"power": 2, "lift_gain": TIKHONOV_GAIN, "render_gain": TIKHONOV_GAIN},
-    Preset.ARGMAX: {"selection": Selection.TOP_K, "k": 1},
-    Preset.TOP_K: {"selection": Selection.TOP_K, "k": 40},
-    Preset.FRONT_MASS: {"selection": Selection.FRONT_MASS, "mass": 0.75},
-    Preset.CENTRE: {"selection": Selection.CENTRE},
-    Preset.MEAN: {"selection": Selection.CENTRE, "power": 0, "weight_floor": VISIBLE_WEIGHT},
+    Preset.ARGMAX: {"top_k": 1},
+    Preset.TOP_K: {"top_k": 40},
 }
 
 
@@ -106,7 +98,7 @@ MOST_DIAGNOSTIC_RAYS = 1_000_000
 
 GROUPS = {  # of the settings, for people who read all of them
     "a choice of many": ("preset", "quality"),
-    "weights of a ray that count": ("selection", "k", "mass", "weight_floor", "power"),
+    "weights of a ray that count": ("top_k", "power"),
     "pixels, views and levels": ("stride", "view_stride", "coverage", "view_cosine", "levels"),
     "the rasterizer": ("kernel", "antialiased", "lift_gain", "render_gain", "alpha_cap", "transmittance_stop"),
     "wrong masks": ("robust", "robust_directions"),
@@ -123,31 +115,21 @@ class LiftSettings(PlainModel):
 
     preset: Preset = Field(
         Preset.DEFAULT,
-        description="sets `selection`, `k`, `mass`, `weight_floor`, `power`, `lift_gain` and `render_gain`; "
-        "`default` also `robust`",
+        description="sets `top_k`, `power`, `lift_gain` and `render_gain`; `default` also `robust`",
     )
     quality: Quality = Field(
         Quality.EXACT,
         description="level of quality: `exact`, `balanced`, `fast` or `draft`, from the slowest to the fastest. It "
         "sets others; what you set yourself wins",
     )
-    selection: Selection = Field(
-        Selection.ALL, description="which weights of a ray count: `all`, `top-k`, `front-mass` or `centre`"
-    )
-    k: int = Field(
-        40,
-        ge=1,
+    top_k: int = Field(
+        0,
+        ge=0,
         le=MOST_OF_A_RAY,
-        description="how many weights of a ray `top-k` keeps, 1 to 64; of equal ones the nearest to the camera",
+        description="only this many of the largest weights of a ray count, 1 to 64; of equal ones the nearest to the "
+        "camera. 0: all",
     )
-    mass: float = Field(
-        0.75,
-        gt=0,
-        le=1,
-        description="`front-mass` keeps a weight while less than this share of the light was taken before it",
-    )
-    weight_floor: float = Field(0.0, ge=0, lt=1, description="smaller weights do not count, whatever the selection")
-    power: int = Field(1, ge=0, le=2, description="exponent of the weights that count: 0 (each counts one), 1 or 2")
+    power: int = Field(1, ge=1, le=2, description="exponent of the weights that count")
     lift_gain: float = Field(1.0, gt=0, le=16, description="gain on the opacity logits when lifting")
     render_gain: float = Field(1.0, gt=0, le=16, description="the same when rendering scores")
     alpha_cap: float = Field(0.99, gt=0, le=LARGEST_ALPHA, description="largest alpha of a splat on a ray")
@@ -313,7 +295,7 @@ class LiftSettings(PlainModel):
     @property
     def weighting(self) -> Weighting:
         """Definition of a weight while lifting."""
-        return Weighting(self.power, self.selection, self.k, self.mass, self.weight_floor)
+        return Weighting(self.power, self.top_k)
 
     @property
     def weighs_rows(self) -> bool:

@@ -28,7 +28,7 @@ from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.raster.gpu import launching, raster, render, tiles, weights
 from liftcore.raster.gpu.tiles import _cut as cut
 from liftcore.runtime.device import Device
-from liftcore.scene.compositing import CompositingParams, Selection, Weighting
+from liftcore.scene.compositing import CompositingParams, Weighting
 from liftcore.scene.splats import Kernel
 from tests.scenes import random_camera, random_grid, random_regions, random_splats
 
@@ -40,7 +40,7 @@ OTHER_CARDS = (75, 80, 89)  # the oldest, an A100 and Ada: what a lift of 3DGS l
 _compile: Any = triton.compile
 _specialised: Any = libtriton.native_specialize_impl
 _CARD = Device("cuda", torch.device("cpu"))
-TOP = Weighting(2, Selection.TOP_K, count=40)  # the preset's
+TOP = Weighting(2, top_k=40)
 
 
 @dataclass(frozen=True)
@@ -142,9 +142,8 @@ def _every_product() -> None:
     """One of each for 3DGS."""
     splats, camera = random_splats(3), random_camera(3)
     gpu = raster.GpuRaster(splats, torch.device("cpu"))
-    gpu.region_weights(camera, random_regions(3), CompositingParams(), Weighting(2, Selection.CENTRE))
+    gpu.region_weights(camera, random_regions(3), CompositingParams(), Weighting(2))
     gpu.render(camera, torch.zeros(splats.count, render.WIDEST), CompositingParams())
-    gpu.adjoint(camera, torch.zeros(camera.height, camera.width, weights.WIDEST), CompositingParams())
     gpu.strongest_labels(camera, torch.zeros(splats.count, dtype=torch.int32), CompositingParams())
     gpu.row_sums(random_camera(3, 1, 1), CompositingParams())
 

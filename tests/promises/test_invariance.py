@@ -18,7 +18,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "tikhonov": {"preset": "tikhonov", "dtype": "float32"},
     "default": {},
     "argmax": {"preset": "argmax", "objects": False},
-    "top-k": {"preset": "top-k", "k": 3},
+    "top-k": {"preset": "top-k", "top_k": 3},
     "strided": {"stride": 2, "view_stride": 2},
     "fast": {"quality": "fast"},
     "smooth": {"preset": "row-sum", "smoothness": 0.5},

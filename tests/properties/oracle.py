@@ -73,7 +73,7 @@ def check_region_weights(
     if view.cut.any():
         return
     S, ray = reading_matrix(observation, camera.width, camera.height)
-    selected = selected_weights(view.A, splats, camera, params, weighting)[0]
+    selected = selected_weights(view.A, splats, camera, weighting)[0]
     expected = selected[ray[strided[ray]]].T @ S[strided[ray]]
     W = dense(weights, splats.count, observation.codebook.shape[0])
     assert np.abs(W - expected).max(initial=0) < INSIDE * max(1.0, expected.max(initial=0))
@@ -84,7 +84,7 @@ def check_selected_weights(
 ) -> None:
     """Compare the selected weights with the reference ray by ray, except for ambiguous rays."""
     view = dense_view(splats, camera, params)
-    selected, close = selected_weights(view.A, splats, camera, params, weighting)
+    selected, close = selected_weights(view.A, splats, camera, weighting)
     weights = raster.region_weights(camera, one_region_a_ray(camera), params, weighting)
     W = dense(weights, splats.count, camera.width * camera.height)
     strided = strided_rays(camera, params)
@@ -102,29 +102,6 @@ def check_ray_rows(
     A = np.zeros((len(sample), splats.count))
     A[np.repeat(np.arange(len(sample)), np.diff(rows.indptr.numpy())), rows.splats.numpy()] = rows.weights.numpy()
     assert np.abs(A - view.A[sample])[~view.cut[sample]].max(initial=0) < INSIDE
-
-
-def check_adjoint(
-    raster: Raster, splats: Splats, camera: Camera, params: CompositingParams, channels: int = 3
-) -> None:
-    """Compare the adjoint of an image with ``A^T Y``."""
-    view = dense_view(splats, camera, params)
-    Y = random_image(camera, channels)
-    Y[torch.from_numpy(view.cut.reshape(camera.height, camera.width))] = 0  # `check_render` counts the flips
-    expected = view.A.T @ Y.double().numpy().reshape(-1, channels)
-    adjoint = raster.adjoint(camera, Y, params).numpy()
-    assert adjoint.shape == (splats.count, channels)
-    assert np.abs(adjoint - expected).max(initial=0) < INSIDE * max(1.0, view.A.sum(axis=0).max(initial=0))
-
-
-def check_inner_product(raster: Raster, splats: Splats, camera: Camera, params: CompositingParams) -> None:
-    """Check that ``<A X, Y> = <X, A^T Y>``: render and adjoint have the same A."""
-    X = torch.tensor(np.random.default_rng(2).normal(0, 1, (splats.count, 4)), dtype=torch.float32)
-    Y = random_image(camera, 4)
-    image, sums = raster.render(camera, X, params), raster.adjoint(camera, Y, params)
-    left, right = float((image.double() * Y).sum()), float((X * sums.double()).sum())
-    scale = float((raster.render(camera, X.abs(), params).double() * Y.abs()).sum())  # free of cancellation
-    assert abs(left - right) <= 1e-6 * scale + 1e-12
 
 
 def check_strongest_labels(raster: Raster, splats: Splats, camera: Camera, params: CompositingParams) -> float:
@@ -177,12 +154,6 @@ def one_region_a_ray(camera: Camera) -> Regions:
     rays = camera.width * camera.height
     labels = torch.arange(rays, dtype=torch.int32).reshape(1, camera.height, camera.width)
     return Regions(labels, torch.ones(rays, 1))
-
-
-def random_image(camera: Camera, channels: int) -> Tensor:
-    """Return a random image [H, W, C] f32."""
-    values = np.random.default_rng(1).normal(0, 1, (camera.height, camera.width, channels))
-    return torch.tensor(values, dtype=torch.float32)
 
 
 def pixels_of(camera: Camera) -> Tensor:

@@ -49,10 +49,7 @@ def test_sums_over_a_million_rays_are_those_of_float64():
         squares += float((alpha * alpha).sum())
     raster, region = CpuRaster(splats), Regions(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1))
     weights, squared = (raster.region_weights(camera, region, CompositingParams(), Weighting(n)) for n in (1, 2))
-    adjoint = raster.adjoint(camera, torch.ones(side, side, 1), CompositingParams())
-    assert [float(weights.weight[0]), float(weights.total_weight[0]), float(adjoint[0, 0])] == pytest.approx(
-        3 * [total]
-    )
+    assert [float(weights.weight[0]), float(weights.total_weight[0])] == pytest.approx(2 * [total])
     assert float(squared.weight[0]) == pytest.approx(squares)
 
 

@@ -381,7 +381,7 @@ def _hit_share(raster: Raster, views: LiftViews, settings: LiftSettings, visible
         camera = views.cameras[views.names[number]]
         places = sample_pixels(camera, TRACED_RAYS, (settings.seed, number), settings.lift_params)
         lengths = raster.ray_rows(camera, places, settings.lift_params).indptr.diff().numpy()
-        limit = settings.k if settings.selection == "top-k" else lengths.max(initial=0)
+        limit = settings.top_k or lengths.max(initial=0)
         counts.append(float(lengths.clip(max=limit).mean()) * camera.width * camera.height)
     area = float(visible.areas.sum(dtype=np.float64)) / len(visible.areas) / visible.areas.shape[1] * visible.splats
     return min(1.0, float(np.mean(counts)) / max(area, 1.0))

@@ -64,20 +64,16 @@ from liftcore.raster.cpu.simd import (
     lowest,
     new_state,
     no_lanes,
-    only_lane,
     plus,
     plus_product,
     smaller,
     store_lanes,
-    sum_of_lanes,
-    times,
     where_above,
-    where_at_least,
     where_equal,
     without_lowest,
 )
 from liftcore.runtime.jit import inlined, kernel
-from liftcore.scene.compositing import ALPHA_FLOOR, TILE, Selection, Weighting, check_weighting
+from liftcore.scene.compositing import ALPHA_FLOOR, TILE
 from liftcore.scene.kernel import Kernel
 
 if TYPE_CHECKING:
@@ -388,49 +384,19 @@ def blend_both(rays, splat, segment, with_unscaled):
     )
 
 
-# ------------------------------------------------------------------------------------ Selection and power of weights
+# --------------------------------------------------------------------------------------- The largest weights of a ray
 #
-# Not used where all weights count at power 1 or 2. Otherwise ``select_weights`` zeroes the lanes that do not count.
 # The k largest weights of a ray are known only at its end, so top-k composites every tile twice: ``rank_tile`` finds
-# the k-th largest weight, which is the threshold of ``select_weights``.
-
-ALL_WEIGHTS, LARGEST, FRONT, CENTRAL = range(4)
-_KINDS = {
-    Selection.ALL: ALL_WEIGHTS,
-    Selection.TOP_K: LARGEST,
-    Selection.FRONT_MASS: FRONT,
-    Selection.CENTRE: CENTRAL,
-}
-NO_CENTRE = -1  # the splat's centre is in another tile
+# the k-th largest weight, which is the threshold of ``largest_weights``.
 
 
-class Choice(NamedTuple):
-    """A Weighting for the compiled code."""
-
-    gated: bool  # True if ``select_weights`` is needed
-    kind: int
-    power: int
-    k: int  # of top-k
-    transmittance: np.float32  # of front-mass: a weight counts while T in front of it is above this
-    floor: np.float32
-
-
-def choice_of(weighting: Weighting) -> Choice:
-    """Return the weighting for the compiled code; InvalidInput if it is out of range."""
-    check_weighting(weighting)
-    kind = _KINDS[weighting.selection]
-    gated = kind != ALL_WEIGHTS or weighting.power == 0 or weighting.floor > 0
-    behind = np.float32(1.0 - weighting.mass)
-    return Choice(gated, kind, weighting.power, weighting.count, behind, np.float32(weighting.floor))
-
-
-def new_marks(choice: Choice | None) -> np.ndarray | None:
+def new_marks(top_k: int) -> np.ndarray | None:
     """Allocate the result of the first pass of top-k for a tile's 256 rays, [(k + 1) * 256] f32.
 
     The rays' largest weights, then their second largest, and so on to the k-th, 0 for none; last the number of
-    weights equal to a ray's k-th that belong to the k. Other selections ignore it. None if all weights count (None).
+    weights equal to a ray's k-th that belong to the k. None if all weights count (0).
     """
-    return None if choice is None else np.zeros((choice.k + 1) * PIXELS, np.float32)
+    return np.zeros((top_k + 1) * PIXELS, np.float32) if top_k else None
 
 
 @kernel
@@ -467,40 +433,19 @@ def rank_tile(rays, frame, tile, marks, with_unscaled):
 
 
 @inlined
-def centre_ray_of(splat):
-    """Return the ray of the tile at the splat's projected centre; NO_CENTRE if it lies in another tile."""
-    column, row = math.floor(splat.mx + 0.5), math.floor(splat.my + 0.5)
-    if 0 <= column < TILE and 0 <= row < TILE:
-        return place_of(int(row), int(column))
-    return NO_CENTRE
-
-
-@inlined
-def select_weights(choice, weights, behind, marks, lane):
-    """Select a segment's weights: zero in the lanes that do not count, raised to the power in the others.
+def largest_weights(weights, least, ties):
+    """Return the weights of eight lanes that are among the k largest of their rays, zero for others.
 
     Args:
-        weights: eight lanes. behind: the transmittance behind them. marks: (the k-th weights of their rays, the
-            number of ties with them that still belong to the k). lane: of the splat's centre; others if outside 0..7.
+        least: the k-th largest weights of the rays. ties: the number of weights equal to these that still count.
 
     Returns:
         The weights, and the remaining number of ties.
     """
-    none, (least, ties) = no_lanes(), marks
-    weights = where_at_least(weights, in_all_lanes(choice.floor), weights)
-    if choice.kind == CENTRAL:
-        weights = only_lane(weights, lane)
-    elif choice.kind == FRONT:
-        weights = where_above(plus(behind, weights), in_all_lanes(choice.transmittance), weights)
-    elif choice.kind == LARGEST:
-        equal = where_equal(weights, least, where_above(ties, none, weights))  # near to far, until k are full
-        ties = plus(ties, where_above(equal, none, in_all_lanes(np.float32(-1.0))))
-        weights = plus(where_above(weights, least, weights), equal)
-    if choice.power == 0:
-        weights = where_above(weights, none, in_all_lanes(np.float32(1.0)))
-    elif choice.power == 2:
-        weights = times(weights, weights)
-    return weights, ties
+    none = no_lanes()
+    equal = where_equal(weights, least, where_above(ties, none, weights))  # near to far, until k are full
+    ties = plus(ties, where_above(equal, none, in_all_lanes(np.float32(-1.0))))
+    return plus(where_above(weights, least, weights), equal), ties
 
 
 # ------------------------------------------------------------------------------------------------- Images and rays
@@ -543,79 +488,6 @@ def _render(first, last, frame, rays, values, sums, image):
                     image[y0 + y, x0 + x, channel] = sums[channel * PIXELS + place_of(y, x)]
         for at in range(sums.shape[0]):
             sums[at] = 0
-
-
-def gather_tiles(first: int, last: int, frame: Frame, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``A^T Y`` of tiles ``first..last`` for ``image`` [H, W, C] f32: the transpose of the render.
-
-    Each share of the tiles has one row of sums per splat that it hit: inside a tile eight lanes per channel, then one
-    number, added tile by tile. ``add_sums`` adds the shares' rows in order, so no sum depends on the threads.
-
-    Returns:
-        rows [n] i32 of projected splats, in the order of their first tile; sums [n, C] f32.
-    """
-    channels, size = image.shape[2], 1 << 10
-    rays, sum_rows = new_rays(frame), np.full(len(frame.ids), -1, np.int32)
-    pixels, lanes = np.zeros(channels * PIXELS, np.float32), np.zeros(channels * LANES, np.float32)
-    rows, sums = np.empty(size, np.int32), np.zeros((size, channels), np.float32)
-    tile, count = first, 0
-    while True:
-        tile, count = _gather(tile, last, frame, rays, image, pixels, lanes, sum_rows, rows, sums, count)
-        if tile == last:
-            return rows[:count], sums[:count]
-        growth = max(len(rows), int(frame.starts[tile + 1] - frame.starts[tile]))
-        rows = np.concatenate((rows, np.empty(growth, np.int32)))
-        sums = np.concatenate((sums, np.zeros((growth, channels), np.float32)))
-
-
-@kernel
-def _gather(first, last, frame, rays, image, pixels, lanes, sum_rows, rows, sums, count):
-    channels = image.shape[2]
-    for tile in range(first, last):
-        if frame.starts[tile] == frame.starts[tile + 1]:
-            continue
-        if count + frame.starts[tile + 1] - frame.starts[tile] > rows.shape[0]:
-            return tile, count
-        x0 = (tile % frame.columns) * TILE
-        y0 = (tile // frame.columns) * TILE
-        start_rays(rays.state, x0, y0, frame.width, frame.height)
-        for y in range(min(TILE, frame.height - y0)):
-            for x in range(min(TILE, frame.width - x0)):
-                for channel in range(channels):
-                    pixels[channel * PIXELS + place_of(y, x)] = image[y0 + y, x0 + x, channel]
-        for step in range(frame.starts[tile], frame.starts[tile + 1]):
-            if (step - frame.starts[tile]) % CHECK_EVERY == 0 and not update_active(rays, False):
-                break
-            splat = next_splat(frame, tile, step, float(x0), float(y0))
-            segments = meets(rays, splat)
-            if not segments:
-                continue
-            while segments:
-                segment = lowest(segments)
-                segments = without_lowest(segments)
-                weights = blend(rays, splat, segment)
-                for channel in range(channels):
-                    image_lanes = lanes_at(pixels, channel * PIXELS + segment * LANES)
-                    total = lanes_at(lanes, channel * LANES)
-                    store_lanes(lanes, channel * LANES, plus_product(total, weights, image_lanes))
-            place = frame.items[step]
-            if sum_rows[place] < 0:
-                sum_rows[place], rows[count] = count, place
-                count += 1
-            for channel in range(channels):
-                sums[sum_rows[place], channel] += sum_of_lanes(lanes_at(lanes, channel * LANES))
-                store_lanes(lanes, channel * LANES, no_lanes())
-    return last, count
-
-
-@kernel
-def add_sums(first, last, rows, sums, ids, result, begin):
-    """Add a share's sums whose rows lie in ``first..last`` to ``result`` [P, F] f32, from channel ``begin`` on."""
-    for i in range(rows.shape[0]):
-        if first <= rows[i] < last:
-            splat = ids[rows[i]]
-            for channel in range(sums.shape[1]):
-                result[splat, begin + channel] += sums[i, channel]
 
 
 def strongest_tiles(first: int, last: int, frame: Frame, labels: np.ndarray, count: int, image: np.ndarray) -> None:
@@ -727,14 +599,3 @@ def _trace(first, frame, rays, pixels, indptr, splats, weights):
                 break
         indptr[i + 1] = count
     return pixels.shape[0], 0
-
-
-def join_rows(rows: list[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, ...]:
-    """Join the rows of all bands, of which each ray has entries in one, into one (indptr, splats, weights)."""
-    if len(rows) == 1:
-        return rows[0]
-    lengths = np.array([np.diff(indptr) for indptr, _, _ in rows])
-    rays = np.concatenate([np.repeat(np.arange(lengths.shape[1]), splat) for splat in lengths])
-    order = np.argsort(rays, kind="stable")
-    splats, weights = (np.concatenate([row[k] for row in rows])[order] for k in (1, 2))
-    return np.concatenate([[0], np.cumsum(lengths.sum(axis=0))]), splats, weights

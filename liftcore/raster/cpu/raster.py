@@ -25,7 +25,6 @@ from liftcore.raster.base import (
     RayRows,
     ViewRequest,
     ViewWeights,
-    check_image,
     check_labels,
     check_params,
     check_rows,
@@ -33,10 +32,6 @@ from liftcore.raster.base import (
 )
 from liftcore.raster.cpu.composite import (
     Frame,
-    add_sums,
-    choice_of,
-    gather_tiles,
-    join_rows,
     kernel_in,
     render_tiles,
     strongest_tiles,
@@ -52,11 +47,11 @@ from liftcore.raster.cpu.project import (
     view_of,
     with_opacities,
 )
-from liftcore.raster.cpu.tiles import Bands, depth_order
-from liftcore.raster.cpu.weights import entries_of, merge_entries, reading_of, weigh_tiles
+from liftcore.raster.cpu.tiles import bin_tiles, depth_order
+from liftcore.raster.cpu.weights import merge_entries, reading_of, weigh_tiles
 from liftcore.runtime.cores import cores
 from liftcore.runtime.device import give_back_memory
-from liftcore.scene.compositing import TILE, CompositingParams, Weighting, every_pixel
+from liftcore.scene.compositing import TILE, CompositingParams, Weighting, check_weighting, every_pixel
 from liftcore.values.region_weights import RegionWeights, one_view
 from liftcore.values.views import DENSE_ROWS
 
@@ -99,28 +94,23 @@ class CpuRaster:
         self._pool = ThreadPoolExecutor(threads)
         self._projected = np.empty((self.splats.count, COLUMNS[self.splats.kernel]))
         self._depths = np.empty(self.splats.count, np.float32)
-        self._last_view: tuple[tuple[Camera, CompositingParams], Bands] | None = None
+        self._last_view: tuple[tuple[Camera, CompositingParams], Frame] | None = None
 
     def region_weights(
         self, camera: Camera, observation: ViewFeatures, params: CompositingParams, weighting: Weighting
     ) -> RegionWeights:
         """Return ``A'^T S`` of a view and the total weight of unscaled weights. See the protocol."""
-        choice = choice_of(weighting)
-        bands = self._bands(camera, params)
+        check_weighting(weighting)
+        frame = self._frame(camera, params)
         reading = reading_of(observation, camera.width, camera.height, params)
-        squared, gate = choice.power == 2, choice if choice.gated else None
         with_unscaled = True if params.opacity_logit_scale != 1.0 else None
 
-        def weigh_share(first: int, last: int, frame: Frame) -> tuple[np.ndarray, ...]:
-            return weigh_tiles(first, last, frame, reading, squared, gate, with_unscaled)
+        def weigh_share(first: int, last: int) -> tuple[np.ndarray, ...]:
+            return weigh_tiles(first, last, frame, reading, weighting.power == 2, weighting.top_k, with_unscaled)
 
-        frames = iter(bands)
-        frame = next(frames)
-        W = self._merge(frame, self._over_tiles(frame, weigh_share), reading.codebook_rows)
-        for frame in frames:
-            before = entries_of(W, frame.ids, reading.codebook_rows, reading.levels)
-            W = self._merge(frame, [before, *self._over_tiles(frame, weigh_share)], reading.codebook_rows)
-        return W
+        entries = self._over_tiles(frame, weigh_share)
+        rows = merge_entries(entries, frame.ids, reading.codebook_rows, self.threads, self._map)
+        return one_view(*map(torch.from_numpy, rows), regions=reading.codebook_rows)
 
     def iterate_views(self, requests: Iterable[ViewRequest]) -> Generator[ViewWeights]:
         """Yield ``region_weights`` and ``ray_rows`` of views, ``views_at_a_time`` in parallel.
@@ -149,39 +139,16 @@ class CpuRaster:
     def render(self, camera: Camera, values: Tensor, params: CompositingParams) -> Tensor:
         """Return ``A X``: values [P, C] f32 -> [H, W, C] f32. See the protocol."""
         check_rows(values, self.splats.count)
-        bands, channels = self._bands(camera, every_pixel(params)), values.shape[1]
+        frame, channels = self._frame(camera, every_pixel(params)), values.shape[1]
         image = np.zeros((camera.height, camera.width, channels), np.float32)
         for begin in range(0, channels, CHANNELS):
             block = np.ascontiguousarray(values[:, begin : begin + CHANNELS].to(torch.float32).numpy())
             is_one_pass = block.shape[1] == channels
             target = image if is_one_pass else np.zeros((camera.height, camera.width, block.shape[1]), np.float32)
-            for frame in bands:
-                self._over_tiles(frame, partial(_render, block, target))
+            self._over_tiles(frame, partial(render_tiles, frame=frame, values=block, image=target))
             if not is_one_pass:
                 image[:, :, begin : begin + CHANNELS] = target
         return torch.from_numpy(image)
-
-    def adjoint(self, camera: Camera, values: Tensor, params: CompositingParams) -> Tensor:
-        """Return ``A^T Y``: values [H, W, C] f32 -> [P, C] f32, the transpose of the render. See the protocol."""
-        check_image(values, camera)
-        bands, channels = self._bands(camera, every_pixel(params)), values.shape[2]
-        result = np.zeros((self.splats.count, channels), np.float32)
-        for begin in range(0, channels, CHANNELS):
-            image = values[:, :, begin : begin + CHANNELS].to(torch.float32).numpy()
-            for frame in bands:
-                self._add_adjoint(frame, np.ascontiguousarray(image), result, begin)
-        return torch.from_numpy(result)
-
-    def _add_adjoint(self, frame: Frame, image: np.ndarray, result: np.ndarray, begin: int) -> None:
-        """Add the adjoint of the frame's tiles, for a block of channels, to ``result`` from channel ``begin`` on."""
-        shares = self._over_tiles(frame, lambda first, last, frame: gather_tiles(first, last, frame, image))
-
-        def merge(first: int, last: int) -> None:
-            for rows, sums in shares:
-                add_sums(first, last, rows, sums, frame.ids, result, begin)
-
-        # Each row is in one range and its shares are added in order, so no sum depends on the number of ranges.
-        self._map(merge, _shares(self.splats.count, self.threads))
 
     def row_sums(self, camera: Camera, params: CompositingParams) -> Tensor:
         """Return ``A 1``: [H, W] f32."""
@@ -191,13 +158,8 @@ class CpuRaster:
         """Return ``argmax(A onehot(labels))``: labels [P] i32 in -1..K - 1 -> [H, W] i32. See the protocol."""
         check_labels(labels, self.splats.count)
         flat, count = np.ascontiguousarray(labels.to(torch.int32).numpy()), int(labels.max()) + 1
-        image = np.full((camera.height, camera.width), -1, np.int32)
-
-        def strongest(first: int, last: int, frame: Frame) -> None:
-            strongest_tiles(first, last, frame, flat, count, image)
-
-        for frame in self._bands(camera, every_pixel(params)):
-            self._over_tiles(frame, strongest)
+        image, frame = np.full((camera.height, camera.width), -1, np.int32), self._frame(camera, every_pixel(params))
+        self._over_tiles(frame, partial(strongest_tiles, frame=frame, labels=flat, count=count, image=image))
         return torch.from_numpy(image)
 
     def ray_rows(self, camera: Camera, pixels: Tensor, params: CompositingParams) -> RayRows:
@@ -206,8 +168,7 @@ class CpuRaster:
         if places is None:  # some are no rays of the strided view
             places, params = pixels, every_pixel(params)
         rays = np.ascontiguousarray(places.to(torch.int32).numpy())
-        rows = join_rows([trace_rays(frame, rays) for frame in self._bands(camera, params)])
-        return RayRows(*map(torch.from_numpy, rows))
+        return RayRows(*map(torch.from_numpy, trace_rays(self._frame(camera, params), rays)))
 
     def footprints(self, camera: Camera, params: CompositingParams) -> Tensor:
         """Return the areas [P] f32 of the splats' outlines. See the protocol."""
@@ -223,7 +184,7 @@ class CpuRaster:
         """Drop the cached projection of the last view."""
         self._last_view = None
 
-    def _bands(self, camera: Camera, params: CompositingParams) -> Bands:
+    def _frame(self, camera: Camera, params: CompositingParams) -> Frame:
         """Project and bin the view; the last view is cached."""
         key = (camera, params)
         if self._last_view is None or self._last_view[0] != key:
@@ -247,7 +208,7 @@ class CpuRaster:
         rows = np.concatenate(rows_by_share) if rows_by_share else np.empty(0, np.int32)
         return targets.ids, depth_order(self._depths[rows].view(np.uint32), rows)
 
-    def _bin(self, view: View, params: CompositingParams, ids: np.ndarray, order: np.ndarray) -> Bands:
+    def _bin(self, view: View, params: CompositingParams, ids: np.ndarray, order: np.ndarray) -> Frame:
         columns, rows = -(-view.width // TILE), -(-view.height // TILE)
         no_lists = np.zeros(rows * columns + 1, np.int64), np.empty(0, np.int32)
         frame = Frame(
@@ -255,12 +216,7 @@ class CpuRaster:
             columns, rows, view.width, view.height, params.alpha_cap, params.transmittance_stop,
         )  # fmt: skip
         parts = [order[first:last] for first, last in _shares(order.shape[0], SPLAT_SHARES)]
-        return Bands(frame, parts, self._map)
-
-    def _merge(self, frame: Frame, entries: list, codebook_rows: int) -> RegionWeights:
-        """Merge the entries of all tile shares into one row per splat."""
-        rows = merge_entries(entries, frame.ids, codebook_rows, self.threads, self._map)
-        return one_view(*map(torch.from_numpy, rows), regions=codebook_rows)
+        return bin_tiles(frame, parts, self._map)
 
     def _scene_with(self, scale: float) -> Scene:
         if scale != self._scale:
@@ -268,20 +224,16 @@ class CpuRaster:
         return self._scene
 
     def _over_tiles(self, frame: Frame, work: Callable) -> list:
-        """Run ``work(first, last, frame)`` over tile shares with about as many list items each."""
+        """Run ``work(first, last)`` over shares of a frame's tiles with about as many list items each."""
         tiles = frame.columns * frame.rows
         marks = np.linspace(0, frame.starts[-1], TILE_SHARES + 1)
         edges = np.unique(np.concatenate([[0], np.searchsorted(frame.starts, marks[1:-1]), [tiles]]))
-        return self._map(work, [(int(a), int(b), frame) for a, b in pairwise(edges)])
+        return self._map(work, [(int(a), int(b)) for a, b in pairwise(edges)])
 
     def _map(self, work: Callable, shares: list) -> list:
         if self.threads == 1:
             return [work(*share) for share in shares]
         return list(self._pool.map(lambda share: work(*share), shares))
-
-
-def _render(values: np.ndarray, image: np.ndarray, first: int, last: int, frame: Frame) -> None:
-    render_tiles(first, last, frame, values, image)
 
 
 def _shares(total: int, count: int) -> list[tuple[int, int]]:

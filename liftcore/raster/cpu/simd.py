@@ -156,7 +156,6 @@ larger = _of_two(_maximum)
 smaller = _of_two(_minimum)
 plus_product = _of_three(lambda builder, total, left, right: _fused(builder, left, right, total))
 where_above = _of_three(_where(">"))  # (left, right, values): values[i] where left[i] > right[i], else 0
-where_at_least = _of_three(_where(">="))
 where_equal = _of_three(_where("=="))
 
 
@@ -205,18 +204,6 @@ def sum_of_lanes(typingctx, lanes):
         return parts[0]
 
     return types.float32(EIGHT), codegen
-
-
-@compiled
-def only_lane(typingctx, values, lane):
-    """Return ``values[i]`` in that lane and 0 in all others; eight zeros if ``lane`` is outside 0..7."""
-
-    def codegen(context, builder, signature, args):
-        number = _broadcast(builder, builder.trunc(args[1], INT), INTS)
-        is_lane = builder.icmp_signed("==", ir.Constant(INTS, list(range(LANES))), number)
-        return builder.select(is_lane, args[0], _constant(0.0))
-
-    return EIGHT(EIGHT, types.intp), codegen
 
 
 @compiled

@@ -9,8 +9,6 @@ order inside a tile is the depth order, so the result does not depend on the num
 from __future__ import annotations
 
 import math
-from itertools import pairwise
-from threading import Lock
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -22,13 +20,10 @@ from liftcore.runtime.jit import inlined, kernel
 from liftcore.scene.compositing import TILE
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from liftcore.raster.cpu.composite import Frame
 
-MOST_LISTED = 1 << 26  # items of all tile lists above which the view is split into bands
-BAND_ITEMS = 1 << 24  # items of a band's lists, unless one tile has more; an item may have several entries of W
-_NO_LIMIT = int(np.iinfo(np.int64).max)
 _PREFETCH = 8  # splats by which rows are prefetched: in depth order they are scattered in memory
 _DIGIT = 11  # bits per pass of the radix sort; three passes cover a float32
 _BUCKETS = 1 << _DIGIT
@@ -152,34 +147,29 @@ def _tile_columns(outline, circle, tile_row, columns):
     return max(0.0, first), min(columns - 1.0, last)
 
 
-def list_tiles(order, frame, span, limit, counts) -> tuple[np.ndarray, np.ndarray]:
+def list_tiles(order: np.ndarray, frame: Frame, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """List the tiles that each of ``order``'s splats touches, splat by splat.
 
     Args:
         order: [n] i32, rows of projected splats. frame: the view, still without lists.
-        span: (first, last), the range of tiles to list.
-        limit: tiles above which the list may end early.
         counts: [rows * columns] i64, zeros; receives the number of splats of each tile.
 
     Returns:
         lengths [n] i32, the number of tiles of each splat; tiles [sum] i32, row by row.
     """
-    lengths, width = np.zeros(len(order), np.int32), span[1] - span[0]
-    tiles = np.empty(4 * len(order) + width, np.int32)
-    size = frame.rows, frame.columns
+    lengths, size = np.zeros(len(order), np.int32), (frame.rows, frame.columns)
+    tiles = np.empty(4 * len(order) + len(counts), np.int32)
     first = count = 0
     while True:
         lists = lengths, tiles
-        first, count = _list_until_full(
-            order, (first, count), frame.kernel, frame.projected, size, span, counts, lists
-        )
-        if first == len(order) or count > limit:
+        first, count = _list_until_full(order, (first, count), frame.kernel, frame.projected, size, counts, lists)
+        if first == len(order):
             return lengths, tiles[:count]
-        tiles = np.concatenate((tiles, np.empty(len(tiles) + width, np.int32)))
+        tiles = np.concatenate((tiles, np.empty(len(tiles) + len(counts), np.int32)))
 
 
 @kernel
-def _list_until_full(order, begin, kernel, projected, size, span, counts, lists):
+def _list_until_full(order, begin, kernel, projected, size, counts, lists):
     """Continue ``list_tiles`` from ``begin = (splat, item of the list)`` on, until a splat might not fit.
 
     Args:
@@ -188,19 +178,17 @@ def _list_until_full(order, begin, kernel, projected, size, span, counts, lists)
     Returns:
         The next splat and item, as ``begin``.
     """
-    (first_one, count), (rows, columns), (start, end), (lengths, tiles) = begin, size, span, lists
-    first_row, last_row = start // columns, (end - 1) // columns
+    (first_one, count), (rows, columns), (lengths, tiles) = begin, size, lists
     for i in range(first_one, order.shape[0]):
-        if count + end - start > tiles.shape[0]:
+        if count + rows * columns > tiles.shape[0]:
             return i, count
         fetch_row(projected, order[min(i + _PREFETCH, order.shape[0] - 1)])
         before, splat = count, projected[order[i]]
         outline, circle = _outline(splat), circle_of(kernel, splat)
         top, bottom = _tile_rows(outline, circle, rows)
-        for tile_row in range(max(int(top), first_row), min(int(bottom), last_row) + 1):
+        for tile_row in range(int(top), int(bottom) + 1):
             first, last = _tile_columns(outline, circle, tile_row, columns)
-            tile_0 = tile_row * columns
-            for tile in range(max(tile_0 + int(first), start), min(tile_0 + int(last) + 1, end)):
+            for tile in range(tile_row * columns + int(first), tile_row * columns + int(last) + 1):
                 tiles[count] = tile
                 counts[tile] += 1
                 count += 1
@@ -236,77 +224,21 @@ def _tile_places(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return starts, cursors
 
 
-class Bands:
-    """A projected view as frames with the lists of some of its tiles: usually one frame with all tiles.
-
-    The split depends on the splats alone, not on the threads.
+def bin_tiles(frame: Frame, parts: list[np.ndarray], run: Callable[[Callable, list], list]) -> Frame:
+    """Return a projected view with the lists of its tiles.
 
     Args:
         frame: the view, with empty lists.
         parts: the depth order, in shares.
         run: calls a function for each of a list of argument tuples, and returns the list of results.
     """
+    counts = np.zeros((len(parts), frame.rows * frame.columns), np.int64)
+    lists = run(lambda part, counts: list_tiles(part, frame, counts), list(zip(parts, counts, strict=True)))
+    starts, cursors = _tile_places(counts)
+    items = np.empty(starts[-1], np.int32)
 
-    def __init__(self, frame: Frame, parts: list[np.ndarray], run: Callable[[Callable, list], list]) -> None:
-        self._bare, self._parts, self._run = frame, parts, run
-        tiles = frame.rows * frame.columns
-        self._edges = [0, tiles]
-        self._single_frame = self._frame((0, tiles), MOST_LISTED)
-        if self._single_frame is None:
-            self._edges = _cuts(self._count_by_tile(), BAND_ITEMS)
+    def fill(part: np.ndarray, lists: tuple[np.ndarray, np.ndarray], cursors: np.ndarray) -> None:
+        fill_tiles(part, *lists, cursors, items)
 
-    def __iter__(self) -> Iterator[Frame]:
-        """Yield the frames, each built on demand; tiles of other bands have empty lists."""
-        for span in pairwise(self._edges):
-            frame = self._single_frame or self._frame(span, _NO_LIMIT)
-            assert frame is not None
-            yield frame
-
-    def _frame(self, span: tuple[int, int], limit: int) -> Frame | None:
-        """Return the frame of the tiles ``span[0]..span[1]``; None if they have more than ``limit`` items."""
-        counts = np.zeros((len(self._parts), self._bare.rows * self._bare.columns), np.int64)
-        total, lock = 0, Lock()
-
-        def fill_lists(part: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            nonlocal total
-            capacity = limit - total
-            lengths, tiles = list_tiles(
-                part if capacity >= 0 else part[:0], self._bare, span, max(0, capacity), counts
-            )
-            with lock:
-                total += len(tiles)
-            return lengths, tiles
-
-        lists = self._run(fill_lists, list(zip(self._parts, counts, strict=True)))
-        if total > limit:
-            return None
-        starts, cursors = _tile_places(counts)
-        items = np.empty(starts[-1], np.int32)
-
-        def fill(part: np.ndarray, lists: tuple[np.ndarray, np.ndarray], cursors: np.ndarray) -> None:
-            fill_tiles(part, *lists, cursors, items)
-
-        self._run(fill, list(zip(self._parts, lists, cursors, strict=True)))
-        return self._bare._replace(starts=starts, items=items)
-
-    def _count_by_tile(self) -> np.ndarray:
-        """Count the splats of each tile, [tiles] i64, without keeping the lists."""
-        tiles = self._bare.rows * self._bare.columns
-        at_a_time = max(1, BAND_ITEMS // tiles)
-
-        def count_lists(part: np.ndarray) -> np.ndarray:
-            counts = np.zeros(tiles, np.int64)
-            for first in range(0, len(part), at_a_time):
-                list_tiles(part[first : first + at_a_time], self._bare, (0, tiles), _NO_LIMIT, counts)
-            return counts
-
-        return np.sum(self._run(count_lists, [(part,) for part in self._parts]), axis=0)
-
-
-def _cuts(counts: np.ndarray, limit: int) -> list[int]:
-    """Return cuts between tiles such that runs of them have at most ``limit`` items, or are single tiles."""
-    ends, edges = np.cumsum(counts), [0]
-    while edges[-1] < len(counts):
-        before = ends[edges[-1] - 1] if edges[-1] else 0
-        edges.append(max(edges[-1] + 1, int(np.searchsorted(ends, before + limit, side="right"))))
-    return edges
+    run(fill, list(zip(parts, lists, cursors, strict=True)))
+    return frame._replace(starts=starts, items=items)

@@ -24,8 +24,8 @@ def warm_up(
 ) -> None:
     """Run the products of a lift and a query on one splat. The first run compiles, later runs load from disk.
 
-    Each splat kernel, unscaled opacities and selections of weights are compiled separately, so a scene waits only for
-    what it uses. Rare products (the adjoint, labels) compile at their first call. On a GPU each weighting compiles.
+    Each splat kernel, unscaled opacities and top-k are compiled separately, so a scene waits only for what it uses.
+    Rare products (labels) compile at their first call. On a GPU each weighting compiles.
 
     Args:
         params: compositing parameters of the lift. weighting: of the lift.

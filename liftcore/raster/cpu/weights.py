@@ -26,20 +26,15 @@ import numpy as np
 import torch
 
 from liftcore.raster.cpu.composite import (
-    CENTRAL,
     CHECK_EVERY,
-    LARGEST,
-    NO_CENTRE,
-    Choice,
     Frame,
     blend_both,
-    centre_ray_of,
+    largest_weights,
     meets,
     new_marks,
     new_rays,
     next_splat,
     rank_tile,
-    select_weights,
     start_rays,
     update_active,
 )
@@ -49,7 +44,6 @@ from liftcore.raster.cpu.simd import (
     ROWS,
     SEGMENTS,
     SIDES,
-    TRANSMITTANCE,
     all_are,
     any_above,
     fetch_place,
@@ -65,7 +59,6 @@ from liftcore.raster.cpu.simd import (
 )
 from liftcore.runtime.jit import inlined, kernel
 from liftcore.scene.compositing import TILE, CompositingParams
-from liftcore.values.region_weights import RegionWeights
 from liftcore.values.views import Regions, ViewFeatures, cells_under
 
 Run = Callable[[Callable, list], list]
@@ -374,7 +367,7 @@ def weigh_tiles(
     frame: Frame,
     reading: ViewReading,
     squared: bool,
-    gate: Choice | None,
+    top_k: int,
     with_unscaled: bool | None,
 ) -> tuple[np.ndarray, ...]:
     """Return the entries of tiles ``first..last``.
@@ -382,8 +375,7 @@ def weigh_tiles(
     Options that are None are not compiled into the loop: skipping them at run time would cost a tenth of its time.
 
     Args:
-        squared: square the weights; a gate does so by its own power.
-        gate: Choice of the weights that count; None for all of them.
+        squared: square the weights. top_k: number of a ray's largest weights that count; 0 for all of them.
         with_unscaled: True if the total weight is of unscaled opacities, with transmittances of its own; else None.
 
     Returns:
@@ -392,13 +384,13 @@ def weigh_tiles(
     """
     rays, taps, sums = new_rays(frame), new_taps(reading.levels), np.zeros(MAX_SLOTS * LANES, np.float32)
     *entries, slot_rows = _weigh(
-        first, last, frame, reading, rays, taps, sums, squared, gate, new_marks(gate), with_unscaled
+        first, last, frame, reading, rays, taps, sums, squared, new_marks(top_k), with_unscaled
     )
     return *entries, slot_rows.reshape(-1, reading.levels)
 
 
 @kernel
-def _weigh(first, last, frame, reading, rays, taps, sums, squared, gate, marks, with_unscaled):
+def _weigh(first, last, frame, reading, rays, taps, sums, squared, marks, with_unscaled):
     """Write the entries in one long function: a call would count references to arrays of a tuple by locked
     instructions.
     """
@@ -407,9 +399,8 @@ def _weigh(first, last, frame, reading, rays, taps, sums, squared, gate, marks, 
     tap_starts, tap_slots, factors = taps.starts, taps.slots, taps.factors
     single_slots, slot_sets, spans, shares = taps.single_slots, taps.slot_sets, taps.spans, taps.shares
     is_grid = reading.is_grid
-    centre_ray = NO_CENTRE
     # The weight of a slot that all pixels read is the total weight.
-    reuse = with_unscaled is None and gate is None and not squared
+    reuse = with_unscaled is None and marks is None and not squared
     size = max(1 << 15, 2 * levels)
     places, slots = np.empty(size, np.int32), np.empty(size, np.int32)
     weights, total_weight = np.empty(size, np.float32), np.empty(size, np.float32)
@@ -420,7 +411,7 @@ def _weigh(first, last, frame, reading, rays, taps, sums, squared, gate, marks, 
             continue
         column, row = tile % frame.columns, tile // frame.columns
         x0, y0 = float(column * TILE), float(row * TILE)
-        if gate is not None and gate.kind == LARGEST:
+        if marks is not None:
             rank_tile(rays, frame, tile, marks, with_unscaled)
         start_rays(state, column * TILE, row * TILE, frame.width, frame.height)
         read_tile(taps, reading, frame.width, frame.height, column * TILE, row * TILE)
@@ -441,8 +432,6 @@ def _weigh(first, last, frame, reading, rays, taps, sums, squared, gate, marks, 
                 weights, total_weight = _longer(weights, required), _longer(total_weight, required)
             for step in range(near, min(near + CHECK_EVERY, starts[tile + 1])):
                 splat = next_splat(frame, tile, step, x0, y0)
-                if gate is not None and gate.kind == CENTRAL:
-                    centre_ray = centre_ray_of(splat)
                 hit_slots, unscaled_sums = np.uint64(0), no_lanes()
                 # Segments of several slots come last: the branch then changes once per splat, and is predicted.
                 several, hit_segments = taps.several[0], meets(rays, splat)
@@ -455,17 +444,14 @@ def _weigh(first, last, frame, reading, rays, taps, sums, squared, gate, marks, 
                     unscaled_sums = plus(unscaled_sums, unscaled)
                     if whole_tile:
                         continue
-                    if gate is not None:
-                        first_ray, ties_at = segment * LANES, gate.k * PIXELS + segment * LANES
-                        behind = lanes_at(state, TRANSMITTANCE + first_ray)
-                        thresholds = lanes_at(marks, ties_at - PIXELS), lanes_at(marks, ties_at)
-                        lane_weights, ties = select_weights(
-                            gate, lane_weights, behind, thresholds, centre_ray - first_ray
-                        )
+                    if marks is not None:
+                        ties_at = marks.shape[0] - PIXELS + segment * LANES
+                        least, ties = lanes_at(marks, ties_at - PIXELS), lanes_at(marks, ties_at)
+                        lane_weights, ties = largest_weights(lane_weights, least, ties)
                         store_lanes(marks, ties_at, ties)
                         if not any_above(lane_weights, no_lanes()):
                             continue
-                    elif squared:
+                    if squared:
                         lane_weights = times(lane_weights, lane_weights)
                     hit_slots |= slot_sets[segment]
                     if rank < SEGMENTS:
@@ -674,21 +660,4 @@ def merge_range(starts, row_entries, slot_rows, codebook_rows, ids):
         weights[:count],
         hit_splats[:hit_count],
         total_weight[:hit_count],
-    )
-
-
-def entries_of(W: RegionWeights, ids: np.ndarray, codebook_rows: int, levels: int) -> tuple[np.ndarray, ...]:
-    """Return the weights of other bands as a share of entries, as those of ``weigh_tiles``: one slot per column."""
-    rows = np.flatnonzero(ids >= 0)
-    records = rows[np.searchsorted(ids[rows], W.splats.numpy())]
-    hit_rows = rows[np.searchsorted(ids[rows], W.total_weight_splats.numpy())]
-    entries, total_weight = W.region.numpy(), W.total_weight.numpy()
-    slot_rows = np.full((codebook_rows, levels), -1, np.int32)
-    slot_rows[:, 0] = np.arange(codebook_rows)
-    return (
-        np.concatenate([np.repeat(records, np.diff(W.indptr.numpy())), hit_rows]).astype(np.int32),
-        np.concatenate([entries, np.full(len(hit_rows), NO_SLOT, np.int32)]),
-        np.concatenate([W.weight.numpy(), np.zeros(len(hit_rows), np.float32)]),
-        np.concatenate([np.zeros(len(entries), np.float32), total_weight]),
-        slot_rows,
     )

@@ -16,7 +16,6 @@ few float64 units.
 
 import triton.language as tl
 
-from liftcore.raster.cpu.composite import CENTRAL, FRONT, LARGEST
 from liftcore.raster.gpu import project as scene
 from liftcore.raster.gpu.launching import jit, lang
 from liftcore.scene.compositing import ALPHA_FLOOR, LARGEST_EXPONENT, TILE
@@ -33,7 +32,6 @@ PARTS = 2  # of scratch; twice as many with those of the total weight
 _CHUNK, _TILE, _PIXELS = tl.constexpr(CHUNK), tl.constexpr(TILE), tl.constexpr(TILE * TILE)
 _SCRATCH, _TOTALS = tl.constexpr(PARTS * PART), tl.constexpr(PARTS * PART)
 _WEIGHTS, _UNSCALED_ALPHAS = tl.constexpr(PART), tl.constexpr(2 * PART)
-_LARGEST, _FRONT, _CENTRAL = tl.constexpr(LARGEST), tl.constexpr(FRONT), tl.constexpr(CENTRAL)
 _LATER = tl.constexpr(1 << 30)  # above every item number: an empty slot
 _BETAS = tl.constexpr(BETAS)
 _DISCS = tl.constexpr(DISCS)
@@ -171,23 +169,12 @@ def weights_of(scratch, count, pixel):
 
 
 @jit
-def blend_selected(
-    scratch,
-    transmittance,
-    stop,
-    count,
-    least,
-    ties,
-    lowest_transmittance,
-    SELECTION: tl.constexpr,
-    WITH_ALL: tl.constexpr,
-):
-    """Blend as ``blend_chunk``, storing selected weights only; WITH_ALL: all weights too, as those of the total
-    weight.
+def blend_largest(scratch, transmittance, stop, count, least, ties, WITH_ALL: tl.constexpr):
+    """Blend as ``blend_chunk``, storing the k largest weights of a ray only.
 
     Args:
-        least: [256] f32, of top-k: the k-th largest weight of a ray. ties: [256] i32, how many equal to it count.
-        lowest_transmittance: of front-mass: a weight counts while the transmittance in front of it is above this.
+        least: [256] f32, the k-th largest weight of a ray. ties: [256] i32, how many equal to it count.
+        WITH_ALL: store all weights too, as those of the total weight.
 
     Returns:
         The transmittance behind the chunk, and the remaining ties.
@@ -195,41 +182,14 @@ def blend_selected(
     pixel = tl.arange(0, _PIXELS)
     for number in range(tl.minimum(count, _CHUNK)):
         pointer = scratch + number * _PIXELS + pixel
-        before = transmittance
         weight, transmittance = blend(tl.load(pointer), transmittance, stop)
         if WITH_ALL:
             tl.store(pointer + _TOTALS + _WEIGHTS, weight)
-        if SELECTION == _LARGEST:  # equal ones near to far, until k are full
-            equal = (weight == least) & (weight > 0.0) & (ties > 0)
-            ties -= equal.to(tl.int32)
-            tl.store(pointer + _WEIGHTS, tl.where(equal | (weight > least), weight, 0.0))
-        else:
-            tl.store(pointer + _WEIGHTS, tl.where(before > lowest_transmittance, weight, 0.0))
+        equal = (weight == least) & (weight > 0.0) & (ties > 0)  # near to far, until k are full
+        ties -= equal.to(tl.int32)
+        tl.store(pointer + _WEIGHTS, tl.where(equal | (weight > least), weight, 0.0))
     tl.debug_barrier()
     return transmittance, ties
-
-
-@jit
-def select_weights(
-    weights, pixel, places, items, at, last, tile, columns, smallest, SELECTION: tl.constexpr, POWER: tl.constexpr
-):
-    """Return a chunk's weights [CHUNK, n] on pixels [n] to their power, zero below ``smallest`` or off the centre."""
-    weights = tl.where(weights >= smallest, weights, 0.0)
-    if SELECTION == _CENTRAL:
-        number = at + tl.arange(0, _CHUNK)
-        inside = number < last
-        place = places + tl.load(items + number, mask=inside, other=0) * _PLACE
-        column = tl.floor(tl.load(place, mask=inside, other=-1.0)) - (tile % columns * _TILE).to(tl.float64)
-        row = tl.floor(tl.load(place + 1, mask=inside, other=-1.0)) - (tile // columns * _TILE).to(tl.float64)
-        is_centre = (column[:, None] == (pixel % _TILE).to(tl.float64)[None, :]) & (
-            row[:, None] == (pixel // _TILE).to(tl.float64)[None, :]
-        )
-        weights = tl.where(is_centre, weights, 0.0)
-    if POWER == 0:
-        weights = tl.where(weights > 0.0, 1.0, 0.0)
-    if POWER == 2:
-        weights = weights * weights
-    return weights
 
 
 @jit

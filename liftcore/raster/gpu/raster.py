@@ -22,13 +22,11 @@ from liftcore.raster.base import (
     RayRows,
     ViewRequest,
     ViewWeights,
-    check_image,
     check_labels,
     check_params,
     check_rows,
     strided_places,
 )
-from liftcore.raster.cpu.composite import choice_of
 from liftcore.raster.cpu.project import activate_splats, view_of, with_opacities
 from liftcore.raster.gpu import render, weights
 from liftcore.raster.gpu.launching import check_device
@@ -38,7 +36,7 @@ from liftcore.raster.gpu.tiles import BLOCK, Frame
 from liftcore.raster.gpu.weights import DeviceReading
 from liftcore.runtime.device import indexed, out_of_memory
 from liftcore.scene.cameras import Camera
-from liftcore.scene.compositing import CompositingParams, Weighting, every_pixel
+from liftcore.scene.compositing import CompositingParams, Weighting, check_weighting, every_pixel
 from liftcore.scene.splats import Splats
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.views import ViewFeatures
@@ -123,8 +121,9 @@ class GpuRaster:
     def _view_weights(
         self, reading: DeviceReading, camera: Camera, params: CompositingParams, weighting: Weighting
     ) -> RegionWeights:
-        choice, frame = choice_of(weighting), self._frame(camera, params)
-        return weights.region_weights(frame, reading, choice, params.opacity_logit_scale != 1.0, self.splats.count)
+        check_weighting(weighting)
+        frame = self._frame(camera, params)
+        return weights.region_weights(frame, reading, weighting, params.opacity_logit_scale != 1.0, self.splats.count)
 
     def iterate_views(self, requests: Iterable[ViewRequest]) -> Generator[ViewWeights]:
         """Yield ``region_weights`` and ``ray_rows`` of views, one at a time; the next is read while the GPU works."""
@@ -156,17 +155,6 @@ class GpuRaster:
             block = values[:, begin : begin + render.WIDEST].to(torch.float32).contiguous()
             image[:, :, begin : begin + render.WIDEST] = render.render(frame, block)
         return image
-
-    @_within_memory
-    def adjoint(self, camera: Camera, values: Tensor, params: CompositingParams) -> Tensor:
-        """Return ``A^T Y``: values [H, W, C] f32 -> [P, C] f32. See the protocol."""
-        check_image(values, camera)
-        frame = self._frame(camera, every_pixel(params))
-        result = torch.empty(self.splats.count, values.shape[2], dtype=torch.float32)
-        for begin in range(0, values.shape[2], weights.WIDEST):
-            block = values[:, :, begin : begin + weights.WIDEST]
-            result[:, begin : begin + weights.WIDEST] = weights.adjoint(frame, block, self.splats.count)
-        return result
 
     def row_sums(self, camera: Camera, params: CompositingParams) -> Tensor:
         """Return ``A 1``: [H, W] f32."""

@@ -288,11 +288,6 @@ class Frame:
         ]
         return [begin for begin in begins if first < begin < last] + [last]
 
-    def of_band(self, image: Tensor, lists: TileLists) -> Tensor:
-        """Copy the rows of a host image [H, W, C] f32 that a band covers to the device."""
-        top = lists.first_row * TILE
-        return image[top : top + lists.tiles // self.columns * TILE].to(self.device, torch.float32).contiguous()
-
     def of_splats(self, values: Tensor, lists: TileLists) -> Tensor:
         """Return the rows of projected splats, taken from ``values`` [P, ...], on the device."""
         return values.to(self.device)[lists.ids.long()]

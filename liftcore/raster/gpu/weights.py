@@ -1,10 +1,9 @@
-"""``W = A'^T S`` and ``A^T Y`` on the device: products that sum over the pixels of each tile.
+"""``W = A'^T S`` on the device, a sum over the pixels of each tile.
 
-Both are the product of a chunk's weights [CHUNK, 256] with a matrix of the tile's pixels: the shares of the slots, or
-the channels of an image. A slot of a region map is a distinct tuple of labels on all levels, a slot of a grid is a
-cell; either becomes one or four taps per pixel. The pixel loop does not depend on labels or rows of the codebook.
-Item k of a tile's list has row k of the tile's table of sums, so every sum has a fixed address, and no two programs
-add to the same one.
+It is the product of a chunk's weights [CHUNK, 256] with a matrix of the tile's pixels, the shares of the slots. A
+slot of a region map is a distinct tuple of labels on all levels, a slot of a grid is a cell; either becomes one or
+four taps per pixel. The pixel loop does not depend on labels or rows of the codebook. Item k of a tile's list has row
+k of the tile's table of sums, so every sum has a fixed address, and no two programs add to the same one.
 
 Sums over tiles are float64, in an order that does not depend on the division into blocks: the terms of a key are
 added per unit of tiles (``tiles.UNIT``), and then the units' sums. A stable sort groups terms in their order, and
@@ -17,24 +16,22 @@ import torch
 import triton.language as tl
 from torch import Tensor
 
-from liftcore.raster.cpu.composite import FRONT, LARGEST, Choice
 from liftcore.raster.cpu.weights import ViewReading, reading_of
 from liftcore.raster.gpu.composite import (
     CHUNK,
     PART,
     PARTS,
     blend_chunk,
-    blend_selected,
+    blend_largest,
     fill_alphas,
     rank_tile,
-    select_weights,
     start_rays,
     weights_of,
 )
 from liftcore.raster.gpu.launching import WARPS, jit, lang, launch
 from liftcore.raster.gpu.tiles import Frame, TileLists, expand_counts
 from liftcore.scene.cameras import Camera
-from liftcore.scene.compositing import TILE, CompositingParams
+from liftcore.scene.compositing import TILE, CompositingParams, Weighting
 from liftcore.values.region_weights import RegionWeights, one_view
 from liftcore.values.views import ViewFeatures
 
@@ -45,7 +42,6 @@ RUN = 32  # terms that one thread adds
 _RUNS_A_PROGRAM = 128
 COLUMNS = 16  # of a tile's matrix at a time
 BLOCK = 64  # of its rows at a time, as the operands must fit in registers
-WIDEST = 32  # channels of an image per pass
 
 _CHUNK = tl.constexpr(CHUNK)
 _TILE = tl.constexpr(TILE)
@@ -55,7 +51,6 @@ _COLUMNS, _BLOCK = tl.constexpr(COLUMNS), tl.constexpr(BLOCK)
 _INT32 = 1 << 31
 MARKS = 12  # largest weights of a ray for which a launch may have all its tiles; with more, fewer tiles
 _WIDE = 32  # largest weights of a ray from which on more warps share a tile, as registers are few
-_LARGEST, _FRONT = tl.constexpr(LARGEST), tl.constexpr(FRONT)
 
 
 class TileInputs(NamedTuple):
@@ -228,14 +223,13 @@ def _sums(values: Tensor, order: Tensor | None, counts: Tensor) -> Tensor:
 @jit
 def _weigh(
     places, inks, starts, items, scratch, taps, shares, slot_starts, table, table_starts, total_weight, least, ties,
-    band_tile, own_tile, slots_tile, columns, width, height, lowest_transmittance, smallest, cap, stop, floor,
-    KIND: tl.constexpr, TAPS: tl.constexpr, SELECTION: tl.constexpr, POWER: tl.constexpr, WITH_UNSCALED: tl.constexpr,
+    band_tile, own_tile, slots_tile, columns, width, height, cap, stop, floor,
+    KIND: tl.constexpr, TAPS: tl.constexpr, TOP_K: tl.constexpr, SQUARED: tl.constexpr, WITH_UNSCALED: tl.constexpr,
 ):  # fmt: skip
-    GATED: tl.constexpr = (SELECTION == _LARGEST) | (SELECTION == _FRONT)
     program = tl.program_id(0)
     list_tile = own_tile + program
     tile = band_tile + list_tile
-    own_scratch = scratch + program * (2 if GATED or WITH_UNSCALED else 1) * _SCRATCH
+    own_scratch = scratch + program * (2 if TOP_K or WITH_UNSCALED else 1) * _SCRATCH
     all_scratch = own_scratch + _SCRATCH
     column = tl.arange(0, _COLUMNS)
     at = tl.load(starts + list_tile)
@@ -247,7 +241,7 @@ def _weigh(
     unscaled_transmittance = transmittance
     threshold = transmittance
     ties_left = tl.zeros([_PIXELS], tl.int32)
-    if SELECTION == _LARGEST:
+    if TOP_K:
         mark = reads * _PIXELS + tl.arange(0, _PIXELS)
         threshold = tl.load(least + mark)
         ties_left = tl.load(ties + mark)
@@ -255,17 +249,9 @@ def _weigh(
     while (at < last) & (brightest > 0.0):
         count = (last - at).to(tl.int32)
         fill_alphas(places, inks, items, at, last, tile, columns, own_scratch, cap, floor, KIND, WITH_UNSCALED)
-        if GATED:
-            transmittance, ties_left = blend_selected(
-                own_scratch,
-                transmittance,
-                stop,
-                count,
-                threshold,
-                ties_left,
-                lowest_transmittance,
-                SELECTION,
-                not WITH_UNSCALED,
+        if TOP_K:
+            transmittance, ties_left = blend_largest(
+                own_scratch, transmittance, stop, count, threshold, ties_left, not WITH_UNSCALED
             )
         else:
             transmittance = blend_chunk(own_scratch, transmittance, stop, count)
@@ -277,16 +263,15 @@ def _weigh(
         totals = tl.zeros([_CHUNK], tl.float32)
         for from_pixel in range(0, _PIXELS, _BLOCK):
             pixel = from_pixel + tl.arange(0, _BLOCK)
-            totals += tl.sum(weights_of(all_scratch if GATED or WITH_UNSCALED else own_scratch, count, pixel), 1)
+            totals += tl.sum(weights_of(all_scratch if TOP_K or WITH_UNSCALED else own_scratch, count, pixel), 1)
         tl.store(total_weight + number, totals, mask=number < last)
         for block in range(0, slot_count, _COLUMNS):
             product = tl.zeros([_CHUNK, _COLUMNS], tl.float32)
             for from_pixel in range(0, _PIXELS, _BLOCK):
                 pixel = from_pixel + tl.arange(0, _BLOCK)
                 weights = weights_of(own_scratch, count, pixel)
-                weights = select_weights(
-                    weights, pixel, places, items, at, last, tile, columns, smallest, SELECTION, POWER
-                )
+                if SQUARED:
+                    weights = weights * weights
                 factors = tl.zeros([_BLOCK, _COLUMNS], tl.float32)
                 for tap in lang.static_range(TAPS):
                     from_here = (reads * TAPS + tap) * _PIXELS + pixel
@@ -302,43 +287,8 @@ def _weigh(
         at += _CHUNK
 
 
-@jit
-def _gather(
-    places, inks, starts, items, scratch, image, table, band_tile, own_tile, columns, width, height, channels,
-    cap, stop, floor, KIND: tl.constexpr, CHANNELS: tl.constexpr,
-):  # fmt: skip
-    list_tile = own_tile + tl.program_id(0)
-    tile = band_tile + list_tile
-    top = band_tile // columns * _TILE  # the image is the band's
-    own_scratch = scratch + tl.program_id(0) * _SCRATCH
-    channel = tl.arange(0, CHANNELS)
-    base = tl.load(starts + own_tile)
-    at = tl.load(starts + list_tile)
-    last = tl.load(starts + list_tile + 1)
-    transmittance = start_rays(tile, columns, width, height)
-    brightest = lang.max(transmittance, 0)
-    while (at < last) & (brightest > 0.0):
-        count = (last - at).to(tl.int32)
-        fill_alphas(places, inks, items, at, last, tile, columns, own_scratch, cap, floor, KIND, False)
-        transmittance = blend_chunk(own_scratch, transmittance, stop, count)
-        product = tl.zeros([_CHUNK, CHANNELS], tl.float32)
-        for from_pixel in range(0, _PIXELS, _BLOCK):
-            pixel = from_pixel + tl.arange(0, _BLOCK)
-            x = tile % columns * _TILE + pixel % _TILE
-            y = tile // columns * _TILE + pixel // _TILE
-            place = ((y - top).to(tl.int64) * width + x)[:, None] * channels + channel[None, :]
-            inside = ((x < width) & (y < height))[:, None] & (channel < channels)[None, :]
-            own_pixels = tl.load(image + place, mask=inside, other=0.0)
-            product += tl.dot(weights_of(own_scratch, count, pixel), own_pixels, input_precision="ieee")
-        number = at + tl.arange(0, _CHUNK)
-        to = (number - base)[:, None] * channels + channel[None, :]
-        tl.store(table + to, product, mask=(number < last)[:, None] & (channel < channels)[None, :])
-        brightest = lang.max(transmittance, 0)
-        at += _CHUNK
-
-
 def region_weights(
-    frame: Frame, reading: DeviceReading, choice: Choice, with_unscaled: bool, splats: int
+    frame: Frame, reading: DeviceReading, weighting: Weighting, with_unscaled: bool, splats: int
 ) -> RegionWeights:
     """Return ``A'^T S`` of a view and the total weight of unscaled weights, on the device.
 
@@ -349,7 +299,7 @@ def region_weights(
     weights: list[Sums] = []
     total_weight: list[Sums] = []
     for band in frame.bands:
-        _weigh_band(frame, frame.lists_of(band), reading, choice, with_unscaled, splats, weights, total_weight)
+        _weigh_band(frame, frame.lists_of(band), reading, weighting, with_unscaled, splats, weights, total_weight)
     sums, totals = sums_over_units(weights), sums_over_units(total_weight)
     splat_ids, counts = torch.unique_consecutive(sums.keys // rows, return_counts=True)
     indptr = torch.zeros(splat_ids.shape[0] + 1, dtype=torch.int64, device=frame.device)
@@ -361,7 +311,7 @@ def region_weights(
 
 
 def _weigh_band(
-    frame: Frame, lists: TileLists, reading: DeviceReading, choice: Choice, with_unscaled: bool, splats: int,
+    frame: Frame, lists: TileLists, reading: DeviceReading, weighting: Weighting, with_unscaled: bool, splats: int,
     weights: list[Sums], total_weight: list[Sums],
 ) -> None:  # fmt: skip
     """Append a band's sums to those of the weights and of the total weight."""
@@ -369,11 +319,11 @@ def _weigh_band(
     item_totals = torch.zeros(lists.items.shape[0], 1, device=frame.device, dtype=torch.float32)
     for first, last in frame.tile_runs(lists):
         slots = reading.slots(lists.first_tile + first, lists.first_tile + last, frame.columns)
-        marks = marks_of(frame, lists, (first, last), choice.k) if choice.kind == LARGEST else None
+        marks = marks_of(frame, lists, (first, last), weighting.top_k) if weighting.top_k else None
         sizes = lists.starts[first : last + 1].diff() * slots.starts.diff()
         for begin, end, floats in frame.table_runs((first, last), sizes):
             job = _Run(lists, (begin, end), first, slots, sizes[begin - first : end - first], floats, marks)
-            table, starts = _weigh_run(frame, job, reading.taps, choice, with_unscaled, item_totals)
+            table, starts = _weigh_run(frame, job, reading.taps, weighting, with_unscaled, item_totals)
             places = table.nonzero()[:, 0]
             for part in _whole_units(frame, job, starts, places, frame.sums_at_once):
                 weights.append(_sums_of(frame, job, table, starts, part, splats * rows, rows))
@@ -393,20 +343,20 @@ class _Run(NamedTuple):
 
 
 def _weigh_run(
-    frame: Frame, job: _Run, taps: int, choice: Choice, with_unscaled: bool, total_weight: Tensor
+    frame: Frame, job: _Run, taps: int, weighting: Weighting, with_unscaled: bool, total_weight: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return the table of a run, the start [tiles + 1] i64 of each part; write its total weight."""
     lists, slots, programs = job.lists, job.slots, job.tiles[1] - job.tiles[0]
     starts = torch.zeros(programs + 1, dtype=torch.int64, device=frame.device)
     torch.cumsum(job.sizes, 0, out=starts[1:])
     table = torch.zeros(job.floats, device=frame.device, dtype=torch.float32)
-    parts = 2 * PARTS if with_unscaled or choice.kind in (LARGEST, FRONT) else PARTS
+    parts = 2 * PARTS if with_unscaled or weighting.top_k else PARTS
     least, ties = job.marks or (slots.shares, slots.taps)  # any tensors where there are no marks
     launch(
         _weigh, programs, *lists.splats, lists.starts, lists.items, frame.scratch(programs, parts), slots.taps,
         slots.shares, slots.starts, table, starts, total_weight, least, ties, lists.first_tile, job.tiles[0],
-        job.slots_tile, *frame.size, float(choice.transmittance), float(choice.floor), *frame.cuts, KIND=frame.kind,
-        TAPS=taps, SELECTION=choice.kind, POWER=choice.power, WITH_UNSCALED=with_unscaled,
+        job.slots_tile, *frame.size, *frame.cuts, KIND=frame.kind, TAPS=taps, TOP_K=weighting.top_k > 0,
+        SQUARED=weighting.power == 2, WITH_UNSCALED=with_unscaled,
     )  # fmt: skip
     return table, starts
 
@@ -450,32 +400,6 @@ def _of_items(frame: Frame, lists: TileLists, tiles: tuple[int, int], values: Te
     items = nonzero + first
     tile = torch.searchsorted(lists.starts[1:], items, right=True)
     return sums_by_unit(lists.ids[lists.items[items]], frame.unit_of(tile + lists.first_tile), values[nonzero])
-
-
-def adjoint(frame: Frame, image: Tensor, splats: int) -> Tensor:
-    """Return ``A^T Y``: image [H, W, C] f32 on the host, C at most ``WIDEST`` -> [P, C] f32 on the host."""
-    channels = image.shape[2]
-    pieces: list[Sums] = []
-    for band in frame.bands:
-        _gather_band(frame, frame.lists_of(band), image, pieces)
-    sums = sums_over_units(pieces)
-    result = torch.zeros(splats, channels, dtype=torch.float32)
-    result[sums.keys.long().cpu()] = sums.values.to(torch.float32).cpu()
-    return result
-
-
-def _gather_band(frame: Frame, lists: TileLists, image: Tensor, pieces: list[Sums]) -> None:
-    band_image, channels = frame.of_band(image, lists), image.shape[2]
-    for first, last in frame.tile_runs(lists):
-        sizes = lists.starts[first : last + 1].diff() * channels
-        for begin, end, floats in frame.table_runs((first, last), sizes):
-            table = torch.zeros(floats // channels, channels, device=frame.device, dtype=torch.float32)
-            launch(
-                _gather, end - begin, *lists.splats, lists.starts, lists.items, frame.scratch(end - begin),
-                band_image, table, lists.first_tile, begin, *frame.size, channels, *frame.cuts, KIND=frame.kind,
-                CHANNELS=max(COLUMNS, 1 << (channels - 1).bit_length()),
-            )  # fmt: skip
-            pieces.append(_of_items(frame, lists, (begin, end), table))
 
 
 def marks_of(frame: Frame, lists: TileLists, run: tuple[int, int], count: int) -> tuple[Tensor, Tensor]:

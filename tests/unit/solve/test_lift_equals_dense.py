@@ -23,7 +23,7 @@ from liftcore.query.scene import Scene
 from liftcore.query.terms import Region
 from liftcore.raster.reference import dense_view, reading_matrix, selected_weights, strided_rays
 from liftcore.scene.cameras import Cameras
-from liftcore.scene.compositing import CompositingParams, Selection, Weighting
+from liftcore.scene.compositing import CompositingParams, Weighting
 from liftcore.scene.splats import Kernel, Splats
 from liftcore.values.lift_file import save_lift
 from liftcore.values.pack import read_features, write_pack
@@ -51,11 +51,8 @@ CASES = {
     for preset, params, weighting in (
         ("row-sum", UNSCALED, Weighting(1)),
         ("tikhonov", GAIN, Weighting(2)),
-        ("argmax", UNSCALED, Weighting(1, Selection.TOP_K, count=1)),
-        ("top-k", UNSCALED, Weighting(1, Selection.TOP_K, count=40)),
-        ("front-mass", UNSCALED, Weighting(1, Selection.FRONT_MASS, mass=0.75)),
-        ("centre", UNSCALED, Weighting(1, Selection.CENTRE)),
-        ("mean", UNSCALED, Weighting(0, Selection.CENTRE, floor=0.05)),
+        ("argmax", UNSCALED, Weighting(1, top_k=1)),
+        ("top-k", UNSCALED, Weighting(1, top_k=40)),
     )
 } | {
     "antialiased": Case({"preset": "tikhonov", "antialiased": True}, replace(GAIN, antialiased=True), Weighting(2)),
@@ -85,7 +82,7 @@ def dense_lift(seed: int, grids: bool, case: Case, splats: Splats, cameras: Came
         observation, params = observed(seed, k, grids), strided(case.params, settings, camera, k)
         view, is_strided = dense_view(splats, camera, params), strided_rays(camera, params)
         S, ray = reading_matrix(observation, camera.width, camera.height)
-        selected, close = selected_weights(view.A, splats, camera, params, case.weighting)
+        selected, close = selected_weights(view.A, splats, camera, case.weighting)
         labels = is_strided[ray]
         weights = selected[ray[labels]]
         numerator += weights.T @ (S[labels] @ observation.codebook.double().numpy())

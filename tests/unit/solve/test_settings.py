@@ -25,10 +25,10 @@ LEVELS = "'rows' or a valid integer"
         ("lift_gain", "1.2", "a valid number"),
         ("lift_gain", float("nan"), "less than or equal to 16"),
         ("levels", True, LEVELS),
-        ("mass", 0, "greater than 0"),
-        ("preset", "\ud800", "'default', 'row-sum', 'tikhonov', 'argmax', 'top-k', 'front-mass', 'centre' or 'mean'"),
+        ("aggregation_iou", 0, "greater than 0"),
+        ("preset", "\ud800", "'default', 'row-sum', 'tikhonov', 'argmax' or 'top-k'"),
         ("diagnostic_rays", 1_000_001, "at most 1000000 rays"),
-        ("k", 65, "less than or equal to 64"),
+        ("top_k", 65, "less than or equal to 64"),
     ],
 )
 def test_json_has_types(name: str, value: Any, expected: str) -> None:
@@ -75,8 +75,8 @@ def test_regions_are_kept_from_the_papers_tau_on() -> None:
 @pytest.mark.parametrize("preset", list(Preset))
 def test_a_preset_only_fills_settings_that_are_not_given(preset: Preset) -> None:
     preset_settings = LiftSettings.of(preset=preset)
-    explicit = LiftSettings.of(preset=preset, power=1, weight_floor=0.25, selection="front-mass", mass=0.5)
-    assert (explicit.power, explicit.weight_floor, explicit.selection, explicit.mass) == (1, 0.25, "front-mass", 0.5)
+    explicit = LiftSettings.of(preset=preset, power=1, top_k=7, alpha_cap=0.5)
+    assert (explicit.power, explicit.top_k, explicit.alpha_cap) == (1, 7, 0.5)
     assert explicit.render_gain == preset_settings.render_gain
     assert LiftSettings.of(**preset_settings.model_dump(mode="json")) == preset_settings
 
