@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from liftcore.errors import InvalidInput, InvalidSettings, SplatliftError, Unavailable
+from liftcore.errors import InvalidInput, SplatliftError, Unavailable
 from liftcore.evaluate.accuracy import centred_cosines, cosine_figures, rendered_scores, shared_pixels
 from liftcore.evaluate.class_masks import read_masks
 from liftcore.evaluate.hardware import hardware, peak_memory
@@ -87,27 +87,16 @@ CANDIDATES = (  # in the order in which the budget is spent; a candidate overrid
     Candidate("smoothness 4", "preset", {"smoothness": 4.0}, 2.0),
     Candidate("tikhonov + aggregation", "preset", {"preset": "tikhonov", "aggregation": True}, 2.5),
     Candidate("balanced", "dial", {"quality": "balanced"}),
-    Candidate("argmax", "preset", {"preset": "argmax"}),
-    Candidate("top-k", "preset", {"preset": "top-k"}, 1.5),  # traverses tiles twice
 )
 
 
 def candidates_of(settings: Mapping[str, Any]) -> list[Candidate]:
-    """List the candidates that the settings allow, `EXACT` first, without those whose lift would be the same."""
+    """List the candidates, `EXACT` first, without those whose lift would be the same."""
     lifts: dict[str, Candidate] = {}
-    LiftSettings.of(**{**settings, **EXACT.settings})
     for candidate in CANDIDATES:
-        lift_settings = _settings_of(settings, candidate)
-        if lift_settings is not None:
-            lifts.setdefault(lift_settings.model_dump_json(exclude={"preset", "quality"}), candidate)
+        lift_settings = LiftSettings.of(**{**settings, **candidate.settings})
+        lifts.setdefault(lift_settings.model_dump_json(exclude={"preset", "quality"}), candidate)
     return list(lifts.values())
-
-
-def _settings_of(settings: Mapping[str, Any], candidate: Candidate) -> LiftSettings | None:
-    try:
-        return LiftSettings.of(**{**settings, **candidate.settings})
-    except InvalidSettings:  # as reliability without the robust step, which a preset has
-        return None
 
 
 @dataclass(frozen=True)
@@ -175,8 +164,8 @@ def compare(
             uses it up.
 
     Returns:
-        Plain numbers: the ``runs``, the names ``over_budget`` for lack of time and ``invalid_runs`` by the settings,
-        the counts of ``views``, and the ``choice``.
+        Plain numbers: the ``runs``, the names ``over_budget`` for lack of time, the counts of ``views``, and the
+        ``choice``.
 
     Raises:
         InvalidInput: the scene lacks an input, or a lift rejects one.
@@ -217,7 +206,6 @@ def compare(
     return {
         "runs": runs,
         "over_budget": over_budget,
-        "invalid_runs": [candidate.name for candidate in CANDIDATES if _settings_of(settings, candidate) is None],
         "choice": choose(runs, accuracies),
         "views": {"lifted": len(spec.lifted), "of": lifted, "held_out": len(spec.held_out)},
         "labelled_views": len(spec.labelled),
@@ -316,7 +304,7 @@ def _accuracy_figures(
     spec: RunSpec, splats: Splats, cameras: Cameras, features: Views, result: LiftResult
 ) -> dict[str, Any]:
     """Compare the run with the exact one, and measure the inputs of `liftcore.evaluate.ranking`, a view at a time."""
-    raster, params = open_raster(splats, CPU, spec.threads), result.metadata.settings.render_params
+    raster, params = open_raster(splats, CPU, spec.threads), result.metadata.settings.compositing
     cosines = centred_cosines(
         raster, [(cameras[view], features[view]) for view in spec.held_out], result.features, params
     )

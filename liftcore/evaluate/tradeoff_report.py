@@ -124,9 +124,8 @@ def save(document: Mapping[str, Any], out: Path) -> list[Path]:
 def page_of(document: Mapping[str, Any]) -> list[str]:
     """Return the table, the verdict and the conditions as lines of Markdown."""
     views, machine = document["views"], document["hardware"]
-    not_run, forbidden = ", ".join(document["over_budget"]), ", ".join(document["invalid_runs"])
+    not_run = ", ".join(document["over_budget"])
     over_budget = f" Not run for want of time: {not_run}." if not_run else ""
-    invalid = f" Not compared, as your settings forbid it: {forbidden}." if forbidden else ""
     subset = "" if views["lifted"] == views["of"] else f" (every n-th of {views['of']}, to fit the budget)"
     return [
         *table_of(document),
@@ -137,7 +136,7 @@ def page_of(document: Mapping[str, Any]) -> list[str]:
         "",
         f"`{document['command']}`, {document['date']}, {document['seconds']:.0f} s; {views['lifted']} views lifted"
         f"{subset}, {views['held_out']} with features and {document['labelled_views']} with masks held out."
-        f"{over_budget}{invalid} {machine_line(machine)}",
+        f"{over_budget} {machine_line(machine)}",
     ]
 
 

@@ -72,7 +72,7 @@ def weight_request(views: LiftViews, number: int, settings: LiftSettings, by_row
     """
     camera, features = views[number]
     observation = at_levels(features, settings.levels, camera.name)
-    params = strided(settings.lift_params, settings, camera, number)
+    params = strided(settings.compositing, settings, camera, number)
     pixels = sample_pixels(camera, -(-settings.diagnostic_rays // len(views)), (settings.seed, number), params)
     regions, codebook = as_regions(observation, by_rows)
     if isinstance(features, Regions) and isinstance(observation, Regions) and codebook.tuples is None:

@@ -157,7 +157,7 @@ class InMemory(LiftSteps[SceneWeights]):
 
         def read(number: int) -> tuple[Camera, ViewFeatures, CompositingParams]:
             camera, features = W.views[number]
-            params = strided(settings.lift_params, settings, camera, number)
+            params = strided(settings.compositing, settings, camera, number)
             return camera, at_levels(features, settings.levels, camera.name), params
 
         views = map(read, range(len(W.views)))

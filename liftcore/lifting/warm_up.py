@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 def warm_up_lift(kernel: Kernel, device: Device, settings: LiftSettings) -> None:
     """Compile the kernels of a lift with these settings, or load them from the disk cache; diagnostics excepted."""
-    warm_up(kernel, device, settings.lift_params, settings.weighting)
+    warm_up(kernel, device, settings.compositing, settings.weighting)
     first, unit = torch.zeros(1, dtype=torch.int32), torch.ones(1, dtype=torch.float32)
     W = one_view(first, torch.tensor([0, 1]), first, unit, first, unit, regions=1)
     book = Codebook((ViewCodebook(unit[None]),))

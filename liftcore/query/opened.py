@@ -441,7 +441,7 @@ class OpenedLift:
     @property
     def compositing(self) -> CompositingParams:
         """Parameters that scores are rendered with: the lift's rendering scale of the opacity logits."""
-        return self.metadata.settings.render_params
+        return self.metadata.settings.compositing
 
     def camera(self, view: str | Camera) -> Camera:
         """Return the camera of a name; a camera is returned as it is.

@@ -109,7 +109,7 @@ def filter_regions(
 ) -> KeptRegionSums:
     """Render the clusters to every lifted view and keep the regions that match one by ``aggregation_iou``."""
     region_sums = KeptRegionSums(np.zeros((clustering.count, channels)), np.zeros(clustering.count, np.int64))
-    params = settings.render_params
+    params = settings.compositing
     for number, name in enumerate(views.names):
         camera, features = views[number]
         observation = at_levels(features, settings.levels, name)

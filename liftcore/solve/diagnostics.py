@@ -68,7 +68,7 @@ def compute_diagnostics(
     return {
         "rays": int(row_sums.size),
         "rows": int(residuals.size),
-        "alpha_gain": settings.lift_gain,
+        "alpha_gain": settings.gain,
         "row_sum_mean": _mean(row_sums),
         "row_sum_std": float(row_sums.std()) if row_sums.size else None,
         "row_sum_min": float(row_sums.min()) if row_sums.size else None,

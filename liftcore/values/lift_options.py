@@ -16,8 +16,7 @@ class LiftOptions(TypedDict, total=False):
     quality: Quality | Literal["exact", "balanced", "fast", "draft"]
     top_k: int
     power: int
-    lift_gain: float
-    render_gain: float
+    gain: float
     alpha_cap: float
     transmittance_stop: float
     antialiased: bool | Literal["auto"]

@@ -54,7 +54,7 @@ class Preset(StrEnum):
 _PRESETS: dict[Preset, dict[str, Any]] = {
     Preset.DEFAULT: {"robust": True},
     Preset.ROW_SUM: {},
-    Preset.TIKHONOV: {"power": 2, "lift_gain": TIKHONOV_GAIN, "render_gain": TIKHONOV_GAIN},
+    Preset.TIKHONOV: {"power": 2, "gain": TIKHONOV_GAIN},
     Preset.ARGMAX: {"top_k": 1},
     Preset.TOP_K: {"top_k": 40},
 }
@@ -100,7 +100,7 @@ GROUPS = {  # of the settings, for people who read all of them
     "a choice of many": ("preset", "quality"),
     "weights of a ray that count": ("top_k", "power"),
     "pixels, views and levels": ("stride", "view_stride", "coverage", "view_cosine", "levels"),
-    "the rasterizer": ("kernel", "antialiased", "lift_gain", "render_gain", "alpha_cap", "transmittance_stop"),
+    "the rasterizer": ("kernel", "antialiased", "gain", "alpha_cap", "transmittance_stop"),
     "wrong masks": ("robust", "robust_directions"),
     "objects and clusters": ("objects", "aggregation", "aggregation_iou", "aggregation_cluster_size"),
     "neighbours": ("smoothness",),
@@ -115,7 +115,7 @@ class LiftSettings(PlainModel):
 
     preset: Preset = Field(
         Preset.DEFAULT,
-        description="sets `top_k`, `power`, `lift_gain` and `render_gain`; `default` also `robust`",
+        description="sets `top_k`, `power` and `gain`; `default` also `robust`",
     )
     quality: Quality = Field(
         Quality.EXACT,
@@ -130,8 +130,9 @@ class LiftSettings(PlainModel):
         "camera. 0: all",
     )
     power: int = Field(1, ge=1, le=2, description="exponent of the weights that count")
-    lift_gain: float = Field(1.0, gt=0, le=16, description="gain on the opacity logits when lifting")
-    render_gain: float = Field(1.0, gt=0, le=16, description="the same when rendering scores")
+    gain: float = Field(
+        1.0, gt=0, le=16, description="gain on the opacity logits, in lifting and in rendering scores"
+    )
     alpha_cap: float = Field(0.99, gt=0, le=LARGEST_ALPHA, description="largest alpha of a splat on a ray")
     transmittance_stop: float = Field(
         1e-4, ge=0, lt=1, description="a ray ends before its transmittance falls to this"
@@ -256,14 +257,10 @@ class LiftSettings(PlainModel):
         return one_line(self, *(f"{name}={value!r}" for name, value in arguments.items()))
 
     @property
-    def lift_params(self) -> CompositingParams:
-        """Compositing of a lift, at every pixel."""
-        return self._compositing(self.lift_gain)
-
-    @property
-    def render_params(self) -> CompositingParams:
-        """Compositing of rendered attention maps and masks."""
-        return self._compositing(self.render_gain)
+    def compositing(self) -> CompositingParams:
+        """Compositing of a lift, at every pixel, and of attention maps and masks of it."""
+        antialiased = self.antialiased is True  # `for_splats` replaces "auto" by the file's mode; before, it is False
+        return CompositingParams(self.gain, self.alpha_cap, self.transmittance_stop, antialiased)
 
     def for_splats(self, splats: Splats) -> Self:
         """Return the same with ``antialiased`` as true or false: what auto means for these splats.
@@ -330,10 +327,6 @@ class LiftSettings(PlainModel):
                 got=", ".join(f"{name}={value}" for name, value in requested.items()),
                 hint=f"set {' and '.join(changes)}; or lift without an engine",
             )
-
-    def _compositing(self, opacity_logit_scale: float) -> CompositingParams:
-        antialiased = self.antialiased is True  # `for_splats` replaces "auto" by the file's mode; before, it is False
-        return CompositingParams(opacity_logit_scale, self.alpha_cap, self.transmittance_stop, antialiased)
 
     @staticmethod
     def groups() -> Mapping[str, tuple[str, ...]]:

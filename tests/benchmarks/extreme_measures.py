@@ -309,7 +309,7 @@ def dense_features(
     sums, totals = 0.0, np.zeros(splats.count)
     for name, observation in views.items():
         S, ray = reading_matrix(observation, WIDTH, HEIGHT)
-        weights = exact_view(splats, camera(name), settings.lift_params).A[ray] ** settings.power
+        weights = exact_view(splats, camera(name), settings.compositing).A[ray] ** settings.power
         sums = sums + weights.T @ (S @ observation.codebook.double().numpy())
         totals += weights.sum(axis=0)
     X = np.asarray(sums)

@@ -442,7 +442,7 @@ MAPS: tuple[Extreme, ...] = (
     lift_of("a grid of one row", _random_grid(1, 9)),
     lift_of("a grid finer than the pixels", _random_grid(50, 70)),
     *(
-        lift_of(f"squared weights and a gain of {gain:g}", checkerboard(), settings={"power": 2, "lift_gain": gain})
+        lift_of(f"squared weights and a gain of {gain:g}", checkerboard(), settings={"power": 2, "gain": gain})
         for gain in (0.01, 8.0, 16.0)
     ),
     lift_of("weights of 1e-20, squared (DBS)", checkerboard(), lambda lift: float(lift.total_weight[0]) < 1e-15,
@@ -461,7 +461,7 @@ REFUSALS: tuple[Extreme, ...] = (
     error_of("values of 1e30", lambda: run({"v0": checkerboard(scale=1e30)}, cloud()), "finite values within"),
     error_of("a label beyond the codebook", lambda: run({"v0": _labelled(np.full((2, 2), 4), 4)}, cloud()),
         "rows of its codebook"),
-    error_of("a gain of nought", lambda: lc.LiftSettings.of(lift_gain=0), "greater than 0"),
+    error_of("a gain of nought", lambda: lc.LiftSettings.of(gain=0), "greater than 0"),
 )
 # fmt: on
 

@@ -71,7 +71,7 @@ class Truth:
 
     def evaluate(self, lifted: lc.LiftResult, raster: Raster | None = None) -> Figures:
         """The figures of a lift; the raster is of the same splats in another form."""
-        return self.evaluate_scores(self.scores(lifted), lifted.settings.render_params, raster)
+        return self.evaluate_scores(self.scores(lifted), lifted.settings.compositing, raster)
 
     def evaluate_scores(self, scores: Tensor, params: lc.CompositingParams, raster: Raster | None = None) -> Figures:
         """The figures of scores [P, K], rendered with these parameters."""
@@ -133,8 +133,7 @@ class Case:
     @property
     def values(self) -> dict[str, Any]:
         """The settings of the row, by name."""
-        gains = {"lift_gain": self.gain, "render_gain": self.gain}
-        return {"preset": "row-sum", "power": self.power, **gains}
+        return {"preset": "row-sum", "power": self.power, "gain": self.gain}
 
     @property
     def name(self) -> str:

@@ -95,7 +95,7 @@ def test_lifted_cnn_features_render_like_those_of_unseen_photos(plush, cameras, 
         observed = held_out[name]
         assert isinstance(observed, FeatureGrid)
         grid = observed.grid[..., ::CHANNELS]
-        image = raster.render(quarter(cameras[name]), features[:, ::CHANNELS].float(), settings.render_params)
+        image = raster.render(quarter(cameras[name]), features[:, ::CHANNELS].float(), settings.compositing)
         cosines = [cosine_with(image, cells) for cells in (grid, grid.flip(1), grid.flip(0))]
         assert cosines[0] > max(cosines[1:]) + 0.2
         means.append(cosines[0])

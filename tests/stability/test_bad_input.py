@@ -79,7 +79,7 @@ def test_a_wrong_kind_of_file_is_refused_wherever_it_stands(scene: Path, capsys,
 
 def test_settings_that_no_lift_has_are_refused(scene: Path, capsys) -> None:
     for settings in (
-        ["--set", "lift_gain=NaN"],
+        ["--set", "gain=NaN"],
         ["--set", "levels=cubic"],
         ["--set", "power=" + "[" * 100_000],
         ["--threads", "0"],

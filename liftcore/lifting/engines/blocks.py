@@ -188,7 +188,7 @@ def visible_splats(job: Job, cameras: list[Camera], threads: int | None) -> tupl
     scene = scene_of(job)
     if job.splats <= job.selected:
         return scene, torch.arange(job.splats, dtype=torch.int32)
-    params, visible = job.settings.lift_params, np.zeros(job.splats, bool)
+    params, visible = job.settings.compositing, np.zeros(job.splats, bool)
     device = choose_device(job.settings.device)
     for first in range(0, job.splats, STEP):
         last = min(first + STEP, job.splats)

@@ -88,7 +88,7 @@ class PlannedScene:
 
 def planned_scene(splats: Splats, settings: LiftSettings) -> PlannedScene:
     """Describe splats as a lift with these settings renders them."""
-    antialiased = settings.lift_params.antialiased
+    antialiased = settings.compositing.antialiased
     return PlannedScene(
         str(splats.kernel), antialiased, rendering_reason(splats.render_mode, antialiased), splats.count
     )
@@ -98,7 +98,7 @@ def scene_warnings(
     splats: Splats, cameras: Cameras, views: Sequence[Camera], settings: LiftSettings
 ) -> tuple[str, ...]:
     """Return warnings of splats and cameras, and of the lenses of ``views``."""
-    rendering = rendering_warnings(splats.render_mode, settings.lift_params.antialiased, splats.kernel)
+    rendering = rendering_warnings(splats.render_mode, settings.compositing.antialiased, splats.kernel)
     return *splats.warnings, *rendering, *cameras.warnings, *distortion_warning(views)
 
 
@@ -226,7 +226,7 @@ def plan_lift(
     features = views.features
     names = views.names
     cameras = [views.cameras[name] for name in names]
-    visible = visibility(splats, cameras, settings.lift_params, device, threads)
+    visible = visibility(splats, cameras, settings.compositing, device, threads)
     short = [] if in_workers else check_device_memory(device, splats.count, settings.device)
     device = CPU if short else device
     raster, seconds, contradicting = None, None, list[str]()
@@ -379,8 +379,8 @@ def _hit_share(raster: Raster, views: LiftViews, settings: LiftSettings, visible
     counts = list[float]()
     for number in sorted({0, len(views) // 2, len(views) - 1}):
         camera = views.cameras[views.names[number]]
-        places = sample_pixels(camera, TRACED_RAYS, (settings.seed, number), settings.lift_params)
-        lengths = raster.ray_rows(camera, places, settings.lift_params).indptr.diff().numpy()
+        places = sample_pixels(camera, TRACED_RAYS, (settings.seed, number), settings.compositing)
+        lengths = raster.ray_rows(camera, places, settings.compositing).indptr.diff().numpy()
         limit = settings.top_k or lengths.max(initial=0)
         counts.append(float(lengths.clip(max=limit).mean()) * camera.width * camera.height)
     area = float(visible.areas.sum(dtype=np.float64)) / len(visible.areas) / visible.areas.shape[1] * visible.splats

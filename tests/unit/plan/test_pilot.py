@@ -158,7 +158,7 @@ def flown(splats, cameras, pack, threads=1) -> ViewNoiseEstimate:
     settings = LiftSettings.of()
     scene, views, packs = open_files(splats, cameras, [pack], settings)
     lift_views = LiftViews.of(packs, views, settings)
-    visible = visibility(scene, [lift_views.camera(k) for k in range(len(lift_views.names))], settings.lift_params)
+    visible = visibility(scene, [lift_views.camera(k) for k in range(len(lift_views.names))], settings.compositing)
     return estimate_view_noise(CpuRaster(scene, threads), lift_views, settings, visible)
 
 

@@ -82,7 +82,7 @@ def test_attention_is_the_scores_rendered_with_the_lifts_gain(scene: Scene) -> N
     scores = torch.from_numpy(np.where(answer.has_feature, answer.scores, np.float32(0)))[:, None]
     assert np.array_equal(in_view.attention, scene.raster.render(camera, scores, scene.compositing)[:, :, 0])
     np.testing.assert_allclose(in_view.row_sums, scene.raster.row_sums(camera, scene.compositing), rtol=1e-6)
-    assert scene.compositing.opacity_logit_scale == scene.metadata.settings.render_gain == 1.2
+    assert scene.compositing.opacity_logit_scale == scene.metadata.settings.gain == 1.2
 
 
 def test_a_mask_is_where_objects_have_most_of_a_ray(scene: Scene) -> None:

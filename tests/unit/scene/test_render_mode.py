@@ -114,7 +114,7 @@ def test_a_file_is_taken_at_its_word(case: str, tmp_path: Path) -> None:
     for colour in (True, False):
         splats = read_splats(path, colour=colour)
         assert (splats.kernel, splats.antialiased) == (kernel, antialiased)
-        assert LiftSettings.of().for_splats(splats).lift_params.antialiased is antialiased
+        assert LiftSettings.of().for_splats(splats).compositing.antialiased is antialiased
     report = inspect_file(path)
     assert report["kernel"] == str(kernel)
     if source is None:

@@ -52,7 +52,7 @@ def test_kept_regions_are_those_of_the_paper_pixel_by_pixel(tmp_path_factory, se
     kept_masks = filter_regions(clustering_of(labels), 6, ReferenceRaster(splats), lifted, lift_settings, silent)
 
     onehot = np.array([[float(label == k) for k in range(-1, K)] for label in labels])
-    A = dense_view(splats, views[0], lift_settings.render_params).A
+    A = dense_view(splats, views[0], lift_settings.compositing).A
     # A ray that splats fill by less than half shows no cluster, whatever little it meets.
     kappa = np.where(A.sum(axis=1) < 0.5, -1, (A @ onehot).argmax(axis=1) - 1).reshape(17, 21)
     sums, counts, present = np.zeros((K, 6)), np.zeros(K, int), 0

@@ -53,7 +53,7 @@ def test_diagnostics_over_all_rays_equals_the_papers_definitions(tmp_path, prese
     paths = write_scene(tmp_path, 3, grids)
     settings = LiftSettings.of(preset=preset, diagnostic_rays=ALL_RAYS, dtype="float32")
     result = lift_files(paths[0], paths[1], [paths[2]], settings)
-    expected = dense_measures(result.features.double().numpy(), 3, read_cameras(paths[1]), settings.lift_gain, grids)
+    expected = dense_measures(result.features.double().numpy(), 3, read_cameras(paths[1]), settings.gain, grids)
     diagnostics = result.metadata.diagnostics | result.metadata.diagnostics["beta"]
     for name, value in expected.items():
         assert diagnostics[name] == pytest.approx(value, rel=1e-3, abs=1e-6), name

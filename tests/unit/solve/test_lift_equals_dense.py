@@ -162,7 +162,7 @@ def test_first_pixels_differ_between_views_and_repeat_with_the_seed():
 
     def offsets(seed: int) -> list[tuple[int, int]]:
         settings = LiftSettings.of(stride=4, seed=seed)
-        return [strided(settings.lift_params, settings, camera, k).offset for k in range(40)]
+        return [strided(settings.compositing, settings, camera, k).offset for k in range(40)]
 
     assert len(set(offsets(0))) > 8
     assert offsets(0) == offsets(0) != offsets(1)

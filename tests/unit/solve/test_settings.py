@@ -22,8 +22,8 @@ LEVELS = "'rows' or a valid integer"
         ("power", True, "a valid integer"),
         ("power", 3, "less than or equal to 2"),
         ("antialiased", 1, "a valid boolean or 'auto'"),
-        ("lift_gain", "1.2", "a valid number"),
-        ("lift_gain", float("nan"), "less than or equal to 16"),
+        ("gain", "1.2", "a valid number"),
+        ("gain", float("nan"), "less than or equal to 16"),
         ("levels", True, LEVELS),
         ("aggregation_iou", 0, "greater than 0"),
         ("preset", "\ud800", "'default', 'row-sum', 'tikhonov', 'argmax' or 'top-k'"),
@@ -39,13 +39,13 @@ def test_json_has_types(name: str, value: Any, expected: str) -> None:
 
 
 def test_json_may_write_whole_numbers_with_a_point() -> None:
-    settings = LiftSettings.of_json({"stride": 2.0, "lift_gain": 2, "preset": "row-sum", "levels": 1.0})
-    assert settings == LiftSettings.of(stride=2, lift_gain=2.0, preset=Preset.ROW_SUM, levels=1)
+    settings = LiftSettings.of_json({"stride": 2.0, "gain": 2, "preset": "row-sum", "levels": 1.0})
+    assert settings == LiftSettings.of(stride=2, gain=2.0, preset=Preset.ROW_SUM, levels=1)
     assert isinstance(settings.stride, int)
 
 
 def test_texts_may_stand_for_numbers_on_a_command_line() -> None:
-    assert LiftSettings.of(stride="2", lift_gain="1.5") == LiftSettings.of_json({"stride": 2, "lift_gain": 1.5})
+    assert LiftSettings.of(stride="2", gain="1.5") == LiftSettings.of_json({"stride": 2, "gain": 1.5})
 
 
 @pytest.mark.parametrize("read_settings", [LiftSettings.of_json, lambda values: LiftSettings.of(**values)])
@@ -77,7 +77,7 @@ def test_a_preset_only_fills_settings_that_are_not_given(preset: Preset) -> None
     preset_settings = LiftSettings.of(preset=preset)
     explicit = LiftSettings.of(preset=preset, power=1, top_k=7, alpha_cap=0.5)
     assert (explicit.power, explicit.top_k, explicit.alpha_cap) == (1, 7, 0.5)
-    assert explicit.render_gain == preset_settings.render_gain
+    assert explicit.gain == preset_settings.gain
     assert LiftSettings.of(**preset_settings.model_dump(mode="json")) == preset_settings
 
 
