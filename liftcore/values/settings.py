@@ -26,9 +26,6 @@ from liftcore.scene.compositing import (
 )
 
 if TYPE_CHECKING:  # it loads torch
-    from pathlib import Path
-
-    from liftcore.scene.kernel import Kernel
     from liftcore.scene.splats import Splats
 
 TIKHONOV_GAIN = 1.2  # lambda of the paper's Tikhonov Guidance (App. Tikhonov, lambda sweep)
@@ -271,23 +268,6 @@ class LiftSettings(PlainModel):
         antialiased = splats.antialiased if self.antialiased == "auto" else self.antialiased
         check_antialiased(splats.kernel, antialiased)
         return self if antialiased == self.antialiased else self.model_copy(update={"antialiased": antialiased})
-
-    def check_kernel(self, kernel: Kernel, file: Path | None = None, name: str = "") -> None:
-        """Refuse a kernel of splats for which settings have no meaning, or that a file lacks a property of.
-
-        Args:
-            kernel: that splats are to be lifted as. file: of the splats, of which the header is read. name: of the
-                file, in errors.
-
-        Raises:
-            InvalidSettings: ``antialiased`` is true, and the splats are not 3D Gaussians.
-            InvalidSplats: the file lacks a property.
-        """
-        from liftcore.io.splats import require_kernel
-
-        check_antialiased(kernel, self.antialiased is True)
-        if file is not None:
-            require_kernel(file, kernel, name or str(file))
 
     @property
     def weighting(self) -> Weighting:

@@ -67,7 +67,6 @@ HIT_BYTES = 24  # of a splat on a ray, in the matrix of the least-squares optimu
 CLUSTERING = 80_000_000  # of hdbscan and its dependencies
 SMOOTHING_BYTES = 2_100  # of a splat: the graph while it is built, or with a block of channels
 SPARE = 0.9  # of the free memory: 10 % are left to other processes
-DEVICE_SPARE = 0.8  # of a GPU's free memory, which is fragmented
 DEVICE_SPLAT_BYTES = 400  # of a splat on a GPU, with the smallest batches of tiles
 
 
