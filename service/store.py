@@ -187,15 +187,27 @@ class Store:
 
     def rows(self, query: str, **terms: Any) -> list[dict[str, Any]]:
         """Return rows with their JSON parsed and their files below the root; a reader never waits for the writer."""
-        connection = getattr(self._local, "writer", None) or getattr(self._local, "reader", None)
-        if connection is None:
-            connection = self._local.reader = connect(self.root / DATABASE, "rw")
-            self._readers.append(connection)
-        rows = [dict(row) for row in connection.execute(query, terms).fetchall()]
+        with self._reader() as connection:
+            rows = [dict(row) for row in connection.execute(query, terms).fetchall()]
         for row in rows:
             row.update({name: json.loads(row[name]) for name in JSON_COLUMNS & row.keys() if row[name] is not None})
             row.update({"file": self.root / row["file"]} if "file" in row else {})
         return rows
+
+    @contextmanager
+    def _reader(self) -> Iterator[sqlite3.Connection]:
+        """Yield the writer within its transaction, else a reader that no other thread uses; threads come and go."""
+        if writer := getattr(self._local, "writer", None):
+            yield writer
+            return
+        try:
+            reader = self._readers.pop()
+        except IndexError:
+            reader = connect(self.root / DATABASE, "rw")
+        try:
+            yield reader
+        finally:
+            self._readers.append(reader)
 
     def page(
         self, table: str, owner: Owner, limit: int, cursor: str | None
