@@ -24,7 +24,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from liftcore import __version__
 from liftcore.files import PhotoIndexes
 from service import errors
-from service.auth import Auth, with_keys
+from service.auth import Auth
 from service.errors import PROBLEM, REQUEST_ID, answer_to
 from service.models import BODY_BYTES
 from service.process import Children
@@ -89,12 +89,12 @@ def create_app(settings: ServiceSettings, store: Store) -> FastAPI:
 
 
 class Application(FastAPI):
-    """The application, whose OpenAPI document names the problem of errors, and the scope of each operation."""
+    """The application, whose OpenAPI document names the problem of errors."""
 
     def openapi(self) -> dict[str, Any]:
         """Return the document; the first sentence of each description is the summary."""
         if self.openapi_schema is None:
-            document = with_keys(super().openapi())
+            document = super().openapi()
             schema = errors.Problem.model_json_schema(ref_template="#/components/schemas/{model}")
             document["components"]["schemas"]["Problem"] = schema
             for operations_of_path in document["paths"].values():

@@ -150,11 +150,14 @@ def is_loopback(host: str) -> bool:
 
 
 def with_keys(document: dict[str, Any]) -> dict[str, Any]:
-    """Mark the operations of an OpenAPI document that need a key, with its scope."""
-    document["components"]["securitySchemes"] = {"key": SCHEME}
-    for path, operations in document["paths"].items():
-        for method, operation in operations.items():
-            line = f"{method.upper()} {path}"
-            if not OPEN.fullmatch(line):
-                operation["security"] = [{"key": ["read" if READS.fullmatch(line) else "write"]}]
-    return document
+    """Return an OpenAPI document in which the operations that need a key say so, with its scope."""
+
+    def needs(line: str) -> dict[str, Any]:
+        scope = "read" if READS.fullmatch(line) else "write"
+        return {} if OPEN.fullmatch(line) else {"security": [{"key": [scope]}]}
+
+    paths = {
+        path: {method: operation | needs(f"{method.upper()} {path}") for method, operation in operations.items()}
+        for path, operations in document["paths"].items()
+    }
+    return document | {"paths": paths, "components": document["components"] | {"securitySchemes": {"key": SCHEME}}}

@@ -17,9 +17,11 @@ from fastapi.responses import FileResponse, HTMLResponse, JSONResponse
 from prometheus_client import generate_latest
 
 from liftcore import __version__
+from service.auth import with_keys
 from service.errors import Busy
 from service.models import Status
 from service.routes import BINARY, Deps
+from service.store import admit
 
 EXAMPLE = Path(__file__).parents[1] / "commands" / "tabletop"
 WEB = Path(__file__).parents[1] / "web" / "built"  # built by `make web`
@@ -102,9 +104,10 @@ def example_file(name: Annotated[str, PathParameter(pattern="|".join(EXAMPLE_FIL
 
 
 @router.get("/openapi.json", include_in_schema=False)
-def document(request: Request) -> JSONResponse:
-    """Get the OpenAPI document."""
-    return JSONResponse(request.app.openapi())
+def document(request: Request, deps: Deps) -> JSONResponse:
+    """Get the OpenAPI document, which asks for keys once there are any."""
+    document = request.app.openapi()
+    return JSONResponse(with_keys(document) if admit(deps.store, None)[0] else document)
 
 
 @router.get("/docs", response_class=HTMLResponse, include_in_schema=False)
