@@ -18,7 +18,7 @@ def add_arguments(parser: Parser) -> None:
         "--encoder",
         required=True,
         metavar="SPEC",
-        help="maskclip:MODEL/TAG, clip:MODEL/TAG or timm:NAME; with --weights also maskclip:MODEL or clip:MODEL",
+        help="maskclip:MODEL/TAG or timm:NAME; with --weights also maskclip:MODEL",
     )
     parser.add_argument("--weights", type=Path, metavar="FILE", help="file of its weights; the same as ENCODER@FILE")
     cameras_help = (

@@ -11,12 +11,9 @@ from liftcore.errors import InvalidInput, Unavailable
 IMAGE_ENCODERS = (
     "maskclip:MODEL/TAG",
     "maskclip:MODEL@FILE",
-    "clip:MODEL/TAG",
-    "clip:MODEL@FILE",
     "timm:NAME",
     "timm:NAME@FILE",
 )
-KINDS = ("maskclip", "clip", "timm")
 
 
 @dataclass(frozen=True)
@@ -64,8 +61,6 @@ def open_image_encoder(spec: str, device: str = "cpu") -> ImageEncoder:
     | specification | features of a patch |
     |---|---|
     | ``maskclip:...`` | MaskCLIP (Zhou et al., ECCV 2022): the projected value of the last attention |
-    | ``clip:...`` | the last block's token through the output layers of the class token |
-    | both, of a tower with a timm trunk | each cell separately through the tower's own pooling and head |
     | ``timm:...`` | the normalized token of the last block, or the last feature map of a convolutional network |
 
     Args:
@@ -77,8 +72,8 @@ def open_image_encoder(spec: str, device: str = "cpu") -> ImageEncoder:
         Unavailable: the weights, or the device, are not on this machine.
     """
     kind, _, rest = spec.partition(":")
-    if not rest or kind not in KINDS:
-        hint = "SigLIP, MobileCLIP and similar models are maskclip:MODEL/TAG; maps of FeatUp and others: pack npy"
+    if not rest or kind not in ("maskclip", "timm"):
+        hint = "SigLIP and MobileCLIP encode crops of masks ('pack masks --encoder'); maps of FeatUp: pack npy"
         raise InvalidInput("encoder", expected=f"one of {', '.join(IMAGE_ENCODERS)}", got=repr(spec), hint=hint)
     torch_device = device_named(device)
     if kind == "timm":
@@ -87,7 +82,7 @@ def open_image_encoder(spec: str, device: str = "cpu") -> ImageEncoder:
         return TimmEncoder.open(rest, torch_device)
     from liftcore.features.encoders.clip import ClipImageEncoder
 
-    return ClipImageEncoder.open(kind, rest, torch_device)
+    return ClipImageEncoder.open(rest, torch_device)
 
 
 def device_named(name: str) -> torch.device:

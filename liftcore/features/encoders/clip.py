@@ -3,9 +3,7 @@
 CLIP itself gives one vector for an image. MaskCLIP (Zhou, Loy and Dai, ECCV 2022) removes the pooling: the value of
 each patch in the last attention goes through the output layers, and stays in the space of the texts.
 
-Towers with a trunk of timm (SigLIP, SigLIP 2, MobileCLIP, ConvNeXt) pool after the trunk: there each cell goes
-separately through the tower's own pooling and head. For SigLIP's attention pooling this is the value path, as in
-MaskCLIP; a mean over cells becomes the identity.
+Other towers (SigLIP, MobileCLIP, ConvNeXt) encode crops of masks (`liftcore.features.encoders.crops`).
 """
 
 from collections.abc import Callable
@@ -18,41 +16,35 @@ from torch.nn import functional
 
 from liftcore.errors import InvalidInput
 from liftcore.features.encoders import Pixels
-from liftcore.text.open_clip import OpenedModel, create_model, library, open_model
+from liftcore.text.open_clip import OpenedModel, library, open_model
 
 RESNET_PATCH = 32  # pixels, the stride of a ResNet's last feature map
 
 
 class ClipImageEncoder:
-    """Dense features of open_clip models (``ImageEncoder``), by MaskCLIP or from the last block's tokens."""
+    """Dense features of open_clip models by MaskCLIP (``ImageEncoder``)."""
 
-    def __init__(self, kind: str, clip_model: OpenedModel, text_space: str, device: torch.device) -> None:
-        self.name = f"{kind}:{clip_model.name.removeprefix('open_clip:')}"
+    def __init__(self, clip_model: OpenedModel, text_space: str, device: torch.device) -> None:
+        self.name = f"maskclip:{clip_model.name.removeprefix('open_clip:')}"
         self.text_space = text_space
         self._tower = clip_model.model.visual.to(device).float().eval()
         self._device = device
-        self._dense = _dense(kind, clip_model.model_name, self._tower)
+        self._dense = _dense(clip_model.model_name, self._tower)
         self.pixels = _pixels(clip_model.model, self._tower)
         with torch.inference_mode():
             probe = self._dense(self._tower, torch.zeros(1, 3, self.pixels.patch, self.pixels.patch, device=device))
         self.channels = int(probe.shape[-1])
 
     @classmethod
-    def open(cls, kind: str, spec: str, device: torch.device) -> Self:
-        """Load ``MODEL/PRETRAINED_TAG`` or ``MODEL@WEIGHTS_FILE`` for ``maskclip`` or ``clip``.
+    def open(cls, spec: str, device: torch.device) -> Self:
+        """Load ``MODEL/PRETRAINED_TAG`` or ``MODEL@WEIGHTS_FILE``.
 
         Raises:
             InvalidInput: an unknown model, an unsupported image tower, or a file without weights of the model.
             Unavailable: the specification has no weights, or they are not available here.
         """
-        clip_model = open_model(kind, spec)
-        return cls(kind, clip_model, space_of(clip_model, spec), device)
-
-    @classmethod
-    def _with_random_weights(cls, kind: str, model_name: str) -> Self:
-        """Create an encoder with random weights of the right shapes, for tests only."""
-        clip_model = OpenedModel(f"open_clip:{model_name} (random)", model_name, create_model(model_name, None))
-        return cls(kind, clip_model, "none", torch.device("cpu"))
+        clip_model = open_model("maskclip", spec)
+        return cls(clip_model, space_of(clip_model, spec), device)
 
     def encode(self, images: Tensor) -> Tensor:
         """Encode images [n, 3, h p, w p] f32 as grids [n, h, w, F] f32 on the CPU."""
@@ -66,22 +58,12 @@ def space_of(clip_model: OpenedModel, spec: str) -> str:
     return f"{clip_model.name}@{Path(file).resolve()}" if at else clip_model.name
 
 
-def _dense(kind: str, model_name: str, tower: Any) -> Callable[[Any, Tensor], Tensor]:
+def _dense(model_name: str, tower: Any) -> Callable[[Any, Tensor], Tensor]:
     library()
     from open_clip.modified_resnet import ModifiedResNet
-    from open_clip.timm_model import TimmModel
     from open_clip.transformer import ResidualAttentionBlock, VisionTransformer
 
-    if isinstance(tower, TimmModel):
-        return _trunk(kind, model_name, tower)
     if isinstance(tower, ModifiedResNet):
-        if kind == "clip":
-            raise InvalidInput(
-                "encoder",
-                expected="a ViT for clip:, whose patches have tokens",
-                got=model_name,
-                hint=f"maskclip:{model_name}... gives a ResNet's dense features",
-            )
         return resnet_values
     # Exactly these classes, as subclasses have other layers on the value path.
     is_standard_vit = type(tower) is VisionTransformer and tower.attn_pool is None
@@ -90,42 +72,9 @@ def _dense(kind: str, model_name: str, tower: Any) -> Callable[[Any, Tensor], Te
             "encoder",
             expected="a CLIP model with open_clip's own ViT or ResNet as image tower, without an attention pooler",
             got=f"{model_name} with {type(tower).__name__}",
+            hint="encode crops of masks with it: 'splatlift pack masks --encoder'",
         )
-    return vit_values if kind == "maskclip" else vit_patches
-
-
-def _trunk(kind: str, model_name: str, tower: Any) -> Callable[[Any, Tensor], Tensor]:
-    """Return `trunk_cells` after a check that the tower gives one cell a patch for images of any size."""
-    if kind == "maskclip" and getattr(tower.trunk, "global_pool", "") == "token":
-        hint = f"clip:{model_name}... takes the patches' tokens through the class token's layers"
-        expected, got = "a tower that pools its cells for maskclip:", f"{model_name}, which reads its class token"
-        raise InvalidInput("encoder", expected=expected, got=got, hint=hint)
-    if getattr(tower.trunk, "dynamic_img_size", True) is False:  # positions are then resampled to an image's grid
-        tower.trunk.dynamic_img_size, tower.trunk.patch_embed.strict_img_size = True, False
-        tower.trunk.patch_embed.flatten, tower.trunk.patch_embed.output_fmt = False, "NHWC"
-    patch = _trunk_patch(tower)
-    try:
-        with torch.inference_mode():
-            shape = tuple(trunk_cells(tower, torch.zeros(1, 3, 2 * patch, 3 * patch, device=_place(tower))).shape)
-        if shape[:3] == (1, 2, 3):
-            return trunk_cells
-        got = f"a grid of {shape[1:3]} for 2x3 patches"
-    except (AssertionError, RuntimeError, ValueError, AttributeError, IndexError, TypeError) as error:
-        got = str(error)
-    raise InvalidInput(
-        "encoder",
-        expected="a tower that gives one cell a patch for images of any size",
-        got=f"{model_name} ({got[:120]})",
-        hint="encode crops of masks with it: 'splatlift pack masks'",
-    )
-
-
-def _trunk_patch(tower: Any) -> int:
-    return int(tower.trunk.feature_info[-1]["reduction"])
-
-
-def _place(tower: Any) -> torch.device:
-    return next(tower.parameters()).device
+    return vit_values
 
 
 def training_pixels(model: Any, tower: Any) -> tuple[int, tuple[float, ...], tuple[float, ...], str]:
@@ -141,7 +90,6 @@ def training_pixels(model: Any, tower: Any) -> tuple[int, tuple[float, ...], tup
 
 def _pixels(model: Any, tower: Any) -> Pixels:
     patch = getattr(tower, "patch_size", (RESNET_PATCH, RESNET_PATCH))
-    patch = (_trunk_patch(tower),) if hasattr(tower, "trunk") else patch
     return Pixels(int(patch[0]), *training_pixels(model, tower))
 
 
@@ -169,18 +117,6 @@ def vit_values(tower: Any, images: Tensor) -> Tensor:
     return _project(tower, last.attn.out_proj(values), images)
 
 
-def vit_patches(tower: Any, images: Tensor) -> Tensor:
-    """CLIP on open_clip's ViT: ``proj(ln_post(x))`` of every patch's token x after the last block.
-
-    The training does not tie these tokens to their patch, so they also contain information for the class token.
-    Shapes are those of `vit_values`.
-    """
-    tokens = _embed(tower, images)
-    for block in tower.transformer.resblocks:
-        tokens = block(tokens)
-    return _project(tower, tokens, images)
-
-
 def resnet_values(tower: Any, images: Tensor) -> Tensor:
     """MaskCLIP on open_clip's ModifiedResNet: ``W_c (W_v x + b_v) + b_c`` of every cell x of the last feature map.
 
@@ -191,31 +127,6 @@ def resnet_values(tower: Any, images: Tensor) -> Tensor:
         cells = layer(cells)
     pool = tower.attnpool
     return pool.c_proj(pool.v_proj(cells.permute(0, 2, 3, 1)))
-
-
-def trunk_cells(tower: Any, images: Tensor) -> Tensor:
-    """Encode each cell of a timm trunk separately by the tower's pooling and head.
-
-    A softmax over one cell is one, so an attention pooling gives ``x + mlp(norm(x))`` of
-    ``x = W_o (W_v cell + b_v) + b_o``. If the tower has a mean and then linear layers, the mean over the cells is the
-    image's vector.
-
-    Args:
-        tower: open_clip's TimmModel. images: [n, 3, h p, w p] f32.
-
-    Returns:
-        [n, h, w, F] f32.
-    """
-    trunk, patch = tower.trunk, _trunk_patch(tower)
-    feature_map = trunk.forward_features(images)
-    rows, columns = (side // patch for side in images.shape[-2:])
-    if feature_map.ndim == 4:  # a feature map
-        single_cells = feature_map.permute(0, 2, 3, 1).reshape(-1, feature_map.shape[1], 1, 1)
-    else:  # tokens; the pooling skips the prefix tokens, so copies of the cell are in their place
-        before = trunk.num_prefix_tokens
-        single_cells = feature_map[:, before:].reshape(-1, 1, feature_map.shape[-1]).expand(-1, before + 1, -1)
-    cells = tower.head(trunk.forward_head(single_cells))
-    return cells.reshape(len(images), rows, columns, -1)
 
 
 def _embed(tower: Any, images: Tensor) -> Tensor:

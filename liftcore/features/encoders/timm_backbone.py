@@ -1,9 +1,7 @@
 """Backbones of timm (DINO, DINOv2, ViT, ResNet and others), whose features have no text space."""
 
-import logging
 import sys
-from collections.abc import Iterable, Mapping
-from itertools import zip_longest
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Self
 
@@ -22,8 +20,6 @@ _LEFT_OVER = ("mask_token",)
 _PROBE = (2, 3)  # rows and columns of the grid that every encoder is tested with
 _STRIDED = (nn.Conv2d, nn.MaxPool2d, nn.AvgPool2d)
 
-log = logging.getLogger(__name__)
-
 
 class TimmEncoder:
     """Normalized patch tokens of the last block, or the last feature map (``ImageEncoder``)."""
@@ -41,8 +37,6 @@ class TimmEncoder:
     @classmethod
     def open(cls, spec: str, device: torch.device) -> Self:
         """Load ``NAME`` (cached or downloaded by timm) or ``NAME@WEIGHTS_FILE`` (tensors only).
-
-        A file with none of timm's names is read as the same network of another program, by `in_order`.
 
         Raises:
             InvalidInput: an unknown model, one that takes a single image size, or a file without its weights.
@@ -137,12 +131,7 @@ def _from_file(label: str, name: str, path: Path) -> Any:
         translate = getattr(sys.modules[type(model).__module__], "checkpoint_filter_fn", None)
         state = translate(dict(stored), model) if translate else stored
         if not state.keys() & model.state_dict().keys():
-            if path.suffix == ".safetensors":
-                raise ValueError(
-                    "other names, and this format sorts by name: give a file in the original order (.pth)"
-                )
-            state = in_order(stored, model.state_dict())
-            log.warning("%s: %s has other names; its tensors are matched by their order", label, path.name)
+            raise ValueError("tensors of other names: save the weights with timm's names")
         missing, unexpected = model.load_state_dict(state, strict=False)
     except Exception as error:  # readers of pickles and state dicts raise many types for files of other content
         raise _not_weights(label, name, path, str(error)) from None
@@ -151,41 +140,6 @@ def _from_file(label: str, name: str, path: Path) -> Any:
         part = ", ".join([*(f"no {key}" for key in missing[:2]), *(f"an unexpected {key}" for key in unexpected[:2])])
         raise _not_weights(label, name, path, part)
     return model
-
-
-def in_order(stored: Mapping[str, Tensor], target: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the tensors of a file by a model's names, for a file with other names of the same network.
-
-    Tensor k of the file becomes tensor k of the model if their shapes and the last parts of their names (`weight`,
-    `running_var`) are the same. The file may have a classifier at its end, and counters of batch norm are ignored.
-
-    Args:
-        stored: the file's tensors, in order. target: the model's, in order.
-
-    Raises:
-        ValueError: a tensor differs. The message has its number and shape.
-    """
-    stored_entries, target_entries = ([*_without_counters(tensors).items()] for tensors in (stored, target))
-    classifier = [tuple(tensor.shape[:1]) for _, tensor in stored_entries[len(target_entries) :]]
-    if len(classifier) == 2 and classifier[0] == classifier[1]:
-        stored_entries = stored_entries[: len(target_entries)]
-    for number, (their, our) in enumerate(zip_longest(stored_entries, target_entries)):
-        if their is None or our is None or _kind(their) != _kind(our):
-            got = f"tensor {number} is {_describe(their)} where the model has {_describe(our)}"
-            raise ValueError(f"other names, and in order {got}")
-    return {name: tensor for (name, _), (_, tensor) in zip(target_entries, stored_entries, strict=True)}
-
-
-def _without_counters(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {name: tensor for name, tensor in tensors.items() if not name.endswith("num_batches_tracked")}
-
-
-def _kind(entry: tuple[str, Tensor]) -> tuple[str, tuple[int, ...]]:
-    return entry[0].rpartition(".")[2], tuple(entry[1].shape)
-
-
-def _describe(entry: tuple[str, Tensor] | None) -> str:
-    return f"{entry[0]} {list(entry[1].shape)}" if entry else "nothing"
 
 
 def _not_weights(label: str, name: str, path: Path, got: str) -> InvalidInput:
