@@ -49,14 +49,14 @@ INTERRUPTED = 130
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command, and return the exit status."""
+    options = argparse.Namespace(debug=False)
     try:
         options = build_parser().parse_args(argv)
-    except SystemExit as end:
-        return end.code if isinstance(end.code, int) else 0
-    try:
         status = _module(options.command).run(options)
         sys.stdout.flush()
         return status
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else 0
     except SplatliftError as error:
         print(f"splatlift: {wrong_kind_error(options) or error}", file=sys.stderr)
         return BAD_INPUT

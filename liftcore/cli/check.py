@@ -19,23 +19,6 @@ if TYPE_CHECKING:
     from liftcore.evaluate import CheckReport
 
 
-CHECKS = """\
-Twelve views are compared. The exit status is 2, with the problem, unless
-- photos have the aspect ratio of their cameras, in any size. Otherwise they are
-  cropped or rotated, and are not compared further;
-- rays hit splats, and the render of a view is more similar to its own photo
-  than to others. Detected causes: photos that are rotated, mirrored, shifted (a
-  wrong principal point) or of another exposure, and camera positions in another
-  scale;
-- masks follow the edges in the photos better than when mirrored, and
-  neighbouring cells of grids are more similar than with another order of axes;
-- views agree on the splats that they share at least a fifth as much as their
-  most similar regions allow, and not better with another scale of the camera
-  positions.
-Photos without a camera and cameras without a photo are listed too.
-"""
-
-
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
     parser.add_argument("splats", type=Path, help="trained splats")
@@ -44,7 +27,6 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--worst", type=Path, metavar="PNG", help="write the worst view: its photo and the render")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one setting of the lift")
     add_verbose(parser)
-    parser.appendix = lambda: CHECKS
 
 
 def run(options: argparse.Namespace) -> int:

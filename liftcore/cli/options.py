@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
-import shutil
 import sys
 import textwrap
 from contextlib import contextmanager
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from types import UnionType
@@ -49,7 +47,6 @@ class Parser(argparse.ArgumentParser):
 
     last = ""  # an optional argument, which may come after options
     fill: Callable[[], None] | None = None  # adds the options at their first use
-    appendix: Callable[[], str] | None = None  # returns the text below the options
 
     def add_options(self) -> Self:
         """Add the options if they are missing, and return the parser."""
@@ -60,8 +57,6 @@ class Parser(argparse.ArgumentParser):
 
     def format_help(self) -> str:
         self.add_options()
-        if self.appendix is not None:
-            self.formatter_class, self.epilog = argparse.RawDescriptionHelpFormatter, self.appendix()
         return super().format_help()
 
     def parse_known_args(  # pyright: ignore[reportIncompatibleMethodOverride]: it has overloads
@@ -137,28 +132,32 @@ def add_sources(parser: argparse.ArgumentParser) -> None:
 
 def add_settings(parser: Parser) -> None:
     """Add the options of the settings of a lift."""
-    parser.appendix = settings_help
     parser.add_argument("--preset", metavar="NAME", help=f"a set of weights: {PRESETS}")
     quality_help = "level of quality: exact, balanced, fast or draft"
     parser.add_argument("--quality", metavar="NAME", help=quality_help)
     add_device(parser)
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one of the settings below")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="one of the settings that --settings lists"
+    )
+    parser.add_argument("--settings", action=ListSettings, nargs=0, help="list all settings, and exit")
 
 
-def settings_help() -> str:
-    """Return all settings of a lift in groups, with defaults and descriptions, in the width of the terminal."""
-    from liftcore import LiftSettings
+class ListSettings(argparse.Action):
+    """Print all settings of a lift in groups, with defaults and descriptions, and exit."""
 
-    wrap = partial(textwrap.fill, width=shutil.get_terminal_size().columns - 2, subsequent_indent=" " * 6)
-    lines = ["settings of a lift, for --set:"]
-    for group, names in LiftSettings.groups().items():
-        lines += ["", f"  {group}"]
-        for name in names:
-            field = LiftSettings.model_fields[name]
-            meaning = (field.description or "").replace("`", "")
-            default = json.dumps(LiftSettings.of().model_dump(mode="json")[name]).strip('"')
-            lines.append(wrap(f"{name}={default}: {meaning}", initial_indent=" " * 4))
-    return "\n".join(lines)
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        from liftcore import LiftSettings
+
+        defaults = LiftSettings.of().model_dump(mode="json")
+        for group, names in LiftSettings.groups().items():
+            print(group)
+            for name in names:
+                meaning = (LiftSettings.model_fields[name].description or "").replace("`", "")
+                default = json.dumps(defaults[name]).strip('"')
+                print(
+                    textwrap.fill(f"{name}={default}: {meaning}", 98, initial_indent="  ", subsequent_indent="    ")
+                )
+        parser.exit()
 
 
 def add_device(parser: argparse.ArgumentParser) -> None:

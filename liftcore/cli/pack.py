@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,47 +21,6 @@ NAMES = {
     **{name: f"--{name}" for name in ("device", "encoder", "names", "photos", "unlabelled")},
 }  # of arguments
 LARGEST_GREY = 65_535  # of a picture of 16 bits
-MASK_LAYOUTS = """\
-layouts of FOLDER: vectors IMG.npy [M, F] of each image, unless --encoder
-computes them, with one of
-  IMG.json              SAM's generator with output_mode uncompressed_rle or
-                        coco_rle, or SA-1B's files
-  IMG_masks.npy (.npz)  booleans [M, H, W] or [M, 1, H, W], or ids [H, W] or
-                        [L, H, W] with -1 for none
-  IMG.png               a label picture of 8 or 16 bits or a palette: value v is
-                        row v - 1, and 0 means no mask; with --unlabelled 255
-                        (or another value) 255 means no mask, and v is row v
-
-Masks may overlap: the largest come first, each on the first level where its
-pixels are free, on at most 32 levels. Hidden files, Thumbs.db and similar ones
-are skipped.
-"""
-ARRAY_LAYOUTS = """\
-layouts of FOLDER: maps IMG.npy or IMG.jpg.npy, also .npz of one array and .pt of
-one tensor, read as tensors only, so no code runs. IMG_fmap_CxHxW.pt of
-feature-3dgs has channels first. Hidden files, Thumbs.db and similar ones are
-skipped.
-"""
-PROMPT_LAYOUTS = """\
-layouts of FOLDER, with sub-folders if names of views have some:
-  PHRASE/VIEW.png       binary pictures, or arrays [h, w] in .npy or .npz; with
-                        --folders views VIEW/PHRASE.png. _ is a space
-  *.json of COCO        images, annotations and categories: run lengths or
-                        polygons. CVAT, Label Studio, Roboflow, LabelMe and
-                        others export it
-  *.json, one an image  Grounded SAM 2: records with a class_name, phrase or
-                        label and run lengths or polygons. The view is that of
-                        the image_path, or else of the file's name
-  json_data, mask_data  the tracking of Grounded SAM 2: pictures of ids and
-                        their class names
-  VIEW.png              label pictures. Those of 'segment --labels' contain
-                        their names; for others --names FILE
-
-Masks of one phrase in a view are merged. Polygons are filled within a pixel of
-pycocotools, at the image's width and height. In a view with a file, pixels
-outside of all masks show none of the phrases. Annotations with only a box are
-counted in a warning, and their pixels have no label.
-"""
 
 
 def add_arguments(parser: Parser, shared: Parser) -> None:
@@ -110,8 +68,6 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
         "COCO's images without an annotation are omitted (skip), or show none of the phrases (negative)"
     )
     prompts.add_argument("--unannotated", choices=("skip", "negative"), default="skip", help=unannotated_help)
-    for command, layouts in ((arrays, ARRAY_LAYOUTS), (masks, MASK_LAYOUTS), (prompts, PROMPT_LAYOUTS)):
-        command.appendix = partial(str, layouts)
     retag = formats.add_parser("retag", parents=[shared], help="a pack with other names of its encoder or text space")
     space = (
         "the text encoder that shares the space of the features, as for query's --encoder "
