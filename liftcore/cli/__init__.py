@@ -8,6 +8,7 @@ stdout has exactly one JSON object.
 
 import argparse
 import os
+import shlex
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -51,7 +52,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command, and return the exit status."""
     options = argparse.Namespace(debug=False)
     try:
-        options = build_parser().parse_args(argv)
+        words = sys.argv[1:] if argv is None else argv
+        options = build_parser().parse_args(words)
+        options.command_line = shlex.join(["splatlift", *words])
         status = _module(options.command).run(options)
         sys.stdout.flush()
         return status

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from liftcore.cli.lift import pairs_of
 from liftcore.cli.options import BAD_INPUT, Parser, add_verbose
-from liftcore.cli.reply import reply
+from liftcore.cli.reply import check_outputs, reply, write_files
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -33,23 +33,18 @@ def run(options: argparse.Namespace) -> int:
     """Check the scene, and print the problems; the exit status is 2 if there are any."""
     from liftcore import LiftSettings
     from liftcore.evaluate import check_scene
-    from liftcore.files import check_output, writing
 
     settings = LiftSettings.of(**pairs_of(options.set))
-    if options.worst:
-        check_output(options.worst, [options.splats], "png")
+    files = {"worst": options.worst} if options.worst else {}
+    check_outputs(files, options)
     packs = [path for path in options.others if path.suffix == ".safetensors"]
     photos = [path for path in options.others if path not in packs]
     begin = time.perf_counter()
     report = check_scene(options.splats, options.cameras, photos, packs or None, True, settings)
     document = {name: value for name, value in asdict(report).items() if name != "worst"}
-    for view in document["views"]:
-        view["others"] = view["other_psnr"]  # the key of earlier releases
     document |= {"healthy": not report.wrong, "seconds": time.perf_counter() - begin}
-    if options.worst and report.worst is not None:
-        with writing(options.worst):
-            options.worst.write_bytes(report.worst)
-        document["worst"] = str(options.worst)
+    if (picture := report.worst) is not None:
+        document |= write_files(files, {"worst": lambda path: path.write_bytes(picture)})
     reply(document, as_json=options.json, lines=_lines(report, document, options.verbose))
     return BAD_INPUT if report.wrong else 0
 

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from liftcore.cli.objects import named_tree
 from liftcore.cli.options import Parser, add_encoder, add_lift, add_world, open_lift, text_encoder, whole_number
-from liftcore.cli.query import source_files
-from liftcore.cli.reply import reply, write_files
+from liftcore.cli.reply import check_outputs, reply, write_files
 from liftcore.cli.segment import encoder_and_words
 from liftcore.errors import InvalidInput
 
@@ -43,32 +42,28 @@ def add_arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Write the scene, and describe the file."""
-    from liftcore.files import check_output
-
     suffix = options.output.suffix.lower()
     content = CONTENT_BY_SUFFIX.get(suffix, "labelled")
     kind = "json" if content == "masks" else "splats"
-    inputs = [path for path in (options.lift, options.table, options.words, options.vocabulary) if path]
-    check_output(options.output, inputs, kind)
     if options.only and not options.text:
         raise InvalidInput(
             "--only", expected="--text as well", got="no --text", hint="use --object ID for one object"
         )
-    scene = open_lift(options)
-    check_output(options.output, source_files(scene), kind)
+    files, scene = {"output": options.output}, open_lift(options)
+    check_outputs(files, options, scene, kind=kind)
     source = _source(options, scene)
     if isinstance(source, int) or options.only:
         content = "object"
     elif suffix in (".splat", ".spz") or source is None:
         content, source = "splats", None
-    files, exports = {"output": options.output}, {"output": partial(scene.export, source=source, what=content)}
+    exports = {"output": partial(scene.export, source=source, what=content)}
     if content == "labelled" and suffix == ".ply":
-        names = options.output.with_name(f"{options.output.name}.json")
-        files["names"] = Path(check_output(names, [*inputs, *source_files(scene)], "json"))
+        files["names"] = options.output.with_name(f"{options.output.name}.json")
+        check_outputs(files, options, scene, kind=kind)
         exports["names"] = partial(scene.export, source=source, what="names")
-    files = write_files(files, exports)
+    written = write_files(files, exports)
     splats = int(scene.members(source).sum()) if isinstance(source, int) else len(scene.features)
-    document: dict[str, Any] = {"files": files, "splats": splats, "what": content}
+    document: dict[str, Any] = {"files": written, "splats": splats, "what": content}
     document["world"] = scene.world.model_dump(mode="json")
     if source is not None and not isinstance(source, int) and content != "object":
         labels = scene.labels(source)

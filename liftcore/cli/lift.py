@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.cli.options import Parser, add_settings, add_sources, add_verbose, add_world, count, world_of
-from liftcore.cli.reply import reply, short_text, smoothing_line
+from liftcore.cli.reply import check_outputs, reply, short_text, smoothing_line, write_files
 from liftcore.errors import InvalidInput, InvalidSettings
 
 FEW_VIEWS = 26  # of masks, where smoothing improves features; with 52 it hardly does (docs/results.md)
@@ -42,9 +43,9 @@ def run(options: argparse.Namespace) -> int:
     """Lift, write the lift completely or not at all, and print a summary."""
     settings, world = settings_of(options), world_of(options)
     from liftcore import lift_files, open_engine
-    from liftcore.files import check_output, writing
 
-    out = check_output(options.output, [options.splats, options.cameras, *options.features], "lift")
+    files = {"output": options.output}
+    check_outputs(files, options, kind="lift")
     engine = open_engine(options.engine, options.address, options.threads)
     if options.checkpoint:
         require_folder(options.checkpoint)
@@ -67,28 +68,14 @@ def run(options: argparse.Namespace) -> int:
         checkpoint=options.checkpoint or None,
         engine=engine,
     ).with_world(world)
-    with writing(out):
-        result.save(options.output, progress=True)
+    write_files(files, {"output": partial(result.save, progress=True)})
     (plan,) = plans
     warnings = result.metadata.diagnostics["warnings"]
     document = {"out": str(options.output), **_summary(result), "warnings": [*plan.warnings, *warnings]}
-    lift_warnings = [
-        warning for warning in warnings if warning not in plan.input_warnings
-    ]  # the others were printed with the plan
-    reply(
-        document,
-        as_json=options.json,
-        lines=_lines(document | {"warnings": lift_warnings}, options.cameras, options.verbose),
-    )
+    new_warnings = [warning for warning in warnings if warning not in plan.input_warnings]  # the plan printed others
+    lines = _lines(document | {"warnings": new_warnings}, options.verbose)
+    reply(document, as_json=options.json, lines=lines)
     return 0
-
-
-def example_in(views: Sequence[str], cameras: Path) -> str:
-    """Return the middle pixel of the first of the lifted views, as an example of a query."""
-    from liftcore import read_cameras
-
-    width, height = read_cameras(cameras, choosing=False, views=views)[views[0]].photo_size
-    return f"{views[0]}:{width // 2},{height // 2}"
 
 
 def require_folder(folder: Path) -> None:
@@ -172,32 +159,29 @@ def plan_lines(plan: Plan) -> Iterable[str]:
 
 def _summary(result: LiftResult) -> dict[str, Any]:
     metadata = result.metadata
-    feature_share = float(result.has_feature.float().mean())
-    diagnostics = result.diagnostics
     return {
         "splats": result.features.shape[0],
-        "feature_share": feature_share,
-        "seen_share": feature_share,
+        "feature_share": float(result.has_feature.float().mean()),
         "channels": result.features.shape[1],
         "views": len(metadata.views),
         "lifted": list(metadata.views),
         "encoder": metadata.encoder,
         "text_space": metadata.text_space,
         "world": metadata.world.model_dump(mode="json"),
-        "diagnostics": diagnostics,
+        "diagnostics": result.diagnostics,
         "timings": metadata.timings,
         "settings": metadata.settings.model_dump(mode="json"),
     }
 
 
-def _lines(document: dict[str, Any], cameras: Path, verbose: bool) -> Iterable[str]:
+def _lines(document: dict[str, Any], verbose: bool) -> Iterable[str]:
     yield (
         f"{document['out']}: {document['splats']} splats x {document['channels']} channels "
         f"from {document['views']} views, {document['feature_share']:.1%} of the splats have a feature, "
         f"in {sum(document['timings'].values()):.1f} s"
     )
     yield from (f"warning: {warning}" for warning in document["warnings"])
-    yield from _verdict(document, cameras)
+    yield from _verdict(document)
     if not verbose:
         return
     for key, value in document["diagnostics"].items():
@@ -207,7 +191,7 @@ def _lines(document: dict[str, Any], cameras: Path, verbose: bool) -> Iterable[s
     yield from (f"  {stage}: {seconds:.3f} s" for stage, seconds in document["timings"].items())
 
 
-def _verdict(document: dict[str, Any], cameras: Path) -> Iterable[str]:
+def _verdict(document: dict[str, Any]) -> Iterable[str]:
     """Yield the verdict: coverage of rays, smoothing, warnings, and the next command."""
     from liftcore.text import NO_WORDS
 
@@ -225,5 +209,5 @@ def _verdict(document: dict[str, Any], cameras: Path) -> Iterable[str]:
     space = document["text_space"]
     if not space:
         yield "the packs have no text space: set it with splatlift pack retag, or query with --table FILE"
-    example = "WORD" if space not in ("", NO_WORDS) else f"--like {example_in(document['lifted'], cameras)}"
+    example = "WORD" if space not in ("", NO_WORDS) else f"--like {document['lifted'][0]}:X,Y"
     yield f"next: splatlift query {document['out']} {example}  (--verbose shows all figures)"

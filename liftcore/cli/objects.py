@@ -7,12 +7,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import Parser, add_encoder, add_splats, add_world, sides_of, world_of
-from liftcore.cli.query import source_files
-from liftcore.cli.reply import check_outputs, place_of, reply, write_files
+from liftcore.cli.options import Parser, add_encoder, add_splats, add_world, world_of
+from liftcore.cli.reply import check_outputs, lines_of, reply, write_files
 from liftcore.cli.segment import encoder_and_words
 from liftcore.errors import InvalidQuery
-from liftcore.files import check_output
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -38,13 +36,10 @@ def add_arguments(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     """List the objects, and write the requested files."""
     files = {"csv": options.csv} if options.csv else {}
-    inputs = [path for path in (options.lift, options.table, options.vocabulary) if path]
-    check_outputs(files, inputs)
     from liftcore import Scene
 
     scene = Scene(options.lift, splats=options.splats, world=world_of(options))
-    if files or options.into:
-        check_outputs(files, source_files(scene))
+    check_outputs(files, options, scene)
     if options.tree:
         return _tree(options, scene)
     encoder, catalogue = named_catalogue(options, scene)
@@ -55,10 +50,11 @@ def run(options: argparse.Namespace) -> int:
     if options.into:
         for scene_object in catalogue.objects:
             name = f"object-{scene_object.id}"
-            files[name] = check_output(options.into / f"{name}.ply", [*inputs, *source_files(scene)], "ply")
+            files[name] = options.into / f"{name}.ply"
             exports[name] = partial(scene.export, source=scene_object.id)
+        check_outputs(files, options, scene)
     document["files"] = write_files(files, exports)
-    reply(document, as_json=options.json, lines=_lines(document["answer"], document["files"]))
+    reply(document, as_json=options.json, lines=_lines(document))
     return 0
 
 
@@ -84,29 +80,19 @@ def _tree(options: argparse.Namespace, scene: Scene) -> int:
     files, exports = dict[str, Any](), dict[str, Any]()
     for node in answer.nodes if options.into else ():
         name = "-".join(["object", *map(str, node.path)])
-        inputs = [path for path in (options.lift, options.table, options.vocabulary) if path]
-        files[name] = check_output(options.into / f"{name}.ply", [*inputs, *source_files(scene)], "ply")
+        files[name] = options.into / f"{name}.ply"
         exports[name] = partial(scene.export, source=node.id)
+    check_outputs(files, options, scene)
     document: dict[str, Any] = {"encoder": None if encoder is None else encoder.name}
     document |= {"answer": answer.model_dump(mode="json"), "files": write_files(files, exports)}
-    reply(document, as_json=options.json, lines=_tree_lines(document["answer"], document["files"]))
+    reply(document, as_json=options.json, lines=_lines(document))
     return 0
 
 
-def _tree_lines(answer: dict[str, Any], files: dict[str, str]) -> Iterable[str]:
+def _lines(document: dict[str, Any]) -> Iterable[str]:
+    answer = document["answer"]
     yield answer["explanation"]
-    nodes = {node["id"]: node for node in answer["nodes"]}
-    stack = [node["id"] for node in answer["nodes"] if node["parent"] is None][::-1]
-    while stack:
-        node = nodes[stack.pop()]
-        name = "" if node["name"] is None else f" {node['name']} ({node['score']:.3f})"
-        yield (
-            f"{'  ' * len(node['path'])}{node['id']}{name}, {node['kind']}: {node['splats']} splats, "
-            f"{node['share']:.1%} of the total weight, {sides_of(node['size'], answer['unit'])}, masked in "
-            f"{node['confidence']:.0%} of the views that see it"
-        )
-        stack += node["parts"][::-1]
-    yield from (f"  {kind}: {path}" for kind, path in files.items())
+    yield from lines_of(document)
 
 
 def _vocabulary(options: argparse.Namespace, scene: Scene) -> tuple[TextEncoder | None, list[str]]:
@@ -117,16 +103,3 @@ def _vocabulary(options: argparse.Namespace, scene: Scene) -> tuple[TextEncoder 
         encoder = scene.encoder(f"table:{options.vocabulary}")
         return encoder, scene.words(encoder)
     return encoder_and_words(options, scene, options.vocabulary, "--vocabulary")
-
-
-def _lines(answer: dict[str, Any], files: dict[str, str]) -> Iterable[str]:
-    yield answer["explanation"]
-    for entry in answer["objects"]:
-        low, high = entry["box"].values()
-        name = "" if entry["name"] is None else f" {entry['name']} ({entry['score']:.3f})"
-        yield (
-            f"  {entry['id']}{name}: {entry['splats']} splats, {entry['share']:.1%} of the total weight, at "
-            f"{place_of(entry['centre'])}, from {place_of(low)} to {place_of(high)}, "
-            f"{sides_of(entry['size'], answer['unit'])}, best in {', '.join(entry['views'])}"
-        )
-    yield from (f"  {kind}: {path}" for kind, path in files.items())

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import textwrap
 from contextlib import contextmanager
-from itertools import pairwise
 from pathlib import Path
 from types import UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, Self, Union, get_args, get_origin
@@ -15,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, Self, Union
 from liftcore.errors import InvalidInput, InvalidQuery, SplatliftError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from liftcore import Scene, TextEncoder, WorldFrame
     from liftcore.models import Body
@@ -65,10 +63,7 @@ class Parser(argparse.ArgumentParser):
         """Parse with the last argument at any position: argparse ignores it after an option."""
         self.add_options()
         options, rest = super().parse_known_args(args, namespace)
-        if not self.last or not rest:
-            return options, rest
-        if rest[0].startswith("-") and rest[0] != "--":
-            self._restore_unknown_value(options, rest, sys.argv[1:] if args is None else args)
+        if not self.last or not rest or (rest[0].startswith("-") and rest[0] != "--"):
             return options, rest
         words = rest[1:] if rest[0] == "--" else rest
         if words and getattr(options, self.last) is None:
@@ -76,13 +71,6 @@ class Parser(argparse.ArgumentParser):
         if words and not any(word.startswith("-") for word in words):
             self.error(f"unrecognized arguments: {' '.join(words)}; a text of several words is one, in quotes")
         return options, words
-
-    def _restore_unknown_value(self, options: argparse.Namespace, rest: list[str], args: Sequence[str]) -> None:
-        """Put the value of an unknown option back into `rest`: Python 3.13 and later take it as the last argument."""
-        value = getattr(options, self.last)
-        if value is not None and [rest[0], value] in ([*pair] for pair in pairwise(args)):
-            setattr(options, self.last, None)
-            rest.insert(1, value)
 
     def error(self, message: str) -> NoReturn:
         self.exit(BAD_INPUT, f"{self.prog}: {' '.join(message.split())}; see '{self.prog} --help'\n")
@@ -93,9 +81,10 @@ def wrong_kind_error(options: argparse.Namespace) -> InvalidInput | None:
 
     The hint about the order is added only if another argument has a file of the right kind.
     """
+    from liftcore.cli.reply import paths_of
     from liftcore.files import identify, wrong_kind
 
-    paths = {name: _paths(getattr(options, name, None)) for name in ROLES}
+    paths = {name: paths_of(getattr(options, name, None)) for name in ROLES}
     for name, kind in ROLES.items():
         is_ordered = options.command in ORDERED and name in ORDER
         argument = name.upper() if is_ordered or name == "lift" else f"--{name}"
@@ -109,10 +98,6 @@ def wrong_kind_error(options: argparse.Namespace) -> InvalidInput | None:
                 error = InvalidInput(error.argument, expected=error.expected, got=error.got, hint=hint)
             return error
     return None
-
-
-def _paths(value: Any) -> list[Path]:
-    return [path for path in (value if isinstance(value, list) else [value]) if isinstance(path, Path)]
 
 
 def shared_options() -> Parser:
@@ -252,11 +237,6 @@ def world_of(options: argparse.Namespace) -> WorldFrame:
         }
     ):
         return WorldFrame(**values)
-
-
-def sides_of(size: Sequence[float], unit: str) -> str:
-    """Format the sides of a box, such as 0.4 x 0.2 x 0.1 metres."""
-    return f"{' x '.join(f'{side:.4g}' for side in size)} {unit}"
 
 
 def open_lift(options: argparse.Namespace) -> Scene:

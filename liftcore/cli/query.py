@@ -15,11 +15,10 @@ from liftcore.cli.options import (
     add_view,
     add_world,
     open_lift,
-    sides_of,
     text_encoder,
     view_of,
 )
-from liftcore.cli.reply import check_outputs, place_of, reply, write_files
+from liftcore.cli.reply import check_outputs, lines_of, place_of, reply, write_files
 from liftcore.errors import InvalidQuery
 
 if TYPE_CHECKING:
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
 
     from PIL.Image import Image
 
-    from liftcore import Answer, Objects, Query, Scene, TextEncoder, ViewMask
+    from liftcore import Answer, Objects, Query, TextEncoder, ViewMask
 
 
 LOCAL_SUFFIXES = (".splat", ".spz")  # of files whose positions are about the splats' origin
@@ -75,11 +74,9 @@ def run(options: argparse.Namespace) -> int:
     """Run the query, render the mask of a view, write the requested files, and print the answer."""
     view = view_of(options, "mask", "attention", "overlay")
     files = {kind: path for kind in OUTPUTS if (path := getattr(options, kind)) is not None}
-    check_outputs(files, [path for path in (options.lift, options.table, options.camera) if path])
     query = _query(options)
     scene = open_lift(options)
-    if files:
-        check_outputs(files, source_files(scene))
+    check_outputs(files, options, scene)
     hint = "or query by example, with --like"
     encoder = text_encoder(options, scene, hint, stand_in=True) if query.texts else None
     answer = scene.ask(query, encoder=encoder, places=options.top > 0)
@@ -131,11 +128,6 @@ def _picture(photo: Path | None, size: tuple[int, int]) -> Image | None:
     return None if photo is None else read_image(photo, size)[0]
 
 
-def source_files(scene: Scene) -> list[Path]:
-    """Return the files that a lift was computed from."""
-    return [Path(file.path) for file in (scene.metadata.splats, scene.metadata.cameras, *scene.metadata.features)]
-
-
 def _lines(document: dict[str, Any]) -> Iterable[str]:
     answer = document["answer"]
     threshold, query_text = answer["threshold"], ", ".join(map(repr, [*answer["text"], *answer["like"]]))
@@ -159,15 +151,8 @@ def _lines(document: dict[str, Any]) -> Iterable[str]:
         yield f"  may be {candidate['set']}, {candidate['kind']}: {size}"
     for best in answer.get("top", []):
         yield f"  splat {best['splat']}: score {best['score']:.4g} at {place_of(best['position'])}"
-    for number, entry in enumerate(answer.get("objects", []), 1):
-        low, high = entry["box"].values()
-        yield (
-            f"  object {number}: {entry['splats']} splats, {entry['share']:.1%} of the selection, score "
-            f"{entry['score']:.4g}, at {place_of(entry['centre'])}, from {place_of(low)} to {place_of(high)}, "
-            f"{sides_of(entry['size'], answer['unit'])}"
-        )
     if count := answer.get("unassigned_splats"):
         yield f"  {count} selected splats are in no object: single splats or small groups"
-    yield from (f"  {kind}: {path}" for kind, path in document["files"].items())
+    yield from lines_of(document)
     if "origin" in document:
         yield f"  positions in the file are relative to the origin {place_of(document['origin'])}"

@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 
 from liftcore.cli.options import Parser, add_fields, add_lift, add_view, open_lift, view_of
-from liftcore.cli.query import source_files
 from liftcore.cli.reply import check_outputs, reply, write_files
 from liftcore.errors import InvalidQuery
 
@@ -27,9 +26,8 @@ def run(options: argparse.Namespace) -> int:
     view, files = view_of(options), {"output": options.output}
     if view is None:
         raise InvalidQuery("--view", expected="a view to render", got="no --view and no --camera")
-    check_outputs(files, [path for path in (options.lift, options.camera) if path])
     scene = open_lift(options)
-    check_outputs(files, source_files(scene))
+    check_outputs(files, options, scene)
     paths = write_files(files, {"output": partial(scene.export, what=options.channel, view=view)})
     document = {"channel": options.channel, "out": paths["output"]}
     reply(document, as_json=options.json, lines=[paths["output"]])

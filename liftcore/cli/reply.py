@@ -1,12 +1,20 @@
 """Replies of commands: one JSON object, or lines of text; and the files that they write."""
 
+from __future__ import annotations
+
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from liftcore.errors import InvalidInput
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Callable, Iterable, Sequence
+
+    from liftcore import Scene
 
 MAX_ITEMS = 6  # of a list, in text
 MAX_FOLDERS = 8
@@ -27,33 +35,88 @@ def reply(document: Mapping[str, Any], *, as_json: bool, lines: Iterable[str] | 
 
 OUTPUTS = {
     "object": "splats", "coloured": "ply", "labelled": "ply", "names": "json", "scores": "npy", "splat_labels": "npy",
-    "csv": "csv", **dict.fromkeys(("mask", "attention", "overlay", "labels", "picture", "output"), "png"),
+    "csv": "csv", **dict.fromkeys(("mask", "attention", "overlay", "labels", "picture", "output", "worst"), "png"),
 }  # kind of file of each option  # fmt: skip
+INPUTS = ("lift", "splats", "cameras", "features", "edited", "table", "words", "vocabulary", "camera", "photo")
 
 
-def check_outputs(files: Mapping[str, Path], inputs: Sequence[Path]) -> None:
-    """Check output files by the options that name them.
+def check_outputs(
+    files: Mapping[str, Path], options: argparse.Namespace, scene: Scene | None = None, *, kind: str = "png"
+) -> None:
+    """Check output files before the work: they can be written, and none is an input or another of them.
+
+    Args:
+        files: by option. scene: whose own files are inputs too. kind: of the option ``output``.
 
     Raises:
-        InvalidInput: a file cannot be written (`check_output`), or two are the same file.
+        InvalidInput: a file cannot be written (`liftcore.files.check_output`), or two are the same file.
     """
     from liftcore.files import check_output
 
     if len({path.absolute() for path in files.values()}) < len(files):
         option_names = " and ".join(f"--{name.replace('_', '-')}" for name in files)
         raise InvalidInput(option_names, expected="different files", got="the same file twice")
+    inputs = [path for name in INPUTS for path in paths_of(getattr(options, name, None))]
+    if files and scene is not None:
+        metadata = scene.metadata
+        inputs += [Path(file.path) for file in (metadata.splats, metadata.cameras, *metadata.features)]
     for name, path in files.items():
-        check_output(path, inputs, OUTPUTS[name])
+        check_output(path, inputs, kind if name == "output" else OUTPUTS[name.partition("-")[0]])
 
 
-def write_files(files: Mapping[str, Path], exports: Mapping[str, Callable[[Path], None]]) -> dict[str, str]:
+def paths_of(value: Any) -> list[Path]:
+    """Return the paths in the value of an option."""
+    return [path for path in (value if isinstance(value, list) else [value]) if isinstance(path, Path)]
+
+
+def write_files(files: Mapping[str, Path], exports: Mapping[str, Callable[[Path], Any]]) -> dict[str, str]:
     """Write the files in order, each completely or not at all; after an error, no further files are written."""
     from liftcore.files import writing
 
-    for kind, path in files.items():
+    for name, path in files.items():
         with writing(path):
-            exports[kind](path)
-    return {kind: str(path) for kind, path in files.items()}
+            exports[name](path)
+    return {name: str(path) for name, path in files.items()}
+
+
+def lines_of(document: Mapping[str, Any]) -> Iterable[str]:
+    """Yield an ``answer`` as lines, an entry a line, and then the ``files``."""
+    answer = document.get("answer", {})
+    unit = answer.get("unit", "")
+    for entry in answer.get("named_words", ()):
+        yield f"  {entry['value']} {entry['word']}: {_facts(entry)}"
+    for number, entry in enumerate(answer.get("objects", ()), 1):
+        head = f"  {entry['id']}{_name(entry)}" if "id" in entry else f"  object {number}"
+        yield f"{head}: {_facts(entry, unit, 'total weight' if 'id' in entry else 'selection')}"
+    nodes = {node["id"]: node for node in answer.get("nodes", ())}
+    stack = [node["id"] for node in nodes.values() if node["parent"] is None][::-1]
+    while stack:
+        node = nodes[stack.pop()]
+        yield f"{'  ' * len(node['path'])}{node['id']}{_name(node)}, {node['kind']}: {_facts(node, unit)}"
+        stack += node["parts"][::-1]
+    yield from (f"  {name.replace('_', ' ')}: {path}" for name, path in document["files"].items())
+
+
+def _name(entry: Mapping[str, Any]) -> str:
+    return "" if entry["name"] is None else f" {entry['name']} ({entry['score']:.3f})"
+
+
+def _facts(entry: Mapping[str, Any], unit: str = "", whole: str = "total weight") -> str:
+    """Describe a set of splats: its size, its score, its place and its views, as far as the entry has them."""
+    facts = [f"{entry['splats']} splats", f"{entry['share']:.1%} of the {whole}"]
+    if "name" not in entry:
+        facts += [f"{name} {entry[name]:.4g}" for name in ("score", "margin") if name in entry]
+    if "confidence" in entry:
+        facts.append(f"masked in {entry['confidence']:.0%} of the views that see it")
+    if "centre" in entry:
+        facts.append(f"at {place_of(entry['centre'])}")
+    low, high = entry["box"].values()
+    facts.append(f"from {place_of(low)} to {place_of(high)}")
+    if unit:
+        facts.append(f"{' x '.join(f'{side:.4g}' for side in entry['size'])} {unit}")
+    if "views" in entry:
+        facts.append(f"best in {', '.join(entry['views'])}")
+    return ", ".join(facts)
 
 
 def _entries(document: Mapping[str, Any]) -> Iterable[str]:

@@ -17,8 +17,7 @@ from liftcore.cli.options import (
     text_encoder,
     view_of,
 )
-from liftcore.cli.query import source_files
-from liftcore.cli.reply import check_outputs, place_of, reply, write_files
+from liftcore.cli.reply import check_outputs, lines_of, reply, write_files
 from liftcore.errors import InvalidQuery
 
 if TYPE_CHECKING:
@@ -60,14 +59,11 @@ def run(options: argparse.Namespace) -> int:
     files = {kind: path for kind in OUTPUTS if (path := getattr(options, kind)) is not None}
     if options.labelled is not None:
         files["names"] = options.labelled.with_name(f"{options.labelled.name}.json")
-    inputs = [path for path in (options.lift, options.table, options.words, options.camera) if path]
-    check_outputs(files, inputs)
     from liftcore import read_example
     from liftcore.models import BestWords
 
     scene = open_lift(options)
-    if files:
-        check_outputs(files, source_files(scene))
+    check_outputs(files, options, scene)
     encoder, words = encoder_and_words(options, scene, options.words)
     document: dict[str, Any] = {"encoder": encoder.name, "words": len(words)}
     if options.example:
@@ -114,11 +110,4 @@ def _lines(document: dict[str, Any]) -> Iterable[str]:
     answer = document["answer"]
     unlabelled = f"{answer['none']} of {answer['splats']} splats have no word"
     yield f"{len(answer['named_words'])} of {document['words']} words found; {unlabelled}"
-    for entry in answer["named_words"]:
-        low, high = entry["box"].values()
-        yield (
-            f"  {entry['value']} {entry['word']}: {entry['splats']} splats, {entry['share']:.1%} of the "
-            f"total weight, score {entry['score']:.3f}, margin {entry['margin']:.3f}, "
-            f"from {place_of(low)} to {place_of(high)}"
-        )
-    yield from (f"  {kind.replace('_', ' ')}: {path}" for kind, path in document["files"].items())
+    yield from lines_of(document)

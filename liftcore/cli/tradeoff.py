@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 from pathlib import Path
 
 from liftcore.cli.lift import pairs_of
 from liftcore.cli.options import Parser, add_sources, count, option_errors
-from liftcore.cli.reply import reply
+from liftcore.cli.reply import check_outputs, reply
 
 
 def add_arguments(parser: Parser) -> None:
@@ -45,9 +44,9 @@ def run(options: argparse.Namespace) -> int:
     """Compare, write the chart, the table and the JSON, and print the recommendation."""
     settings = pairs_of(options.set)
     from liftcore.evaluate import SceneFiles, compare_speeds
-    from liftcore.files import check_output, writing
+    from liftcore.files import writing
 
-    check_output(options.out / "tradeoff.json", [], "json")
+    check_outputs({"output": options.out / "tradeoff.json"}, options, kind="json")
     sources = options.splats, options.cameras, tuple(options.features)
     with option_errors({"settings": "--set"}):
         comparison = compare_speeds(
@@ -57,23 +56,10 @@ def run(options: argparse.Namespace) -> int:
             threads=options.threads,
             progress=True,
             scene=options.splats.resolve().parent.name,
-            command=_command(options),
+            command=options.command_line,
         )
     with writing(options.out):
         files = comparison.save(options.out)
     document = comparison.document | {"files": [str(file) for file in files]}
     reply(document, as_json=options.json, lines=[*comparison.lines(), "", *document["files"]])
     return 0
-
-
-def _command(options: argparse.Namespace) -> str:
-    """Return the command of this comparison."""
-    parts = ["splatlift", "tradeoff", str(options.splats), str(options.cameras), *map(str, options.features)]
-    parts += ["--budget", f"{options.budget:g}"]
-    for pair in options.set:
-        parts += ["--set", pair]
-    if options.threads:
-        parts += ["--threads", str(options.threads)]
-    if options.labels:
-        parts += ["--labels", str(options.labels), "--table", str(options.table), "--classes", *options.classes]
-    return shlex.join(parts)

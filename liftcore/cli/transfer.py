@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from liftcore.cli.options import Parser, add_splats
-from liftcore.cli.reply import reply
+from liftcore.cli.reply import check_outputs, reply, write_files
 from liftcore.errors import InvalidInput
 
 NUMBERS = (12, 16)  # of a matrix
@@ -26,14 +27,12 @@ def add_arguments(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Write the lift of the other splats, and print the origin of their features."""
     from liftcore import Scene, load_lift
-    from liftcore.files import check_output, writing
 
-    scene = Scene(options.lift, splats=options.splats)
-    file = check_output(options.output, [options.lift, scene.splat_file, options.edited], "lift")
+    files, scene = {"output": options.output}, Scene(options.lift, splats=options.splats)
+    check_outputs(files, options, scene, kind="lift")
     matrix = None if options.matrix is None else _matrix(options.matrix)
     result = load_lift(options.lift).transferred(scene.splats, options.edited, matrix=matrix)
-    with writing(file):
-        result.save(options.output, progress=True)
+    write_files(files, {"output": partial(result.save, progress=True)})
     facts = result.diagnostics["transfer"]
     document: dict[str, Any] = {"out": str(options.output), "splats": len(result), **facts, "warnings": []}
     if unmatched := facts["without_partner"]:
