@@ -310,7 +310,6 @@ def describe_lift(lift: Lift) -> dict[str, Any]:
     metadata = lift.metadata
     count, channels = lift.features.shape
     feature_share = float(lift.has_feature.float().mean())
-    view_consistency = _ends(lift.view_consistency[lift.has_feature])
     diagnostics = lift.diagnostics
     return {
         "splats": count,
@@ -318,7 +317,6 @@ def describe_lift(lift: Lift) -> dict[str, Any]:
         "dtype": str(lift.features.dtype).removeprefix("torch."),
         "feature_share": feature_share,
         "total_weight": _ends(lift.total_weight),
-        "view_consistency": view_consistency,
         "encoder": metadata.encoder,
         "text_space": metadata.text_space,
         "views": len(metadata.views),

@@ -46,7 +46,6 @@ class SplatSupport:
 
     sums: np.ndarray  # [P] f64, of rows of W before any reweighting
     total_weight: Tensor  # [P] f32, sums of plain weights over all views, each ray once
-    view_consistency: Tensor  # [P] f32, norm of the weighted mean of unit codebook rows
     confidence: Tensor | None  # [P] f32; None where W was not reweighted
 
 

@@ -143,14 +143,12 @@ class InMemory(LiftSteps[SceneWeights]):
         return result, reweighting.reliability
 
     def solve(self, W: SceneWeights) -> tuple[Tensor, SplatSupport]:
-        solution = solve(
+        X = solve(
             W.weights, W.geometry.codebook, getattr(torch, self.settings.dtype), self.timings.progress,
             means=self.splats.means, threads=self.threads, memory=W.memory,
         )  # fmt: skip
         confidence = W.reweighting.confidence if W.reweighting else None
-        return solution.features, SplatSupport(
-            W.row_sums(), W.geometry.total_weight(), solution.view_consistency, confidence
-        )
+        return X, SplatSupport(W.row_sums(), W.geometry.total_weight(), confidence)
 
     def compare_with_optimum(self, W: SceneWeights, X: Tensor, visible: np.ndarray) -> dict[str, Any]:
         settings, geometry = self.settings, W.geometry

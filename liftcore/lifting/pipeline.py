@@ -76,7 +76,7 @@ def lift(
         settings: fields of `LiftSettings` that differ from the preset's.
 
     Returns:
-        Features [P, F] f16 (or f32) with total weight, view consistency and diagnostics, on the device that computed
+        Features [P, F] f16 (or f32) with total weight and diagnostics, on the device that computed
         them, or on the CPU where that device has too little memory.
 
     Raises:
@@ -159,7 +159,6 @@ def _run(
     lift = LiftResult(
         features=X,
         total_weight=support.total_weight,
-        view_consistency=support.view_consistency,
         confidence=support.confidence,
         has_feature=torch.from_numpy(support.sums > 0),
         metadata=views.metadata(settings, inputs.splats, diagnostics, timings.seconds),

@@ -237,7 +237,7 @@ def layer_colours(scene: OpenedLift, layer: str) -> np.ndarray:
     """Colour all splats by a layer, [P, 3] u8 sRGB.
 
     ``pca`` are three principal components of the features, ``cluster`` a colour a cluster; ``total_weight`` (by its
-    logarithm), ``view_consistency`` and ``confidence`` go through the colour map of scores. Splats without a feature
+    logarithm) and ``confidence`` go through the colour map of scores. Splats without a feature
     are grey.
 
     Raises:

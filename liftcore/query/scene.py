@@ -320,7 +320,7 @@ class Scene(OpenedLift):
         """Return [P, 3] u8 sRGB of splats by a layer.
 
         Args:
-            what: pca, cluster, total_weight, view_consistency or confidence.
+            what: pca, cluster, total_weight or confidence.
 
         Raises:
             InvalidQuery: the lift has no such layer.

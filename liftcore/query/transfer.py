@@ -54,7 +54,7 @@ def transfer(lift: AnyLift, old: Splats, new: Splats, matrix: Any = None) -> Any
         raise InvalidSplats("splats", expected="splats of the lifted scene", got=got, hint=hint)
     result, copied = lift[rows], torch.from_numpy(is_copy)
     labels = ("cluster", "object", "node")
-    values = ("features", "total_weight", "view_consistency", "has_feature", "confidence", *labels)
+    values = ("features", "total_weight", "has_feature", "confidence", *labels)
     columns = {name: column for name in values if (column := getattr(result, name)) is not None}
     for name, column in columns.items():
         column[~copied] = -1 if name in labels else 0

@@ -8,9 +8,6 @@ and faint splats keep their precision. At most LONG terms of a splat are added o
 added in pieces of LONG, as a plain float32 sum of ten million equal terms is wrong in its first digit.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -24,17 +21,6 @@ from liftcore.solve.codebook import Codebook
 from liftcore.solve.shared_rows import LONG, flat_table, sum_rows
 from liftcore.values.region_weights import BLOCK_ENTRIES, BLOCK_ROWS, RegionWeights, from_zero, row_blocks, run_each
 
-# rows [n] i64 -> means of vectors, of unit vectors, [n, C] f32
-BlockMeans = Callable[[Tensor], tuple[Tensor, Tensor]]
-
-
-@dataclass(frozen=True)
-class Solution:
-    """X and the consistency of the vectors that views give each splat."""
-
-    features: Tensor  # [P, F] f16 or f32, zero rows of splats without weights
-    view_consistency: Tensor  # [P] f32, norm of the weighted mean of unit codebook rows
-
 
 @one_thread()
 def solve(
@@ -46,8 +32,8 @@ def solve(
     means: Tensor | None = None,
     threads: int | None = None,
     memory: int | None = None,
-) -> Solution:
-    """Return ``X = D^-1 W E`` and the consistency of the vectors that views give each splat.
+) -> Tensor:
+    """Return ``X = D^-1 W E``, [P, F] f16 or f32, with zero rows of splats without weights.
 
     Args:
         W: of all views, with a row for every splat, on the CPU.
@@ -62,78 +48,41 @@ def solve(
     shape = W.splats.shape[0], codebook.channels
     size = shape[0] * shape[1] * dtype.itemsize
     X = zeros(shape, dtype, name="features", in_file=memory is not None and size > memory)
-    rows = torch.nonzero(W.indptr.diff())[:, 0]
-    squares = solve_rows(X, rows, W, codebook, progress, means=means, threads=threads)
+    solve_rows(X, W, codebook, progress, means=means, threads=threads)
     give_back_memory()
-    return Solution(X, squares.sqrt().clamp(0.0, 1.0).float())
+    return X
 
 
 def solve_rows(
     X: Tensor,
-    rows: Tensor,
     W: RegionWeights,
     codebook: Codebook,
     progress: Progress = silent,
     *,
     means: Tensor | None = None,
     threads: int | None = None,
-) -> Tensor:
-    """Solve for some splats, by their numbers [n] i64, and write their rows of X [P, F].
-
-    Returns:
-        [P] f64, squared lengths of the means of unit vectors; zero for the other splats.
-    """
-    sums = W.row_sums()
-    scale = torch.where(sums > 0, 1.0 / sums, 0.0)
-    squares = torch.zeros(X.shape[0], dtype=torch.float64)
+) -> None:
+    """Write the rows of X [P, F] of the splats that have weights."""
+    rows, sums = torch.nonzero(W.indptr.diff())[:, 0], W.row_sums()
     if means is not None:
         rows = rows[torch.argsort(morton_codes(means.cpu()[rows]))]
+    scales = torch.where(sums > 0, 1.0 / sums, 0.0).numpy()
+    indptr, region, weight = (part.numpy() for part in (W.indptr, W.region, W.weight))
     blocks = row_blocks(W.indptr.diff()[rows].numpy(), BLOCK_ROWS, BLOCK_ENTRIES)
     slices = list(codebook.slices())
-    inverse = None if codebook.unit or codebook.inverse_lengths is None else codebook.inverse_lengths
     for number, channels in enumerate(slices):
-        table = codebook.values(channels, X.device)
-        units = None if codebook.unit or inverse is not None else codebook.unit_values(channels, X.device)
-        means_of = _block_means(W, scale, table, units, inverse)
+        table, width = flat_table(codebook.values(channels, X.device)), channels.stop - channels.start
 
-        def solve_block(first: int, last: int, means_of: BlockMeans = means_of, channels: slice = channels) -> None:
+        def solve_block(
+            first: int, last: int, table: np.ndarray = table, width: int = width, channels: slice = channels
+        ) -> None:
             block_rows = rows[first:last]
-            block_means, unit_means = means_of(block_rows)
-            X[:, channels].index_copy_(0, block_rows, block_means.to(X.dtype))
-            squares[block_rows] += torch.linalg.vector_norm(unit_means, dim=1).double().square()
+            block_means = np.empty((last - first, width), np.float32)
+            sum_rows(*[block_rows.numpy(), indptr, region, weight, scales, table, width, block_means])
+            X[:, channels].index_copy_(0, block_rows, torch.from_numpy(block_means).to(X.dtype))
 
         run_each(solve_block, blocks, threads)
         progress("solve", number + 1, len(slices), "slices")
-    return squares
-
-
-def _block_means(
-    W: RegionWeights, scale: Tensor, table: Tensor, units: Tensor | None, inverse: Tensor | None
-) -> BlockMeans:
-    """Return a function for the means of rows of W.
-
-    Args:
-        scale: [P] f64, 1 / row sum. table: [M, C] f32. units: [M, C] f32, unit rows of the table. inverse: [M] f32,
-            inverse lengths of its rows. At most one of the two is given; neither if the rows have unit length.
-    """
-    indptr, region, weight, scales = (part.numpy() for part in (W.indptr, W.region, W.weight, scale))
-    flat, width, none = flat_table(table), table.shape[1], np.empty(0, np.float32)
-    flat_units = None if units is None else flat_table(units)
-    inverse_lengths = none if inverse is None else inverse.numpy()
-
-    def sum_table(rows: np.ndarray, table: np.ndarray, inverse_lengths: np.ndarray = none) -> Tensor:
-        sums = np.empty((rows.size, width), np.float32)
-        sum_rows(*[rows, indptr, region, weight, scales, inverse_lengths, table, width, sums])
-        return torch.from_numpy(sums)
-
-    def means_of(block_rows: Tensor) -> tuple[Tensor, Tensor]:
-        rows = block_rows.numpy()
-        means = sum_table(rows, flat)
-        if flat_units is not None:
-            return means, sum_table(rows, flat_units)
-        return means, means if inverse is None else sum_table(rows, flat, inverse_lengths)
-
-    return means_of
 
 
 def bag_sums(index: Tensor, table: Tensor, starts: Tensor, shares: Tensor | None = None) -> Tensor:

@@ -24,8 +24,6 @@ ROWS = 1 << 10  # of a codebook that are converted at a time
 FLOAT16_MAX = 65_504.0
 FLOAT16_STEP = 2.0**-25  # the largest rounding error of its small values
 FLOAT16_ERROR = 1e-4  # of the longest vector, the largest error of a row in float16
-UNIT_TOLERANCE = 5e-3  # float16 unit vectors are off by less
-SHORTEST = 1e-30  # length of a vector whose inverse float32 represents
 TABLE_BYTES = 1 << 28  # of float32 columns of E of all views at a time
 LEAST_CHANNELS = 8  # at a time, for any number of regions
 
@@ -84,23 +82,6 @@ class Codebook:
     def lengths(self) -> list[Tensor]:
         """The lengths of the rows of each view's codebook, [M] f64 per view."""
         return [row_lengths(view.rows) for view in self.views]
-
-    @cached_property
-    def unit(self) -> bool:
-        """True if all rows are unit vectors to float16 precision."""
-        return all(bool(((length - 1).abs() < UNIT_TOLERANCE).all()) for length in self.lengths)
-
-    @cached_property
-    def inverse_lengths(self) -> Tensor | None:
-        """The inverse length [M] f32 of each region's vector, zero for zero vectors.
-
-        None if a region is the mean of several rows, or an inverse times a weight may overflow float32.
-        """
-        lengths = torch.cat(self.lengths)
-        nonzero = lengths > 0
-        if any(view.tuples is not None for view in self.views) or bool((lengths[nonzero] < SHORTEST).any()):
-            return None
-        return torch.where(nonzero, 1.0 / lengths, 0.0).float()
 
     def fits_float16(self) -> bool:
         """Return True if float16 represents the rows of all codebooks."""

@@ -254,12 +254,11 @@ def order_by_level(regions, count, level, levels, starts, order):
 
 
 @kernel
-def sum_rows(rows, indptr, region, weight, inverse, lengths, table, width, sums):
+def sum_rows(rows, indptr, region, weight, inverse, table, width, sums):
     """Compute ``sum_k W_jk inverse_j table[region_k]`` of some rows.
 
     Args:
-        rows: [n] i64, of W. inverse: [P] f64. lengths: [M] f32, further factors of the regions' vectors; [0] for
-            none.
+        rows: [n] i64, of W. inverse: [P] f64.
         table: `flat_table` [M, width]. sums: [n, width] f32.
     """
     regions, shares = np.empty(GROUP * LONG, np.int32), np.empty(GROUP * GROUP * LONG, np.float32)
@@ -277,9 +276,6 @@ def sum_rows(rows, indptr, region, weight, inverse, lengths, table, width, sums)
         for piece in range(pieces):
             arrays = indptr, region, weight, no_level, scales
             count = unite_rows(rows, first, last, piece, LONG, *arrays, regions, shares, entries)
-            if lengths.size > 0:
-                for place in range(GROUP * count):
-                    shares[place] *= lengths[regions[place // GROUP]]
             for c in range(0, width, LANES):
                 a = b = d = e = no_lanes()
                 for n in range(count):

@@ -82,8 +82,6 @@ class Lift:
     """[P, F] f16 or f32; zero rows without a feature"""
     total_weight: Tensor
     """[P] f32, sum of plain weights w over the feature views, each ray once"""
-    view_consistency: Tensor
-    """[P] f32 in 0..1, norm of the mean of unit regions or cells; says little of being right"""
     has_feature: Tensor
     """[P] bool, whether any labelled ray reached the splat"""
     metadata: LiftMetadata
@@ -151,7 +149,7 @@ class Lift:
         from liftcore.scene.rows import chosen_rows
 
         rows = chosen_rows(keep, len(self)).to(self.features.device)
-        names = ("features", "total_weight", "view_consistency", "has_feature", "confidence", "cluster", "object")
+        names = ("features", "total_weight", "has_feature", "confidence", "cluster", "object")
         tensors = {name: getattr(self, name) for name in names}
         columns = {name: column[rows] for name, column in tensors.items() if column is not None}
         for labels, table in (("cluster", "cluster_features"), ("object", "object_views")):

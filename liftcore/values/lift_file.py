@@ -1,13 +1,13 @@
 """The lift file: features on splats, with all that is needed to trust and to use them.
 
-A ``.safetensors`` file holds ``features`` [P, F], ``total_weight`` [P], ``view_consistency`` [P] and ``has_feature``
-[P]. After reweighting it has ``confidence`` [P] f32, which tells right splats from wrong ones, as view consistency
-does not; after Post-Lifting Aggregation ``cluster`` [P] i32, -1 for splats in none, and ``cluster_features`` [K, F];
-where objects were looked for ``object`` [P] i32, -1 for none, and ``object_views`` [N, 5] i32, and of the tree of
-objects, parts and groups ``node`` [P] i32, ``node_parents`` [T] i32, ``node_views`` [T, 5] i32, ``node_confidence``
-[T] f32 and ``node_features`` [T, F] f16 (`Lift`); of packs with words their vectors, ``embeddings`` [n, F] f32. Its
-metadata hold settings, inputs with digests, the encoder, words, the diagnostics, timings and the version, as JSON. A
-lift too large for one file is a folder of shards with the same tensors (`liftcore.io.shards`).
+A ``.safetensors`` file holds ``features`` [P, F], ``total_weight`` [P] and ``has_feature`` [P]. After reweighting it
+has ``confidence`` [P] f32, which tells right splats from wrong ones; after Post-Lifting Aggregation ``cluster`` [P]
+i32, -1 for splats in none, and ``cluster_features`` [K, F]; where objects were looked for ``object`` [P] i32, -1 for
+none, and ``object_views`` [N, 5] i32, and of the tree of objects, parts and groups ``node`` [P] i32, ``node_parents``
+[T] i32, ``node_views`` [T, 5] i32, ``node_confidence`` [T] f32 and ``node_features`` [T, F] f16 (`Lift`); of packs
+with words their vectors, ``embeddings`` [n, F] f32. Its metadata hold settings, inputs with digests, the encoder,
+words, the diagnostics, timings and the version, as JSON. A lift too large for one file is a folder of shards with the
+same tensors (`liftcore.io.shards`).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from liftcore.values.lift import InputFile, Lift, LiftMetadata
 
 FORMAT = "splatlift-lift/2"
-TENSORS = ("features", "total_weight", "view_consistency", "has_feature")
+TENSORS = ("features", "total_weight", "has_feature")
 CONFIDENCE = "confidence"  # in lifts that were reweighted
 NEAR = 3  # folders of an input's path, and above a lift, among which it is looked for
 MOST_BESIDE = 16  # files of one kind beside a lift, that are read to know one of them
@@ -172,7 +172,7 @@ def _check_shapes(arrays: dict[str, np.ndarray], path: Path | str) -> None:
     features = arrays["features"]
     rows = features.shape[:1]
     fits = features.ndim == 2 and features.dtype in (np.float16, np.float32) and features.size
-    columns = (("total_weight", np.float32), ("view_consistency", np.float32), ("has_feature", np.bool_))
+    columns = (("total_weight", np.float32), ("has_feature", np.bool_))
     columns += ((CONFIDENCE, np.float32),) if CONFIDENCE in arrays else ()
     if not fits or any(arrays[name].shape != rows or arrays[name].dtype != dtype for name, dtype in columns):
         shapes = {name: list(arrays[name].shape) for name in TENSORS}

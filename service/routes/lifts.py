@@ -45,7 +45,7 @@ LiftCameras = Annotated[
 View = Annotated[str, Query(min_length=1, max_length=models.VIEW_CHARACTERS, description="the name of a camera")]
 ShareId = Annotated[str, PathParameter(pattern=r"^[0-9a-f]{12}$", description="the id of a share of the lift")]
 Layer = Annotated[
-    Literal["pca", "cluster", "total_weight", "view_consistency", "confidence"],
+    Literal["pca", "cluster", "total_weight", "confidence"],
     Query(description="of colours: principal components of features, clusters, or another through a colour map"),
 ]
 KNOWN: dict[int | str, dict[str, Any]] = {200: {"model": Lift, "description": "It was here already"}}

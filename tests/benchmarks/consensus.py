@@ -6,7 +6,7 @@
 ``DIR`` is `tabletop`, with its packs of 52, 26 and 13 views. ``--mistakes`` are made on its exact masks (13 views),
 and on the tests' still life and small things, with each seed. A row is a
 scene: splat accuracy / mIoU of held-out views as `tests.benchmarks.tabletop` has them / the least IoU of a class, and
-how well confidence and view consistency of ``default`` rank splats by being right (AUROC). ``seconds`` are of the
+how well the confidence of ``default`` ranks splats by being right (AUROC). ``seconds`` are of the
 lift, over those of ``row-sum``.
 """
 
@@ -109,7 +109,6 @@ def measured(name: str, truth: Truth, views: Mapping[str, ViewFeatures], setting
         row[label] = " / ".join(f"{value:.4f}" for value in vars(truth.evaluate(lifted)).values())
         if label == "default" and lifted.confidence is not None:
             row["confidence"] = ranked(truth, lifted, lifted.confidence)
-            row["view_consistency"] = ranked(truth, lifted, lifted.view_consistency)
     if {"default", "row-sum"} <= seconds.keys():
         row["seconds"] = seconds["default"] / seconds["row-sum"]
     return row

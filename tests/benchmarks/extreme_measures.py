@@ -243,7 +243,7 @@ def lift_of(
         faint = (totals > 0) & (totals < FAINT)
         errors = np.abs(result.features.double().numpy() - X) / (longest or 1.0)
         visible = result.has_feature.numpy()
-        parts = result.features, result.total_weight, result.view_consistency
+        parts = result.features, result.total_weight
         sound = all(bool(part.isfinite().all()) for part in parts)
         sound &= (
             np.array_equal(visible[~faint], totals[~faint] > 0) and not result.features[~result.has_feature].any()
@@ -323,7 +323,7 @@ def survives(result: lc.LiftResult, view: ViewFeatures) -> bool:
     if not vector.any():
         return bool(result.features.isfinite().all())
     answers = [result.query(vector, threshold=method) for method in METHODS]
-    parts = [result.features, result.view_consistency, *(answer.scores for answer in answers)]
+    parts = [result.features, *(answer.scores for answer in answers)]
     is_finite = all(
         not math.isnan(answer.threshold) and not answer.splats[~result.has_feature].any() for answer in answers
     )

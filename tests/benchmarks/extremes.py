@@ -406,9 +406,8 @@ LENGTHS: tuple[Extreme, ...] = (
         kernels=GAUSSIAN),
     lift_of("a zero row in the codebook", _zero_row(), text="codebook rows are zero"),
     lift_of("a codebook of zeros", lc.Regions(checkerboard(3).labels, torch.zeros(3, 7)),
-        lambda lift: float(lift.view_consistency.max()) == 0, bound=0.0, text="codebook rows are zero"),
-    lift_of("vectors that cancel: +1e4 and -9990 in turn", _cancelling(),
-        lambda lift: float(lift.view_consistency.min()) < 0.2),
+        lambda lift: not lift.features.any(), bound=0.0, text="codebook rows are zero"),
+    lift_of("vectors that cancel: +1e4 and -9990 in turn", _cancelling()),
 )
 # fmt: on
 
@@ -417,8 +416,7 @@ MAPS: tuple[Extreme, ...] = (
     lift_of("a mask of one pixel", _one_pixel()),
     lift_of("one label on the whole image", _labelled(np.zeros((HEIGHT, WIDTH)), 1),
         lambda lift: bool((lift.features[lift.has_feature] - lift.features[lift.has_feature][0]).abs().max() < 1e-6)),
-    lift_of("labels of 1 x 1 pixel", _labelled(np.zeros((1, 1)), 1),
-        lambda lift: float(lift.view_consistency[lift.has_feature].min()) > 1 - 1e-6),
+    lift_of("labels of 1 x 1 pixel", _labelled(np.zeros((1, 1)), 1)),
     lift_of("a region a pixel", _region_a_pixel()),
     lift_of("labels of 32,766 and 32,767, the last of int16",
         _labelled(LARGEST_I16 - np.indices((HEIGHT, WIDTH)).sum(axis=0) % 2, LARGEST_I16 + 1), kernels=GAUSSIAN,
@@ -434,7 +432,6 @@ MAPS: tuple[Extreme, ...] = (
         lambda lift: not bool(lift.has_feature.any()), bound=0.0,
         text="poses are world to camera"),
     lift_of("a splat that one ray alone meets", _region_a_pixel(),
-        lambda lift: abs(float(lift.view_consistency[0]) - 1) < 1e-6,
         splats=splats_at([(0.125, 0.125, 0.0)], -12.0, logits=-4.0), kernels=GAUSSIAN),
     lift_of("a grid of 1 x 1 cell", lc.FeatureGrid(torch.ones(1, 1, 6)),
         lambda lift: bool((lift.features[lift.has_feature] - 1).abs().max() < 1e-6)),

@@ -320,13 +320,10 @@ class InBlocks(LiftSteps[Job]):
         return W, scene.reliability
 
     def solve(self, W: Job) -> tuple[Tensor, SplatSupport]:
-        job = W
-        self.run("solve", steps.solve, job, job.splat_pieces)
-        sums, total_weight = _column(job, "rows", "sums"), _column(job, "rows", "total_weight")
-        view_consistency, robust = _column(job, "columns", "view_consistency"), job.settings.robust
-        confidence = torch.from_numpy(_column(job, "columns", "confidence")) if robust else None
-        support = SplatSupport(sums, torch.from_numpy(total_weight), torch.from_numpy(view_consistency), confidence)
-        return _mapped(job, job.features_file), support
+        self.run("solve", steps.solve, W, W.splat_pieces)
+        sums, total_weight = _column(W, "rows", "sums"), _column(W, "rows", "total_weight")
+        confidence = torch.from_numpy(_column(W, "columns", "confidence")) if W.settings.robust else None
+        return _mapped(W, W.features_file), SplatSupport(sums, torch.from_numpy(total_weight), confidence)
 
     def compare_with_optimum(self, W: Job, X: Tensor, visible: np.ndarray) -> NoReturn:
         """See the protocol; `LiftSettings.check_blocks` rejects settings that need it."""

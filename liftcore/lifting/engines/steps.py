@@ -11,7 +11,7 @@ them up and writes the totals as files too. So the result is bitwise identical t
     label     splats     the object of each splat, and its weight in other regions and in views
     share     views      the consensus of other views about their entries (`liftcore.solve.consensus`)
     compare   splats     cosines of regions with the other views (`liftcore.solve.reweight`)
-    solve     splats     X, view consistency and confidence
+    solve     splats     X and confidence
 
 A worker holds one piece: W of some views or of a block, in mapped files where it is large, and tables of size M, of
 which those of codebooks and directions take at most TABLE_BYTES.
@@ -385,17 +385,13 @@ def _reweighted(job: Job, piece: int, block: SplatBlock, threads: int | None) ->
 
 @one_thread()
 def solve(job: Job, piece: int, threads: int | None) -> None:
-    """Write X of a block of splats with view consistency and confidence."""
+    """Write X of a block of splats, and their confidence."""
     columns_file, features_file = job.columns_file(piece), job.features_file(piece)
     if columns_file.exists() and features_file.exists():
         return
     block, codebook = _splat_block(job, piece), codebook_of(job)
     W, confidence = _reweighted(job, piece, block, threads)
     X = torch.zeros(block.last - block.first, job.channels, dtype=job.dtype)
-    rows = torch.nonzero(W.indptr.diff())[:, 0]
-    squares = solve_rows(X, rows, W, codebook, means=block.means, threads=threads)
+    solve_rows(X, W, codebook, means=block.means, threads=threads)
     write_rows(features_file, X)
-    columns = {"view_consistency": squares.sqrt().clamp(0.0, 1.0).float()}
-    if confidence is not None:
-        columns["confidence"] = confidence
-    write_piece(columns_file, columns)
+    write_piece(columns_file, {} if confidence is None else {"confidence": confidence})

@@ -10,13 +10,12 @@ const LAYERS = {
   pca: "The first three principal components of the features as red, green and blue. Similar colours are similar features.",
   cluster: "A colour for each cluster of the aggregation. Grey splats are in no cluster.",
   total_weight: "The total weight of each splat over all views, on a logarithmic scale.",
-  view_consistency: "The consistency of the views' features at each splat.",
   confidence: "The confidence of each splat's feature, by the regions of other views.",
   photo: "The photo of the view, if one was uploaded.",
   depth: "The depth of the splats.",
 };
-const SCALE_ENDS = { total_weight: ["low", "high"], view_consistency: ["low", "high"], confidence: ["low", "high"], depth: ["far", "near"] }; // dark and bright
-const OLD_NAMES = { evidence: "total_weight", agreement: "view_consistency" }; // of layers in old links: their names now
+const SCALE_ENDS = { total_weight: ["low", "high"], confidence: ["low", "high"], depth: ["far", "near"] }; // dark and bright
+const OLD_NAMES = { evidence: "total_weight" }; // of layers in old links: their names now
 const MODES = ["scene", "both", "view"];
 const CLICK_DISTANCE = 5; // pixels that the pointer may move during a click
 const RENDERED_LAYERS = ["rgb", "pca", "cluster", "confidence", "depth"]; // layers that the service renders

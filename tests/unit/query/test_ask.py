@@ -53,7 +53,7 @@ class Axes:
 def of(scene: Scene, rows: np.ndarray, **fields: torch.Tensor) -> Scene:
     """Return the scene with these features [P, F]: every splat has a feature, of total weight one."""
     ones = torch.ones(len(rows))
-    values = {"total_weight": ones, "view_consistency": ones, "has_feature": ones > 0} | fields
+    values = {"total_weight": ones, "has_feature": ones > 0} | fields
     return Scene(replace(scene.lift, features=torch.from_numpy(rows.astype(np.float32)), **values))
 
 
@@ -369,7 +369,7 @@ def test_a_lift_with_other_rows_than_its_splats_answers_nothing(
 ) -> None:
     path = lift_tiny(tmp_path)
     lift, splats = load_lift(path), tmp_path / f"other{suffix}"
-    rows = ("features", "total_weight", "view_consistency", "has_feature", "confidence", "cluster", "object", "node")
+    rows = ("features", "total_weight", "has_feature", "confidence", "cluster", "object", "node")
     cropped = {name: getattr(lift, name)[:-1] for name in rows if getattr(lift, name) is not None}
     save_lift(replace(lift, **cropped), tmp_path / "cropped.lift")
     ask(Scene(path), Query.of((SplatTerm(0),)))

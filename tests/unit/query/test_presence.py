@@ -48,7 +48,7 @@ def clip(scene: Scene, table: TableEncoder) -> Scene:
         0.28 * words + 0.9 * gap / np.linalg.norm(gap) + 0.25 * noise / np.linalg.norm(noise, axis=1, keepdims=True)
     )
     ones = torch.ones(COUNT)
-    values = {"total_weight": ones, "view_consistency": ones, "has_feature": ones > 0}
+    values = {"total_weight": ones, "has_feature": ones > 0}
     lifted = replace(scene.lift, features=torch.from_numpy(rows.astype(np.float32)), **values)
     return Scene(lifted, scene.splats, scene.cameras)
 
@@ -111,7 +111,7 @@ def test_references_that_mean_the_same_hide_nothing(clip: Scene, table: TableEnc
 def test_small_total_weight_makes_no_object(clip: Scene, table: TableEncoder) -> None:
     features = torch.cat([clip.lift.features, torch.from_numpy(table.encode(["sofa"]))])
     ones = torch.ones(COUNT + 1)
-    values = {"features": features, "view_consistency": ones, "has_feature": ones > 0}
+    values = {"features": features, "has_feature": ones > 0}
     total_weight = torch.cat([torch.ones(COUNT), torch.tensor([1e-4])])
     for weight, present in ((1e-4, False), (1.0, True)):
         total_weight[-1] = weight

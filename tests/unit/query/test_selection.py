@@ -31,7 +31,6 @@ def lifted(scene: Scene, features: np.ndarray, **fields: Any) -> Scene:
     ones = torch.ones(len(features))
     defaults = {
         "total_weight": ones,
-        "view_consistency": ones,
         "has_feature": ones > 0,
         "object": None,
         "object_views": None,

@@ -39,7 +39,7 @@ def test_rows_that_are_kept_come_back_as_they_were(lifted: tuple[LiftResult, Spl
     result, splats = lifted
     order = np.random.default_rng(1).permutation(splats.count)[:45]
     moved_lift = result.transferred(splats, splats[order])
-    for name in ("features", "total_weight", "view_consistency", "has_feature"):
+    for name in ("features", "total_weight", "has_feature"):
         assert torch.equal(getattr(moved_lift, name), getattr(result, name)[order]), name
     expected = result[order]
     assert (

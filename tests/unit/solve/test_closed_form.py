@@ -11,62 +11,53 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from liftcore.solve.closed_form import LONG, Solution, solve
+from liftcore.solve.closed_form import LONG, solve
 from liftcore.values.region_weights import RegionWeights, stacked
 from tests.unit.solve.sparse_views import codebook_of, defined, of_dense, random_view
 
 SPLATS = 700
 
 
-def scene(channels: int = 33, unit: bool = False) -> tuple[list[RegionWeights], list[Tensor]]:
+def scene(channels: int = 33) -> tuple[list[RegionWeights], list[Tensor]]:
     views = [random_view(k, 5 + k, SPLATS) for k in range(7)]
     books = [torch.randn(5 + k, channels, generator=torch.manual_seed(k)) for k in range(7)]
-    return views, [torch.nn.functional.normalize(book, dim=1).half() for book in books] if unit else books
+    return views, books
 
 
-def solved(views, books, dtype=torch.float32, **options) -> Solution:
+def solved(views, books, dtype=torch.float32, **options) -> Tensor:
     return solve(stacked(views, SPLATS), codebook_of(books), dtype, **options)
 
 
-def assert_same_bits(first: Solution, second: Solution) -> None:
-    assert torch.equal(first.features, second.features)
-    assert torch.equal(first.view_consistency, second.view_consistency)
-
-
 @pytest.mark.parametrize("channels", [1, 3, 70])
-@pytest.mark.parametrize("unit", [True, False])
-def test_features_and_view_consistency_equal_their_definition(channels, unit):
-    views, books = scene(channels, unit)
+def test_features_equal_their_definition(channels):
+    views, books = scene(channels)
     expected, sums = defined(views, books, SPLATS)
     solution = solved(views, books)
-    np.testing.assert_allclose(solution.features.numpy(), expected, rtol=1e-5, atol=1e-6)
-    units = [torch.nn.functional.normalize(book.double(), dim=1) for book in books]
-    lengths = np.linalg.norm(defined(views, units, SPLATS)[0], axis=1)
-    np.testing.assert_allclose(solution.view_consistency.numpy(), lengths, atol=1e-3 if unit else 1e-6)
+    np.testing.assert_allclose(solution.numpy(), expected, rtol=1e-5, atol=1e-6)
     unseen = torch.from_numpy(sums == 0)
-    assert unseen.any() and not solution.features[unseen].any() and not solution.view_consistency[unseen].any()
-    halves = solved(views, books, torch.float16).features
+    assert unseen.any() and not solution[unseen].any()
+    halves = solved(views, books, torch.float16)
     assert halves.dtype == torch.float16
-    torch.testing.assert_close(halves.float(), solution.features, rtol=2**-10, atol=2**-24)
+    torch.testing.assert_close(halves.float(), solution, rtol=2**-10, atol=2**-24)
 
 
 def test_neither_threads_nor_order_nor_files_change_a_bit():
     views, books = scene()
     expected = solved(views, books, threads=1)
     means = torch.rand(SPLATS, 3, generator=torch.manual_seed(0))
-    assert_same_bits(expected, solved(views, books, threads=5))
-    assert_same_bits(expected, solved(views, books, threads=2, means=means, memory=0))
-    assert_same_bits(expected, solved([view.in_files() for view in views], books, means=means))
+    assert torch.equal(expected, solved(views, books, threads=5))
+    assert torch.equal(expected, solved(views, books, threads=2, means=means, memory=0))
+    assert torch.equal(expected, solved([view.in_files() for view in views], books, means=means))
 
 
 @pytest.mark.parametrize("size", [1e5, 1e-9, 3e38])
 def test_what_float16_cannot_hold_is_float32(size):
     views, books = scene(4)
     large = [size * book.clamp(-1, 1) for book in books]
-    solution = solved(views, large, torch.float16).features
+    solution = solved(views, large, torch.float16)
     assert solution.dtype == torch.float32
     assert torch.isfinite(solution).all()
-    expected = solved(views, [book.clamp(-1, 1) for book in books]).features
+    expected = solved(views, [book.clamp(-1, 1) for book in books])
     torch.testing.assert_close(solution / size, expected, rtol=1e-5, atol=1e-6)
 
 
@@ -76,8 +67,7 @@ def test_slices_of_channels_are_put_together(monkeypatch):
     monkeypatch.setattr("liftcore.solve.codebook.TABLE_BYTES", 1)
     calls = []
     cut = solved(views, books, progress=lambda *step: calls.append(step))
-    assert torch.equal(cut.features, expected.features)
-    torch.testing.assert_close(cut.view_consistency, expected.view_consistency, rtol=0, atol=1e-6)
+    assert torch.equal(cut, expected)
     assert calls[-1] == ("solve", 5, 5, "slices")
 
 
@@ -88,15 +78,15 @@ def test_sums_of_a_million_entries_and_of_many_views_keep_their_digits():
     for views_of_case, codebooks in ((long, books), (views, [torch.full((1, 1), 0.7)] * 2_000)):
         solution = solve(stacked(views_of_case, 1), codebook_of(codebooks), torch.float32)
         # One by one: the third digit.
-        assert abs(float(solution.features[0, 0]) / float(torch.tensor(0.7)) - 1) < 5e-6
+        assert abs(float(solution[0, 0]) / float(torch.tensor(0.7)) - 1) < 5e-6
 
 
 def test_no_view_no_region_and_codebooks_of_zeros_are_zeros():
     no_weights = of_dense(np.zeros((SPLATS, 2)))
     solution = solved([no_weights, no_weights], [torch.ones(2, 3)] * 2, torch.float16)
-    assert not solution.features.any() and not solution.view_consistency.any()
+    assert not solution.any()
     zeros = solved([random_view(0, 4, SPLATS)], [torch.zeros(4, 3)], torch.float16)
-    assert not zeros.features.any() and not zeros.view_consistency.any()
+    assert not zeros.any()
 
 
 def test_tiny_and_huge_weights_give_means():
@@ -104,7 +94,7 @@ def test_tiny_and_huge_weights_give_means():
     expected = solved(views, books)
     for factor in (2.0**-100, 2.0**100):
         scaled = [replace(view, weight=view.weight * factor) for view in views]
-        assert torch.equal(solved(scaled, books).features, expected.features)
+        assert torch.equal(solved(scaled, books), expected)
 
 
 @given(st.integers(0, 2**31), st.sampled_from([1, 7, 50]), st.sampled_from([1e-7, 1e-5, 1.0, 6e4]))
@@ -112,10 +102,10 @@ def test_float16_codebooks_give_the_bits_of_their_float32_twins(seed, channels, 
     views = [random_view(seed + view, 5, 40) for view in range(3)]
     books = [(size * torch.rand(5, channels, generator=torch.manual_seed(seed))).half() for _ in views]
     W, before = stacked(views, 40), [book.clone() for book in books]
-    solution = solve(W, codebook_of(books), torch.float32).features
-    assert torch.equal(solution, solve(W, codebook_of([book.float() for book in books]), torch.float32).features)
+    solution = solve(W, codebook_of(books), torch.float32)
+    assert torch.equal(solution, solve(W, codebook_of([book.float() for book in books]), torch.float32))
     mixed_books = [book.float() if k else book for k, book in enumerate(books)]
-    assert torch.equal(solution, solve(W, codebook_of(mixed_books), torch.float32).features)
+    assert torch.equal(solution, solve(W, codebook_of(mixed_books), torch.float32))
     assert all(map(torch.equal, books, before))
 
 
@@ -124,11 +114,11 @@ def test_splats_of_few_and_of_many_entries_in_one_group_have_the_bits_of_each_al
     lengths = np.array([10, 3 * LONG + 5, LONG, 2 * LONG - 1])
     weights = rng.uniform(0.1, 1.0, (4, lengths.max())) * (np.arange(lengths.max()) < lengths[:, None])
     book = torch.tensor(rng.normal(0, 1, (lengths.max(), 40)), dtype=torch.float32)
-    together = solve(stacked([of_dense(weights)], 4), codebook_of([book]), torch.float32).features
+    together = solve(stacked([of_dense(weights)], 4), codebook_of([book]), torch.float32)
     for row in range(4):
         single = np.zeros_like(weights)
         single[row] = weights[row]
-        alone = solve(stacked([of_dense(single)], 4), codebook_of([book]), torch.float32).features
+        alone = solve(stacked([of_dense(single)], 4), codebook_of([book]), torch.float32)
         assert torch.equal(together[row], alone[row])
     expected = weights @ book.double().numpy() / weights.sum(axis=1, keepdims=True)
     np.testing.assert_allclose(together.numpy(), expected, atol=1e-6)

@@ -46,22 +46,20 @@ def inverse_of(dense: np.ndarray) -> np.ndarray:
     return np.divide(1.0, sums, out=np.zeros_like(sums), where=sums > 0)
 
 
-def summed(rows: np.ndarray, dense: np.ndarray, table: torch.Tensor, lengths: np.ndarray) -> np.ndarray:
+def summed(rows: np.ndarray, dense: np.ndarray, table: torch.Tensor) -> np.ndarray:
     sums = np.full((rows.size, table.shape[1]), np.nan, np.float32)
-    sum_rows(*[rows, *sparse(dense), inverse_of(dense), lengths, flat_table(table), table.shape[1], sums])
+    sum_rows(*[rows, *sparse(dense), inverse_of(dense), flat_table(table), table.shape[1], sums])
     return sums
 
 
 @widths
-@pytest.mark.parametrize("scaled", [False, True])
-def test_sums_equal_float64_ones_and_those_of_each_row_alone_to_the_bit(width, scaled):
+def test_sums_equal_float64_ones_and_those_of_each_row_alone_to_the_bit(width):
     dense, table, rows = weights(0), table_of(width), np.random.default_rng(1).permutation(23)
-    lengths = np.random.default_rng(2).random(REGIONS if scaled else 0).astype(np.float32)
-    sums = summed(rows, dense, table, lengths)
-    exact = dense * inverse_of(dense)[:, None] @ (table.numpy() * (lengths[:, None] if scaled else 1.0))
+    sums = summed(rows, dense, table)
+    exact = dense * inverse_of(dense)[:, None] @ table.numpy()
     np.testing.assert_allclose(sums, exact[rows], atol=1e-6)
     for row, result in zip(rows, sums, strict=True):
-        assert np.array_equal(summed(np.array([row]), dense, table, lengths)[0], result)
+        assert np.array_equal(summed(np.array([row]), dense, table)[0], result)
 
 
 def compare(rows: np.ndarray, dense: np.ndarray, table: torch.Tensor) -> np.ndarray:

@@ -34,7 +34,7 @@ def test_rows_of_a_lift_are_its_columns_and_answer_as_those_of_the_whole(scene, 
     splats, _, result = scene
     keep = splats.means[:, 0] > -0.2
     subset, full = result[keep], result
-    for name in ("features", "total_weight", "view_consistency", "has_feature", "confidence"):
+    for name in ("features", "total_weight", "has_feature", "confidence"):
         assert torch.equal(getattr(subset, name), getattr(full, name)[keep]), name
     assert len(subset) == len(splats[keep]) == int(keep.sum())
     answer = subset.query(np.eye(1, 6), splats=splats[keep], threshold=0.5)
