@@ -42,13 +42,13 @@ def table(lift: Path) -> list[object]:
         "{lift} apple --table {table}",
         "--table {table} {lift} apple",
         "--table {table} {lift} --view left apple",
-        "{lift} --view left apple --negative lamp --table {table} --negative book",
+        "{lift} --view left apple --negative apple --table {table} --negative book",
         "{lift} --table {table} -- apple",
     ],
 )
 def test_text_stands_before_between_or_after_options(words: str, lift: Path, table: list[object]) -> None:
     answer = run("query", "--json", *words.format(lift=lift, table=table[1]).split()).document["answer"]
-    negatives = ["lamp", "book"] if "--negative" in words else []
+    negatives = ["apple", "book"] if "--negative" in words else []
     expected = lc.Scene(lift).ask(lc.Query(text=["apple"], negatives=negatives), encoder=f"table:{table[1]}")
     assert answer["text"] == ["apple"] and answer["count"] == SPLATS_A_CLUSTER
     assert answer["statistics"] == expected.statistics
@@ -114,7 +114,8 @@ def test_overlay_tints_the_selection_and_dims_the_rest(lift: Path, tmp_path: Pat
     mask = lc.Scene(lift).mask(lc.Scene(lift).ask(lc.Query(like=["splat:0"])), "left")
     assert share == pytest.approx(mask.mean()) and 0 < share < 0.5
     assert pixels.shape[1] == WIDTH and pixels[HEIGHT:].min() < 128  # a caption below
-    assert (pixels[:HEIGHT][mask, 0] > 100).all() and np.mean(pixels[:HEIGHT][~mask, 0] < 50) > 0.5
+    rest = pixels[:HEIGHT][~mask, 0]
+    assert (pixels[:HEIGHT][mask, 0] > 100).all() and np.mean((rest > 10) & (rest < 50)) > 0.5
 
 
 def test_object_of_an_answer_is_its_splats_alone(lift: Path, table: list[object], tmp_path: Path) -> None:
