@@ -12,7 +12,6 @@ from liftcore.io.outputs import writing as writing
 from liftcore.io.photo_zip import PhotoIndexes as PhotoIndexes
 from liftcore.io.photo_zip import in_camera_orientation as in_camera_orientation
 from liftcore.io.safetensors_file import with_metadata as with_metadata
-from liftcore.scene.panorama import with_panoramas as with_panoramas
 from liftcore.scene.views import cameras_of_views as cameras_of_views
 from liftcore.scene.views import require_pairs as require_pairs
 

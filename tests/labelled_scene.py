@@ -70,7 +70,7 @@ def write_lift(folder: Path, name: str = "kitchen.lift.safetensors") -> Path:
     )
     has_feature, ones = torch.ones(count, dtype=torch.bool), torch.ones(count)
     path = folder / name
-    save_lift(LiftResult(words[owner].half(), ones * 9, ones, has_feature, metadata), path)
+    save_lift(LiftResult(words[owner].half(), ones * 9, has_feature, metadata), path)
     return path
 
 

@@ -61,9 +61,9 @@ def run(options: argparse.Namespace) -> int:
         files["names"] = options.output.with_name(f"{options.output.name}.json")
         check_outputs(files, options, scene, kind=kind)
         exports["names"] = partial(scene.export, source=source, what="names")
-    written = write_files(files, exports)
+    paths = write_files(files, exports)
     splats = int(scene.members(source).sum()) if isinstance(source, int) else len(scene.features)
-    document: dict[str, Any] = {"files": written, "splats": splats, "what": content}
+    document: dict[str, Any] = {"files": paths, "splats": splats, "what": content}
     document["world"] = scene.world.model_dump(mode="json")
     if source is not None and not isinstance(source, int) and content != "object":
         labels = scene.labels(source)
@@ -72,7 +72,7 @@ def run(options: argparse.Namespace) -> int:
         }
     if suffix != ".ply" and content not in CONTENT_BY_SUFFIX.values() and scene.splats.kernel != "3dgs":
         document["warnings"] = [
-            f"{scene.splats.kernel} splats are written as the nearest Gaussians, the only kernel of this format"
+            f"{scene.splats.kernel} splats are paths as the nearest Gaussians, the only kernel of this format"
         ]
     reply(document, as_json=options.json)
     return 0

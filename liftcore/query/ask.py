@@ -490,12 +490,12 @@ def _select_each(
     """
     cuts, selected = list[Threshold](), np.zeros_like(scene.has_feature)
     for word in words.tolist():
-        alone = mask.copy()
-        alone[: len(request.query.positives)] = False
-        alone[word] = True
-        scores = combine(similarities[:, alone], 1)
+        word_mask = mask.copy()
+        word_mask[: len(request.query.positives)] = False
+        word_mask[word] = True
+        scores = combine(similarities[:, word_mask], 1)
         scores = scores if scene.all_have_features else np.where(scene.has_feature, scores, np.float32(LOWEST_COSINE))
-        threshold, of_word = _select(scene, request, alone, scores)
+        threshold, of_word = _select(scene, request, word_mask, scores)
         cuts.append(threshold)
         selected |= of_word
     explanation = " ".join(

@@ -70,8 +70,8 @@ def read_query(scene: OpenedLift, query: Query, encoder: TextEncoder | None, nam
     phrases = {index: (str(query.terms[place]), form) for index, (_, _, place, form, _) in enumerate(terms) if form}
     if not phrases:
         return ReadQuery(query, tuple(names), {})
-    others = Query.model_fields.keys() - {"text", "like", "negatives", "unlike"}
-    read = Query.of(positives, negatives, **{name: getattr(query, name) for name in others})
+    options = Query.model_fields.keys() - {"text", "like", "negatives", "unlike"}
+    read = Query.of(positives, negatives, **{name: getattr(query, name) for name in options})
     return ReadQuery(read, tuple(names[place] for _, _, place, _, _ in terms) if names else (), phrases)
 
 

@@ -75,20 +75,20 @@ def nearest_rows(old: Splats, new: Splats) -> tuple[np.ndarray, np.ndarray]:
     from scipy.spatial import KDTree
 
     centres, places = (splats.positions().astype(np.float64) for splats in (old, new))
-    (sizes, looks), (_, new_looks) = map(_sizes_and_looks, (old, new))
+    (sizes, styles), (_, new_styles) = map(_sizes_and_styles, (old, new))
     tree, rows, is_copy = KDTree(set_apart(centres)), np.empty(new.count, np.int64), np.empty(new.count, np.bool_)
     for first in range(0, new.count, _BLOCK):
         block = slice(first, first + _BLOCK)
         near = tree.query(places[block], min(NEIGHBOURS, old.count), workers=-1)[1].reshape(len(places[block]), -1)
         distances = np.linalg.norm(places[block, None] - centres[near], axis=2) / sizes[near]
-        unlikeness = distances**2 + ((new_looks[block, None] - looks[near]) ** 2).sum(axis=2)
+        unlikeness = distances**2 + ((new_styles[block, None] - styles[near]) ** 2).sum(axis=2)
         best = unlikeness.argmin(axis=1)[:, None]
         rows[block] = np.take_along_axis(near, best, axis=1)[:, 0]
         is_copy[block] = np.take_along_axis(distances, best, axis=1)[:, 0] <= REACH
     return rows, is_copy
 
 
-def _sizes_and_looks(splats: Splats) -> tuple[np.ndarray, np.ndarray]:
+def _sizes_and_styles(splats: Splats) -> tuple[np.ndarray, np.ndarray]:
     """Return the longest standard deviation of each splat, [P] f64; its logarithm beside its colour, [P, 4] f64."""
     logs = splats.log_scales.cpu().numpy().astype(np.float64).max(axis=1).clip(-30, 30)
     colours = base_colours(splats)

@@ -82,13 +82,13 @@ def compare_with_optimum(
     residual = least = unfit
     for c in range(axes.shape[1]):
         start = lifted[:, c] * lengths
-        solution, reason, taken, *_ = lsmr(
+        solution, reason, iterations, *_ = lsmr(
             A, targets[:, c], atol=TOLERANCE, btol=TOLERANCE, conlim=0.0, maxiter=STEPS, x0=start
         )
         optimum[:, c] = np.where(lengths > 0, solution * scale, lifted[:, c])
         residual += float(np.square(A @ start - targets[:, c]).sum())
         least += float(np.square(A @ solution - targets[:, c]).sum())
-        steps, is_converged = max(steps, taken), is_converged and reason < 7  # 7: STEPS were too few
+        steps, is_converged = max(steps, iterations), is_converged and reason < 7  # 7: STEPS were too few
         progress("reference", c + 1, axes.shape[1], "channels")
     books = [torch.from_numpy(_project(book, axes)).float() for book in codebooks]
     facts = {
@@ -117,7 +117,8 @@ def _system(
         labels = np.full((1, camera.height, camera.width), NO_LABEL, np.int32)
         labels[0, y, x] = np.arange(len(pixels))  # a region a ray: its weights are a column of A^T
         rays = Regions.unchecked(torch.from_numpy(labels), torch.empty(len(pixels), 0))
-        part = raster.region_weights(camera, rays, params, Weighting()).matrix(raster.splats.count).astype(np.float64)
+        weights = raster.region_weights(camera, rays, params, Weighting()).matrix(raster.splats.count)
+        part = csr_array(weights, dtype=np.float64)
         readout = read_pixels(observation, camera, pixels)
         rows, taps = readout.columns.shape
         starts, book = np.arange(rows + 1) * taps, _project(observation.codebook, axes)

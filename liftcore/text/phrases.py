@@ -65,7 +65,7 @@ _NEGATION = re.compile(
     r"except|excluding|without|minus|but|not|no|non|never|neither|nor|isn't|isn\u2019t|aren't|aren\u2019t)(?=\s|$)"
 )
 _ALTERNATIVES = frozenset({"but", "rather than", "instead of"})
-_ANYTHING = frozenset({
+_UNIVERSALS = frozenset({
     "", "it", "everything", "anything", "something", "nothing", "all", "any", "every", "things", "thing", "objects",
     "stuff", "rest", "whatever", "scene", "none",
 })  # fmt: skip
@@ -121,11 +121,11 @@ def read_phrase(text: str, is_word: Callable[[str], bool] | None) -> Reading:
     before, after = _RELATIVE.sub("", typed[: negation.start()]), typed[negation.end() :]
     names, negatives = _list(before, is_name), _list(after, is_name)
     alternative = _NEGATION.search(after)
-    if before.strip() in _ANYTHING and alternative and alternative.group().strip(" ,;") in _ALTERNATIVES:
+    if before.strip() in _UNIVERSALS and alternative and alternative.group().strip(" ,;") in _ALTERNATIVES:
         names, negatives = _list(after[alternative.end() :], is_name), _list(after[: alternative.start()], is_name)
     elif alternative:  # "neither mug nor bowl", "bowl, not mug, not lamp"
         negatives = [name for piece in _NEGATION.split(after) for name in _list(piece, is_name)]
-    names = [name for name in names if _without_articles(name) not in _ANYTHING]
+    names = [name for name in names if _without_articles(name) not in _UNIVERSALS]
     if not names or not negatives or not set(names).isdisjoint(negatives):
         raise InvalidQuery(
             "text", expected="what to look for, and then what it is not", got=repr(text[:80]),
@@ -153,9 +153,9 @@ def _check(text: str, names: list[str], is_word: Callable[[str], bool] | None) -
             _refuse("numbers", text, " ".join(words[1:]))
 
 
-def _refuse(what: str, text: str, rest: str) -> None:
-    expected = f"a name, a part, a list or a negation: {what} are not understood"
-    hint = f"ask for {rest!r}" if rest not in _DETERMINERS | _ANYTHING else "ask for the thing by its name"
+def _refuse(subject: str, text: str, rest: str) -> None:
+    expected = f"a name, a part, a list or a negation: {subject} are not understood"
+    hint = f"ask for {rest!r}" if rest not in _DETERMINERS | _UNIVERSALS else "ask for the thing by its name"
     raise InvalidQuery("text", expected=expected, got=repr(text[:80]), hint=hint)
 
 

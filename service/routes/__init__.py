@@ -124,13 +124,13 @@ def get_and_post(
             def handle(**arguments: Any) -> Any:
                 return endpoint(**arguments)
 
-            known = signature(endpoint, eval_str=True)
+            own_signature = signature(endpoint, eval_str=True)
             annotation = Annotated[model, source]
             fields = [
                 field.replace(annotation=annotation) if field.name == "question" else field
-                for field in known.parameters.values()
+                for field in own_signature.parameters.values()
             ]
-            handle.__signature__ = known.replace(parameters=fields)  # pyright: ignore[reportAttributeAccessIssue]
+            handle.__signature__ = own_signature.replace(parameters=fields)  # pyright: ignore[reportAttributeAccessIssue]
             add(path, name=f"{endpoint.__name__}{suffix}", **route)(handle)
         return endpoint
 

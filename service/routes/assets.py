@@ -34,12 +34,12 @@ UPLOAD: dict[str, Any] = {
 # OpenAPI takes two templates of the same paths as one path given twice, so the parameter has one name.
 Kind = Annotated[AssetKind, PathParameter(alias="asset", description="its kind")]
 Sha256 = Annotated[str | None, Query(pattern="^[0-9a-fA-F]{64}$", description="of the content; checked if given")]
-KNOWN: dict[int | str, dict[str, Any]] = {200: {"model": Asset, "description": "It was here already"}}
+REPEATED: dict[int | str, dict[str, Any]] = {200: {"model": Asset, "description": "It was here already"}}
 
 router = APIRouter(prefix="/assets", tags=["assets"])
 
 
-@router.put("/{asset}", status_code=201, responses=KNOWN, **UPLOAD)
+@router.put("/{asset}", status_code=201, responses=REPEATED, **UPLOAD)
 async def put_asset(
     kind: Kind, request: Request, response: Response, deps: Deps, owner: Caller, sha256: Sha256 = None
 ) -> Asset:

@@ -26,7 +26,9 @@ Key = Annotated[
     ),
 ]  # fmt: skip
 LastEvent = Annotated[int, Header(alias="Last-Event-ID", ge=0, le=2**53, description="the last that the client has")]
-KNOWN: dict[int | str, dict[str, Any]] = {200: {"model": Job, "description": "The job that the same key made before"}}
+REPEATED: dict[int | str, dict[str, Any]] = {
+    200: {"model": Job, "description": "The job that the same key made before"}
+}
 FIELDS = {name: {"type": "string"} for name in ("id", "event", "data")}
 EVENTS: dict[int | str, dict[str, Any]] = {
     200: {
@@ -39,13 +41,13 @@ EVENTS: dict[int | str, dict[str, Any]] = {
 router = APIRouter(tags=["jobs"])
 
 
-@router.post("/lift", status_code=202, responses=KNOWN)
+@router.post("/lift", status_code=202, responses=REPEATED)
 def order_lift(order: LiftRequest, response: Response, deps: Deps, owner: Caller, key: Key = None) -> Job:
     """Lift features onto splats. The job is on the disk before the reply."""
     return _submit(order.job(), response, deps, owner, key)
 
 
-@router.post("/tradeoff", status_code=202, responses=KNOWN, tags=["trade-offs"])
+@router.post("/tradeoff", status_code=202, responses=REPEATED, tags=["trade-offs"])
 def order_tradeoff(order: TradeoffRequest, response: Response, deps: Deps, owner: Caller, key: Key = None) -> Job:
     """Compare quality levels and presets on a scene within a budget. The job is on the disk before the reply."""
     return _submit(order.job(), response, deps, owner, key)

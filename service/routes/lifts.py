@@ -48,7 +48,7 @@ Layer = Annotated[
     Literal["pca", "cluster", "total_weight", "confidence"],
     Query(description="of colours: principal components of features, clusters, or another through a colour map"),
 ]
-KNOWN: dict[int | str, dict[str, Any]] = {200: {"model": Lift, "description": "It was here already"}}
+REPEATED: dict[int | str, dict[str, Any]] = {200: {"model": Lift, "description": "It was here already"}}
 
 router = APIRouter(tags=["lifts"])
 
@@ -60,7 +60,7 @@ def list_lifts(deps: Deps, owner: Caller, limit: Limit = models.PAGE, cursor: Cu
     return Lifts(lifts=[Lift.of_row(row) for row in rows], next=following)
 
 
-@router.post("/lifts", status_code=201, responses=KNOWN, **UPLOAD)
+@router.post("/lifts", status_code=201, responses=REPEATED, **UPLOAD)
 async def create_lift(
     request: Request,
     response: Response,

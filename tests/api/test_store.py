@@ -122,9 +122,9 @@ def test_full_line_refuses_new_jobs_and_repeats_known_ones(store: Store) -> None
 def test_attempts_without_an_answer_end_a_job_after_the_third(store: Store) -> None:
     job, _ = store.submit(ANNA, order_of(store, ANNA))
     for attempt in range(1, MAX_ATTEMPTS + 1):
-        claimed = store.claim()
-        assert claimed is not None and claimed.attempt == attempt
-        store.end(claimed, PROBLEM, retries=True)
+        active = store.claim()
+        assert active is not None and active.attempt == attempt
+        store.end(active, PROBLEM, retries=True)
     record = store.job(ANNA, job.id)
     assert (record.state, record.attempt, store.claim()) == ("failed", MAX_ATTEMPTS, None)
     assert states_of(store, job.id) == ["queued", *["running", "queued"] * (MAX_ATTEMPTS - 1), "running", "failed"]
@@ -133,9 +133,9 @@ def test_attempts_without_an_answer_end_a_job_after_the_third(store: Store) -> N
 def test_attempts_that_the_server_ended_do_not_count(store: Store) -> None:
     job, _ = store.submit(ANNA, order_of(store, ANNA))
     for _ in range(MAX_ATTEMPTS + 2):
-        claimed = store.claim()
-        assert claimed is not None and claimed.attempt == 1
-        store.end(claimed)
+        active = store.claim()
+        assert active is not None and active.attempt == 1
+        store.end(active)
     assert store.job(ANNA, job.id).state == "queued"
 
 
@@ -146,8 +146,8 @@ def test_jobs_of_a_server_that_died_go_back_in_line(tmp_path: Path) -> None:
         store.submit(ANNA, order_of(store, ANNA))
     with closing(open_store(tmp_path)) as store:
         assert [store.job(ANNA, running.id).state, store.job(ANNA, running.id).attempt] == ["queued", 0]
-        claimed = store.claim()
-        assert claimed is not None and claimed.id == running.id
+        active = store.claim()
+        assert active is not None and active.id == running.id
         assert store.cancel(ANNA, running.id).state == "canceling"
     with closing(open_store(tmp_path)) as store:
         assert store.job(ANNA, running.id).state == "canceled"
@@ -155,9 +155,9 @@ def test_jobs_of_a_server_that_died_go_back_in_line(tmp_path: Path) -> None:
 
 def test_job_that_is_being_canceled_gets_no_result(store: Store) -> None:
     job, _ = store.submit(ANNA, order_of(store, ANNA))
-    claimed = store.claim()
-    assert claimed is not None and store.cancel(ANNA, job.id).state == "canceling"
-    finish(store, claimed)
+    active = store.claim()
+    assert active is not None and store.cancel(ANNA, job.id).state == "canceling"
+    finish(store, active)
     assert store.job(ANNA, job.id).state == "canceled"
     assert list((store.root / "lifts").iterdir()) == []
     with pytest.raises(NotFound):
@@ -302,8 +302,8 @@ class StoreMachine(RuleBasedStateMachine):
             if state in ("running", "canceling"):
                 self.states[job] = ("queued" if state == "running" else "canceled", owner, attempt - 1)
 
-    @rule(how=st.sampled_from(("finish", "fail", "lose", "release")), data=st.data())
-    def attempt(self, how: str, data: st.DataObject) -> None:
+    @rule(outcome=st.sampled_from(("finish", "fail", "lose", "release")), data=st.data())
+    def attempt(self, outcome: str, data: st.DataObject) -> None:
         job = self.store.claim()
         waiting = [name for name, (state, _, _) in self.states.items() if state == "queued"]
         assert (job is None) == (not waiting)
@@ -313,15 +313,15 @@ class StoreMachine(RuleBasedStateMachine):
         self.states[job.id] = ("running", owner, attempt + 1)
         if is_canceled := data.draw(st.booleans()):
             assert self.store.cancel(owner, job.id).state == "canceling"
-        if how == "finish":
+        if outcome == "finish":
             finish(self.store, job)
         else:
-            self.store.end(job, None if how == "release" else PROBLEM, retries=how == "lose")
+            self.store.end(job, None if outcome == "release" else PROBLEM, retries=outcome == "lose")
         later = attempt + 1
-        state = {"finish": "succeeded", "fail": "failed", "release": "queued"}.get(how)
-        if how == "lose":
+        state = {"finish": "succeeded", "fail": "failed", "release": "queued"}.get(outcome)
+        if outcome == "lose":
             state = "queued" if later < MAX_ATTEMPTS else "failed"
-        if how == "release" and not is_canceled:
+        if outcome == "release" and not is_canceled:
             later -= 1
         self.states[job.id] = ("canceled" if is_canceled else str(state), owner, later)
 

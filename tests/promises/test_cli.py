@@ -282,13 +282,6 @@ def test_plan_is_that_of_the_lift_and_said_once(scene: Path) -> None:
         assert text.count("maps of another aspect") == 1
 
 
-def test_plan_without_features_names_photos_to_encode(scene: Path) -> None:
-    document = run("plan", *sources(scene)[:2], "--json").document
-    expected = lc.plan_photos(lc.read_splats(scene / "s.ply"), lc.read_cameras(scene / "c.json"), progress=False)
-    assert document["order"] == json.loads(json.dumps(expected.facts()))["order"]
-    assert "encode first: left, middle, right" in run("plan", *sources(scene)[:2]).out
-
-
 def test_files_that_moved_are_given_by_options(scene: Path) -> None:
     """A lift knows its files by their paths; beside it they are found, elsewhere they are given."""
     folder = scene.with_name("moved")

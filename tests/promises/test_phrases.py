@@ -10,7 +10,7 @@ import pytest
 
 from tests.promises.tiny_files import photo_vectors, scene_with, write_table
 
-THINGS = ("mug", "bowl", "lamp")
+OBJECTS = ("mug", "bowl", "lamp")
 SPLATS = 20  # of each
 READ = {
     "mug": "mug", "the small red mug": "mug", "mugs": "mug", "Where is the mug?": "mug", "mug, please": "mug",
@@ -22,7 +22,7 @@ READ = {
     "the lamp, not the mug": "lamp", "lamp without bowls": "lamp", "mug and bowl except the lamp": "mug bowl",
     "not the mug but the bowl": "bowl", "bowl rather than mug": "bowl", "bowl, not mug, not lamp": "bowl",
 }  # fmt: skip
-REFUSED = {
+REFUSALS = {
     "not the mug": "what it is not", "no mug": "what it is not", "everything except the mug": "what it is not",
     "all but the mug": "what it is not", "neither mug nor bowl": "what it is not", "mug, not mug": "what it is not",
     "the bowl to the left of the mug": "ask for 'bowl'", "mug in front of the bowl": "ask for 'mug'",
@@ -36,28 +36,28 @@ REFUSED = {
 @pytest.fixture(scope="module")
 def scene() -> lc.Scene:
     """A mug, a bowl and a lamp, with vectors as of photos."""
-    return scene_with(photo_vectors(list(np.repeat(THINGS, SPLATS)), 0.25))
+    return scene_with(photo_vectors(list(np.repeat(OBJECTS, SPLATS)), 0.25))
 
 
 def things_of(answer: lc.Answer) -> str:
     """Return the things of which most splats are selected."""
-    shares = answer.selected.reshape(len(THINGS), SPLATS).mean(axis=1)
+    shares = answer.selected.reshape(len(OBJECTS), SPLATS).mean(axis=1)
     assert ((shares > 0.8) | (shares < 0.2)).all(), shares
-    return " ".join(thing for thing, share in zip(THINGS, shares, strict=True) if share > 0.5)
+    return " ".join(name for name, share in zip(OBJECTS, shares, strict=True) if share > 0.5)
 
 
 @pytest.mark.parametrize("phrase", READ)
 def test_a_phrase_selects_the_things_that_it_names(scene: lc.Scene, phrase: str) -> None:
     answer = scene.ask(phrase, encoder="lvis", places=False)
     assert things_of(answer) == READ[phrase]
-    assert phrase in THINGS or {match.text for match in answer.wording} == {phrase}
+    assert phrase in OBJECTS or {match.text for match in answer.wording} == {phrase}
 
 
-@pytest.mark.parametrize("phrase", REFUSED)
+@pytest.mark.parametrize("phrase", REFUSALS)
 def test_a_phrase_that_scores_cannot_answer_is_refused(scene: lc.Scene, phrase: str) -> None:
     with pytest.raises(lc.InvalidQuery) as refusal:
         scene.ask(phrase, encoder="lvis", places=False)
-    assert REFUSED[phrase] in str(refusal.value)
+    assert REFUSALS[phrase] in str(refusal.value)
 
 
 def test_an_answer_says_how_a_phrase_was_read(scene: lc.Scene) -> None:

@@ -135,7 +135,7 @@ ROWS: list[Row] = [
     (lc.lift_files, {"splats": "a", "cameras": "b", "features": ["c"], "settings": {}}, T, "settings"),
     (evaluate.SceneFiles, {"splats": None, "cameras": "b", "features": ()}, N, "splats"),
     (evaluate.compare_speeds, {"files": "scene.ply"}, N, "files"),
-    (evaluate.evaluate_lifts, {"dataset": "lerf", "lifts": "x", "data": "."}, N, "dataset"),
+    (evaluate.evaluate_lift, {"lift": "", "labels": "x"}, N, "lift"),
     (lc.RegionWeights.load, {"path": "nope"}, N, "weights"),
     (evaluate.inspect_file, {"path": ".", "kind": "foo"}, N, "kind"),
     (files.check_output, {"path": "new.npy", "inputs": [], "kind": "foo"}, N, "kind"),

@@ -28,7 +28,7 @@ from liftcore.scene.splats import Kernel, Splats
 from liftcore.values.lift_file import save_lift
 from liftcore.values.pack import read_features, write_pack
 from liftcore.values.settings import LiftSettings
-from liftcore.values.views import Regions
+from liftcore.values.views import Regions, ViewFeatures
 from tests.scenes import observed, random_camera, write_scene
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("every_kernel")]
@@ -168,7 +168,8 @@ def test_every_nth_view_is_lifted_from_the_first_on(tmp_path):
     assert torch.equal(got.features, two.features)
 
 
-def one_level(regions: Regions) -> Regions:
+def one_level(regions: ViewFeatures) -> Regions:
+    assert isinstance(regions, Regions)
     return Regions(regions.labels[1:2], regions.codebook)
 
 
