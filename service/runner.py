@@ -89,8 +89,9 @@ class Runner:
                 draft = scratch / OUTPUTS[job.kind]
                 settle = self._attempt(job, scratch, draft)
                 self._until_committed(settle)
-            state = self._store.job(SERVICE, job.id).state
-            if state in FINAL_STATES:
+            rows = self._store.rows("SELECT state FROM jobs WHERE id = :id", id=job.id)
+            state = rows[0]["state"] if rows else "deleted"  # by a client that was faster
+            if state in (*FINAL_STATES, "deleted"):
                 self._store.forget_work(job.id)
             log.info("job %s, attempt %d: %s after %.3f s", job.id, job.attempt, state, time.monotonic() - start)
         except Exception:

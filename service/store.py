@@ -473,7 +473,10 @@ class Store:
             retries: True if another attempt may do better, up to `MAX_ATTEMPTS`.
         """
         with self.write():
-            if self.job(SERVICE, job.id).state == "canceling":
+            state = self.job(SERVICE, job.id).state
+            if state in FINAL_STATES:  # its result was stored before something failed
+                return
+            if state == "canceling":
                 self._move(job.id, "canceled")
             elif problem is None:
                 self._move(job.id, "queued", attempt=job.attempt - 1, progress=None)

@@ -139,6 +139,15 @@ def test_attempts_that_the_server_ended_do_not_count(store: Store) -> None:
     assert store.job(ANNA, job.id).state == "queued"
 
 
+def test_job_that_has_its_result_is_not_put_back_in_line(store: Store) -> None:
+    store.submit(ANNA, order_of(store, ANNA))
+    job = store.claim()
+    assert job is not None
+    finish(store, job)
+    store.end(job)
+    assert states_of(store, job.id) == ["queued", "running", "succeeded"]
+
+
 def test_jobs_of_a_server_that_died_go_back_in_line(tmp_path: Path) -> None:
     with closing(open_store(tmp_path)) as store:
         running, _ = store.submit(ANNA, order_of(store, ANNA))
