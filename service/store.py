@@ -67,6 +67,7 @@ CREATE TABLE IF NOT EXISTS objects (
 """
 MAX_ATTEMPTS = 3  # that count against a job
 BUSY_SECONDS = 10.0  # that a write waits for another process
+RESERVE_BYTES = 1 << 20  # of a file that is given free on a full disk: a delete writes before it makes room
 JSON_COLUMNS = frozenset(
     ("counts", "warnings", "features", "settings", "parameters", "plan", "progress", "problem", "world", "metadata",
      "document", "lifts", "edit", "box")
@@ -131,6 +132,8 @@ class Store:
             self._writer = connect(self.root / DATABASE)
             self._identity = self._identify()
             self._put_back()
+            with self._room_to_delete():
+                pass
             if unnamed := self.unnamed_files():
                 log.warning("%d files have no row: splatlift store clean removes them", len(unnamed))
         except BaseException:
@@ -248,6 +251,18 @@ class Store:
             )  # fmt: skip
 
     @contextmanager
+    def _room_to_delete(self) -> Iterator[None]:
+        """Give the reserve free if the disk is full; make it again once there is room."""
+        reserve = self.root / "reserve"
+        if self.free_bytes() < RESERVE_BYTES:
+            reserve.unlink(missing_ok=True)
+        try:
+            yield
+        finally:
+            if not reserve.exists() and self.free_bytes() > 2 * RESERVE_BYTES:
+                reserve.write_bytes(bytes(RESERVE_BYTES))
+
+    @contextmanager
     def scratch(self) -> Iterator[Path]:
         """Yield a folder for drafts, which is removed with its content."""
         self.make_folders()
@@ -314,7 +329,7 @@ class Store:
             NotFound: there is none.
             Conflict: a job or a lift of theirs refers to it.
         """
-        with self._blobs_lock:
+        with self._blobs_lock, self._room_to_delete():
             record = self.asset(owner, asset)
             with self.write() as connection:
                 users = self.rows(
@@ -514,7 +529,7 @@ class Store:
             NotFound: there is none.
             Conflict: it has not ended, or it has a result and ``with_result`` is False.
         """
-        with self.write() as connection:
+        with self._room_to_delete(), self.write() as connection:
             record = self.job(owner, job)
             if record.state not in FINAL_STATES:
                 hint, got = f"POST /jobs/{job}/cancel first", f"one that is {record.state}"
