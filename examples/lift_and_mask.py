@@ -19,17 +19,17 @@ def main(splats_path: str, cameras_path: str, features_path: str, word: str, out
     cameras = lc.read_cameras(cameras_path)
     result = lc.lift(splats, cameras, lc.read_features(features_path), quality="balanced", seed=0)
     answer = result.query(word, splats=splats)
-    print(answer.explanation)
+    print(answer.threshold.explanation)
 
     masks = Path(out, "masks")
     # Share of each ray's weight on selected splats.
-    shares = lc.render(splats, cameras, answer.splats, normalise=True)
+    shares = lc.render(splats, cameras, answer.selected, normalise=True)
     for view, share in shares.items():
         picture = np.asarray(share > 0.5, dtype=np.uint8) * 255
         path = masks / f"{view}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(picture).save(path)
-    lc.write_splats(Path(out, "scores.ply"), splats, {"score": answer.scores, "selected": answer.splats})
+    lc.write_splats(Path(out, "scores.ply"), splats, {"score": answer.scores, "selected": answer.selected})
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ python examples/training_loop.py
 import math
 from collections.abc import Iterator
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -70,8 +71,8 @@ def main() -> None:
     with torch.inference_mode():  # as in evaluation; the result is the same
         result = lc.lift(splats, cameras, features())
     answer = result.query(encode(torch.tensor([[[1.0, 0.0, 0.0]]]))[0, 0])
-    red = torch.arange(400) % 2 == 0
-    correct, wrong = int((answer.splats & red).sum()), int((answer.splats & ~red).sum())
+    red = np.arange(400) % 2 == 0
+    correct, wrong = int((answer.selected & red).sum()), int((answer.selected & ~red).sum())
     print(f"{correct} of {int(red.sum())} red splats, {wrong} others")
 
 

@@ -27,7 +27,6 @@ from liftcore.lifting.operators import render as render
 from liftcore.lifting.pipeline import lift as lift
 from liftcore.lifting.pipeline import plan as plan
 from liftcore.lifting.planning.plan import Plan as Plan
-from liftcore.query.ask import VectorAnswer as VectorAnswer
 from liftcore.query.catalogue import Catalogue as Catalogue
 from liftcore.query.directions import read_example as read_example
 from liftcore.query.question import Answer as Answer

@@ -6,8 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +14,6 @@ from liftcore.errors import InvalidQuery
 from liftcore.io.json_file import finite
 from liftcore.query.candidates import candidates, parts_of
 from liftcore.query.directions import directions, part_phrase, read_query, table_of, unknown_part, wordings
-from liftcore.query.objects import objects
 from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.presence import (
     NOT_IN_WORDS,
@@ -32,7 +30,6 @@ from liftcore.query.question import (
     Answer,
     Box,
     Candidate,
-    Objects,
     Point,
     Presence,
     Query,
@@ -57,13 +54,9 @@ from liftcore.query.terms import Vector
 from liftcore.query.threshold import explain_no_selection, find_threshold
 from liftcore.runtime.cores import cores
 from liftcore.runtime.one_thread import one_thread
-from liftcore.text import TextEncoder, check_texts
+from liftcore.text import TextEncoder
 from liftcore.text.phrases import PartPhrase
 from liftcore.text.wording import Wording, base_of, normalize_text
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
 
 MOST_RIVALS = 3  # competing words in an answer
 LEAST_RIVAL = 0.1  # least share of the selected total weight to which such a word is the nearest
@@ -97,34 +90,6 @@ class PartQuery:
     part: ResolvedQuery
 
 
-@dataclass(frozen=True)
-class VectorAnswer:
-    """Answer of a lift to vectors (`query_vectors`); tensors are on the CPU, where queries run."""
-
-    scores: Tensor
-    """[P] f32 in -1..1; -1 for splats without a feature"""
-    splats: Tensor
-    """[P] bool, the selected splats (`ask`)"""
-    threshold: float
-    """on the scores"""
-    explanation: str
-    """one sentence on the threshold"""
-    clear: bool
-    """True if the selected splats are clearly separate from the others"""
-    present: bool | None
-    """True if the object is in the scene; None: not known, or not sure"""
-    presence: float | None
-    """in 0..1, present from 0.5 on"""
-    reason: str
-    """one sentence on the reason of `present`"""
-    objects: Objects | None
-    """the objects of the selected splats, with boxes; None without splats"""
-
-    def __repr__(self) -> str:
-        selection = f"{int(self.splats.sum())} of {len(self.splats)} splats at or above {self.threshold:.4g}"
-        return f"VectorAnswer({selection}, present={self.present}, clear={self.clear})"
-
-
 def ask(scene: OpenedLift, query: Query | str, encoder: TextEncoder | None = None) -> Answer:
     """Score every splat for a query and select those that answer it.
 
@@ -149,59 +114,31 @@ def ask(scene: OpenedLift, query: Query | str, encoder: TextEncoder | None = Non
     return answers(scene, [resolve_query(scene, query, encoder)])[0]
 
 
-def query_vectors(
-    scene: OpenedLift,
-    positives: Any,
-    negatives: Any = (),
-    *,
-    references: Any = None,
-    encoder: TextEncoder | str | Path | None = None,
-    grouped: bool = False,
-    **fields: Any,
-) -> VectorAnswer:
-    """Query a lift by words, or by vectors of its text space, which count as words.
+def ask_vectors(
+    scene: OpenedLift, positives: Any, negatives: Any = (), references: Any = None, **fields: Any
+) -> Answer:
+    """Answer a query of vectors of the lift's text space, which count as words.
 
     Args:
         scene: an opened lift.
-        positives: the target: a text or several, or [n, F] or [F], torch or numpy, rows of any length above zero.
-        negatives: likewise; they reduce the scores (`scores.combine`).
+        positives: the target: [n, F] or [F], torch or numpy, rows of any length above zero. negatives: likewise.
         references: [n, F], the vectors of 200 words or more, to estimate presence; None = those of the lift's text
             space, if it has some (`liftcore.query.presence`).
-        encoder: of texts and of reference words, as in `Scene.ask`. grouped: True to group the selection to objects.
         fields: of `Query`.
 
     Raises:
-        InvalidQuery: a vector of another length, of zeros or not finite; a text that the encoder cannot encode, or no
-            encoder of the lift's space; or a field that `Query` rejects.
-        Unavailable: the encoder's weights are not on this machine.
+        InvalidQuery: a vector of another length, of zeros or not finite; or a field that `Query` rejects.
     """
-    import torch
-
-    query = Query.of(_terms(positives), _terms(negatives), **fields)
-    reader = scene.encoder(encoder) if query.texts or encoder is not None else None
-    asked_as = wordings(scene, query, reader)
-    rows = directions(scene, query, reader, asked_as=asked_as)
-    if references is not None:
-        reference_words = References.of(references, scene.channels)
-    elif reader is not None:
-        reference_words = references_of(reader, scene.metadata.text_space)
-    else:
+    query = Query.of(_vectors(positives), _vectors(negatives), **fields)
+    rows = directions(scene, query, None)
+    if references is None:
         reference_words = references_of_space(rows, scene.metadata.text_space)
-    small_table = None if reader is None else small_table_of(reader)
-    answer = answers(
-        scene, [ResolvedQuery(query, rows, np.ones(len(rows), np.bool_), reference_words, asked_as, small_table)]
-    )[0]
-    scores, selected = map(torch.from_numpy, (answer.scores, answer.selected))
-    groups = objects(scene, answer) if grouped else None
-    cut, presence_fields = answer.threshold, (answer.present, answer.presence, answer.reason)
-    return VectorAnswer(scores, selected, cut.value, cut.explanation, answer.clear, *presence_fields, groups)
+    else:
+        reference_words = References.of(references, scene.channels)
+    return answers(scene, [ResolvedQuery(query, rows, np.ones(len(rows), np.bool_), reference_words, {})])[0]
 
 
-def _terms(values: Any) -> tuple[str | Vector, ...]:
-    words = (values,) if isinstance(values, str) else tuple(values) if isinstance(values, list | tuple) else ()
-    if words and all(isinstance(word, str) for word in words):
-        check_texts(words)
-        return words
+def _vectors(values: Any) -> tuple[Vector, ...]:
     try:
         if values is None:
             raise TypeError

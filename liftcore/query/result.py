@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from liftcore.errors import InvalidInput
+from liftcore.errors import InvalidInput, InvalidQuery
 from liftcore.values.lift import Lift
 from liftcore.values.lift_file import has_poses, open_lift, save_lift, tensors_of
 
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from liftcore.query.ask import VectorAnswer
     from liftcore.query.catalogue import Catalogue
+    from liftcore.query.question import Answer
     from liftcore.query.scene import Scene
     from liftcore.query.segment import Segmentation
     from liftcore.runtime.progress import Progress
@@ -64,18 +64,18 @@ class LiftResult(Lift):
         references: Any = None,
         encoder: TextEncoder | str | Path | None = None,
         **fields: Any,
-    ) -> VectorAnswer:
-        """Select the splats that answer words, or vectors of the lift's text space.
+    ) -> Answer:
+        """Select the splats that answer words, or vectors of the lift's text space, which count as words.
 
         Args:
             positives: the target: a text or several, or [n, F] or [F], torch or numpy, rows of any length above zero.
             negatives: likewise; they reduce the scores.
-            splats: that were lifted; with them the answer has objects with boxes.
-            references: [n, F], the vectors of 200 words or more, to estimate presence; None = those of the lift's
-                text space, if it has some.
-            encoder: of texts and of reference words, or the specification of one (`liftcore.open_encoder`), which is
-                opened once. None: the lift's own words (`table`), else the encoder of its text space, or its shipped
-                table if the weights are not available.
+            splats: that were lifted; with them the answer has its best splats and the box of its selection.
+            references: with vectors: [n, F], those of 200 words or more, to estimate presence; None = those of the
+                lift's text space, if it has some.
+            encoder: of texts, or the specification of one (`liftcore.open_encoder`), which is opened once. None: the
+                lift's own words (`table`), else the encoder of its text space, or its shipped table if the weights
+                are not available.
             fields: the others of `liftcore.Query`.
 
         Raises:
@@ -83,10 +83,20 @@ class LiftResult(Lift):
                 or no encoder of the lift's text space; or an unknown threshold.
             Unavailable: the encoder's weights are not on this machine.
         """
-        from liftcore.query.ask import query_vectors
+        from liftcore.query.ask import ask_vectors
+        from liftcore.query.question import Query
+        from liftcore.text import check_texts
 
-        options = {"references": references, "encoder": encoder, "grouped": splats is not None}
-        return query_vectors(self.scene(splats), positives, negatives, **options, **fields)
+        scene, words = self.scene(splats), [positives] if isinstance(positives, str) else positives
+        if not isinstance(words, list | tuple) or not words or not all(isinstance(word, str) for word in words):
+            answer = ask_vectors(scene, positives, negatives, references, **fields)
+            return answer if splats is None else scene.locate(answer)
+        if references is not None:
+            hint = "an encoder has reference words of its own"
+            raise InvalidQuery("references", expected="vectors to query", got="texts", hint=hint)
+        against = [negatives] if isinstance(negatives, str) else negatives
+        check_texts([*words, *against])
+        return scene.ask(Query.of(words, against, **fields), encoder=encoder, places=splats is not None)
 
     def segment(
         self,

@@ -323,9 +323,10 @@ def survives(result: lc.LiftResult, view: ViewFeatures) -> bool:
     if not vector.any():
         return bool(result.features.isfinite().all())
     answers = [result.query(vector, threshold=method) for method in METHODS]
-    parts = [result.features, *(answer.scores for answer in answers)]
+    parts = [result.features, *(torch.from_numpy(answer.scores) for answer in answers)]
     is_finite = all(
-        not math.isnan(answer.threshold) and not answer.splats[~result.has_feature].any() for answer in answers
+        not math.isnan(answer.threshold.value) and not answer.selected[~result.has_feature.numpy()].any()
+        for answer in answers
     )
     return is_finite and all(bool(part.isfinite().all()) for part in parts)
 

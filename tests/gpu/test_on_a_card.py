@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -69,9 +70,9 @@ def test_what_follows_a_lift_takes_it_from_the_card(paths: list[Path], tmp_path:
     splats, cameras = lc.read_splats(paths[0]), lc.read_cameras(paths[1])
     vectors = torch.from_numpy(lc.open_encoder(f"table:{paths[3]}").encode(list(WORDS)))
     answer = result.query("apple", encoder=f"table:{paths[3]}", splats=splats)
-    assert answer.splats.nonzero()[:, 0].tolist() == list(range(20))
+    assert np.flatnonzero(answer.selected).tolist() == list(range(20))
     for views in (vectors[0], vectors[0].to("cuda")):
-        assert torch.equal(result.query(views).splats, answer.splats)
+        assert np.array_equal(result.query(views).selected, answer.selected)
     assert result.segment(WORDS, vectors, splats).labels.tolist() == [number // 20 for number in range(60)]
     assert len(result.objects(splats, WORDS, vectors.to("cuda")).objects) == 3
     image = lc.render(splats, cameras["middle"], result.features, device="cuda")
@@ -113,4 +114,4 @@ def test_tensors_of_a_card_come_in(paths: list[Path]) -> None:
         assert lc.plan(splats, {"middle": corner}, {"middle": few}, device=device).views == ("middle",)
     assert result.segment(WORDS, torch.eye(3, 8).to("cuda"), splats).labels.max() >= 0
     answer = result.query(torch.eye(8)[0].to("cuda"), splats=splats)
-    assert splats.means[answer.splats].shape[1] == 3
+    assert splats.means[answer.selected].shape[1] == 3

@@ -335,7 +335,7 @@ def test_torch_modes_change_no_bit_and_hold_in_the_callers_iterator(scene, mode)
         answer = result.query(vectors, splats=splats)
         W, image = lc.region_weights(splats, cameras, views), lc.render(splats, cameras["v0"], values)
         tuples = lc.lift(splats, cameras, views, preset="row-sum").features
-        return result.features, result.total_weight, answer.scores, W.weight, image, tuples
+        return result.features, result.total_weight, torch.from_numpy(answer.scores), W.weight, image, tuples
 
     def iterator(log):
         for name, view in views.items():
@@ -366,13 +366,12 @@ def test_repr_of_every_public_value_is_one_line_with_its_size(scene):
     vectors = torch.eye(2, result.features.shape[1])
     answer, words = result.query(vectors, splats=splats, threshold=0.1), ["a" * 90, "b"]
     segmentation, catalogue = result.segment(words, vectors, splats), result.objects(splats, words, vectors)
-    sized = [splats, result, lc.region_weights(splats, cameras, views), answer, segmentation]
+    sized = [splats, result, lc.region_weights(splats, cameras, views), segmentation]
     sized += [lc.plan(splats, cameras, views)]
     long = lc.LiftSettings.of(**dict(lc.LiftSettings.of(quality="fast")))
     unsized = [cameras, cameras["v0"].replace(name="x" * 300), *views.values(), long, lc.LiftSettings.of()]
     unsized += [
-        answer.objects,
-        *(answer.objects.objects if answer.objects else ()),
+        answer,
         *segmentation.named_words,
         catalogue,
         *catalogue.objects,

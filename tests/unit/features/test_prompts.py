@@ -139,8 +139,8 @@ def test_a_lift_of_prompts_is_asked_in_its_words_alone(tmp_path: Path, capsys: p
     assert status == 2 and "nearest: red apple" in err
     assert_one_line(err)
     result = lc.load_lift(lifted)
-    assert result.query("red apple").splats.nonzero().flatten().tolist() == list(range(20))
-    assert result.query(["lamp"], ["red apple"]).splats.nonzero().flatten().tolist() == list(range(40, 60))
+    assert np.flatnonzero(result.query("red apple").selected).tolist() == list(range(20))
+    assert np.flatnonzero(result.query(["lamp"], ["red apple"]).selected).tolist() == list(range(40, 60))
     with pytest.raises(InvalidQuery, match="one of the 2 words of the lift's own words, got 'mug'"):
         result.query("mug")
 

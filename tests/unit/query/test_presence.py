@@ -159,8 +159,8 @@ def test_without_references_presence_is_not_known(clip: Scene, table: TableEncod
 def test_vectors_of_words_are_present_or_absent_too(clip: Scene, table: TableEncoder) -> None:
     cat, sofa = table.encode(["cat", "sofa"])
     assert LiftResult.of(clip.lift).query(cat).present and LiftResult.of(clip.lift).query(sofa).present is False
-    assert not LiftResult.of(clip.lift).query(sofa, splats=clip.splats).splats.any()
-    assert LiftResult.of(clip.lift).query(sofa, absent="keep").splats.any()
+    assert not LiftResult.of(clip.lift).query(sofa, splats=clip.splats).selected.any()
+    assert LiftResult.of(clip.lift).query(sofa, absent="keep").selected.any()
     rotation = np.linalg.qr(np.random.default_rng(3).normal(size=(512, 512)))[0].astype(np.float32)
     rotated = LiftResult.of(replace(clip.lift, features=clip.lift.features @ torch.from_numpy(rotation)))
     assert rotated.query(sofa @ rotation).present is None
@@ -185,7 +185,7 @@ def test_texts_are_asked_as_their_vectors_are(
     monkeypatch.setattr("liftcore.text.encoder_of_space", encoder_of_space)
     for encoder in (table, "lvis", LVIS_TABLE, None):
         answer = lift.query("cat", ["pizza"], encoder=encoder)
-        assert torch.equal(answer.scores, cat.scores) and torch.equal(answer.splats, cat.splats)
+        assert np.array_equal(answer.scores, cat.scores) and np.array_equal(answer.selected, cat.selected)
         assert (answer.present, answer.presence) == (cat.present, cat.presence)
         assert answer.reason.startswith("'cat' is there")
     assert spaces == [lift.metadata.text_space]

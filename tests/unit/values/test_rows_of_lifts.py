@@ -38,9 +38,7 @@ def test_rows_of_a_lift_are_its_columns_and_answer_as_those_of_the_whole(scene, 
         assert torch.equal(getattr(subset, name), getattr(full, name)[keep]), name
     assert len(subset) == len(splats[keep]) == int(keep.sum())
     answer = subset.query(np.eye(1, 6), splats=splats[keep], threshold=0.5)
-    np.testing.assert_array_equal(
-        answer.splats, np.asarray(full.query(np.eye(1, 6), threshold=0.5).splats)[keep.numpy()]
-    )
+    np.testing.assert_array_equal(answer.selected, full.query(np.eye(1, 6), threshold=0.5).selected[keep.numpy()])
     subset.save(tmp_path / "some.lift.safetensors")
     copy = lc.load_lift(tmp_path / "some.lift.safetensors")
     assert torch.equal(copy.features, subset.features) and copy.diagnostics["cropped_from"] == 300
@@ -68,7 +66,7 @@ def test_a_lift_moves_with_its_splats(scene) -> None:
     transformed = result.transformed(**MOVE)
     assert torch.equal(transformed.features, result.features) and transformed.metadata.poses == ""
     answer = transformed.query(np.eye(1, 6), splats=splats.transformed(**MOVE))
-    assert np.array_equal(answer.splats, result.query(np.eye(1, 6), splats=splats).splats)
+    assert np.array_equal(answer.selected, result.query(np.eye(1, 6), splats=splats).selected)
     with pytest.raises(lc.InvalidSplats, match=r"row for row, got others: .*result\.transformed"):
         transformed.query(np.eye(1, 6), splats=splats)
 
@@ -95,7 +93,7 @@ def test_splats_that_are_not_those_of_the_lift_are_refused(scene, kind: str) -> 
 def test_splats_of_a_quantised_copy_are_those_of_the_lift(scene) -> None:
     splats, _, result = scene
     rounded = replace(splats, means=(splats.means * 256).round() / 256)
-    assert result.query(np.eye(1, 6), splats=rounded).splats.shape == (300,)
+    assert result.query(np.eye(1, 6), splats=rounded).selected.shape == (300,)
 
 
 def test_lift_of_files_knows_its_splats_in_memory(tmp_path: Path) -> None:
