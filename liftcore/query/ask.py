@@ -49,7 +49,6 @@ from liftcore.query.selection import (
     objects_within,
     part_nodes,
 )
-from liftcore.query.selections import set_members
 from liftcore.query.terms import Vector
 from liftcore.query.threshold import explain_no_selection, find_threshold
 from liftcore.runtime.cores import cores
@@ -361,7 +360,7 @@ def _set_answer(scene: OpenedLift, query: Query) -> Answer:
     """Answer a query of sets: a score of one for their splats and zero for the others, also without a feature."""
     members = np.zeros(len(scene.features), np.bool_)
     for splat_set in query.splat_sets:
-        members |= set_members(scene, splat_set)
+        members |= scene.set_members(splat_set)
     label, count, scores = ", ".join(query.sets), int(members.sum()), members.astype(np.float32)
     threshold = Threshold(value=0.5, method="set", explanation=f"the splats of {label}, as they are", clear=count > 0)
     presence = Presence(present=count > 0, presence=float(count > 0), reason=f"{label} has {count} splats.")

@@ -18,7 +18,6 @@ from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.presence import references_of
 from liftcore.query.question import Query, SuggestedWord, SuggestedWords
 from liftcore.query.regions import codebook_row, regions_of
-from liftcore.query.selections import set_members
 from liftcore.query.terms import Area, Example, Region, SplatSet, SplatTerm, Term, Vector, parse_example
 from liftcore.text import CachingEncoder, TextEncoder, check_texts
 from liftcore.text.phrases import PartPhrase, part_phrases, read_phrase
@@ -265,7 +264,7 @@ def _feature(scene: OpenedLift, example: Area | SplatTerm | SplatSet | Vector) -
             raise InvalidQuery("vector", expected=f"{scene.channels} channels, as the lift has", got=str(example))
         return np.array(example.values)
     if isinstance(example, SplatSet):
-        rows = np.flatnonzero(set_members(scene, example) & scene.has_feature)
+        rows = np.flatnonzero(scene.set_members(example) & scene.has_feature)
         if not rows.size:
             raise InvalidQuery(str(example), expected="a set with splats that have a feature", got="none of them")
         return scene.mean_of(rows)

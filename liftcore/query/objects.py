@@ -117,11 +117,9 @@ def _without_leaks(
 
 def _set_numbers(scene: OpenedLift, sets: Sequence[SplatSet]) -> np.ndarray:
     """Return the index of the first set that contains a splat, [P] i32; -1 for none."""
-    from liftcore.query.selections import set_members
-
     numbers = np.full(len(scene.features), -1, np.int32)
     for place, members in reversed(list(enumerate(sets))):
-        numbers[set_members(scene, members)] = place
+        numbers[scene.set_members(members)] = place
     return numbers
 
 

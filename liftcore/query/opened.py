@@ -24,7 +24,7 @@ if TYPE_CHECKING:  # these load torch
     from torch import Tensor
 
     from liftcore.query.question import Box
-    from liftcore.query.selections import Selection
+    from liftcore.query.terms import SplatSet
     from liftcore.raster.base import Raster
     from liftcore.scene.cameras import Camera, Cameras
     from liftcore.scene.compositing import CompositingParams
@@ -85,7 +85,7 @@ class OpenedLift:
     ) -> None:
         self.device, self._world_override = device, world
         self.labelled: tuple[Any, Any] | None = None  # the last exported source and its `Labels`, for the next file
-        self.selections: dict[str, Selection] = {}  # by their names; `Scene.select` makes them
+        self.selections: dict[str, Any] = {}  # of `liftcore.query.selections` by their names
         self.node_boxes: dict[tuple[int, int], Box] = {}  # of listed nodes, by their ids and numbers of splats
         self.object_features: np.ndarray | None = None  # [N, F], of `liftcore.query.catalogue.object_features`
         self._encoders: dict[str | None, TextEncoder] = {}
@@ -305,6 +305,16 @@ class OpenedLift:
             below[:-1] |= above == number
             above = np.where(above >= 0, self.node_parents[above], -1)
         return below[self.node]  # the last entry is of splats without a node
+
+    def set_members(self, splat_set: SplatSet) -> np.ndarray:
+        """Return the splats of an object or of a selection, [P] bool; NotFound if there is none of that name."""
+        if splat_set.kind != "selection":
+            return self.members(int(splat_set.name))
+        selection = self.selections.get(splat_set.name)
+        if selection is None:
+            names = ", ".join(list(self.selections)[:20]) or "none yet"
+            raise NotFound("selection", expected=f"a selection of the scene: {names}", got=repr(splat_set.name))
+        return selection.splats
 
     def within(self, members: np.ndarray) -> Self:
         """Return a copy of the lift in which only some splats [P] bool have features, with nodes as its objects.

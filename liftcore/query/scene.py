@@ -60,6 +60,9 @@ class Scene(OpenedLift):
         InvalidSplats: other splats than were lifted (`Lift.require_splats`).
     """
 
+    selections: dict[str, Selection]
+    """selections by their names (`select`)"""
+
     def __repr__(self) -> str:
         objects = "" if self.object_views is None else f", {len(self.object_views)} objects"
         return f"Scene({len(self.features)} splats, {self.channels} channels{objects})"

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from liftcore.errors import InvalidQuery, NotFound
+from liftcore.errors import InvalidQuery
+from liftcore.query.ask import ask
 from liftcore.query.edits import Edit
 from liftcore.query.objects import MOST_SPLATS, object_box, objects
 from liftcore.query.opened import MOST_PIXELS, OpenedLift
 from liftcore.query.question import Answer, Box, Query
-from liftcore.query.terms import PixelBox, SplatSet, Stroke
+from liftcore.query.terms import PixelBox, Stroke
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.touching import REACH, spreads_along, touching_pairs
 
 if TYPE_CHECKING:
-    from liftcore.query.scene import Scene
     from liftcore.scene.cameras import Camera
 
 MOST_HISTORY = 100  # steps in the history of a selection
@@ -55,7 +55,7 @@ class Selection:
         scene: an opened lift. name: ``selection:NAME`` in queries. splats: [P] bool at the start; None: none.
     """
 
-    def __init__(self, scene: Scene, name: str, splats: np.ndarray | None = None) -> None:
+    def __init__(self, scene: OpenedLift, name: str, splats: np.ndarray | None = None) -> None:
         self._scene, self.name = scene, name
         start = np.zeros(len(scene.features), np.bool_) if splats is None else _booleans(scene, splats)
         self._steps, self._place = [Step.of({"operation": "set"}, start)], 0
@@ -101,7 +101,7 @@ class Selection:
         """
         edit, answer = _edit_of(self._scene, operation, source, fields)
         if edit.query is not None and answer is None:
-            answer = self._scene.ask(edit.query, places=False)
+            answer = ask(self._scene, edit.query, self._scene.encoder() if edit.query.texts else None)
         splats = apply_edit(self._scene, self.splats, edit, answer)
         self._steps = [*self._steps[: self._place + 1], Step.of(edit.to_json(), splats)][-MOST_HISTORY - 1 :]
         self._place = len(self._steps) - 1
@@ -118,7 +118,9 @@ class Selection:
         return self
 
 
-def _edit_of(scene: Scene, operation: str | Edit, source: Any, fields: dict[str, Any]) -> tuple[Edit, Answer | None]:
+def _edit_of(
+    scene: OpenedLift, operation: str | Edit, source: Any, fields: dict[str, Any]
+) -> tuple[Edit, Answer | None]:
     """Return an edit from Python's arguments, and the answer that is its source."""
     answer = source if isinstance(source, Answer) else None
     if isinstance(operation, Edit):
@@ -151,17 +153,6 @@ def apply_edit(scene: OpenedLift, splats: np.ndarray, edit: Edit, answer: Answer
         return ~_grow(scene, ~splats, edit.steps, splats)
     source = _source(scene, edit, answer)
     return source if edit.operation == "set" else splats | source if edit.operation == "add" else splats & ~source
-
-
-def set_members(scene: OpenedLift, members: SplatSet) -> np.ndarray:
-    """Return the splats of an object or of a selection, [P] bool; NotFound if there is none of that name."""
-    if members.kind == "selection":
-        selection = scene.selections.get(members.name)
-        if selection is None:
-            names = ", ".join(list(scene.selections)[:20]) or "none yet"
-            raise NotFound("selection", expected=f"a selection of the scene: {names}", got=repr(members.name))
-        return selection.splats
-    return scene.members(int(members.name))
 
 
 def _source(scene: OpenedLift, edit: Edit, answer: Answer | None) -> np.ndarray:
