@@ -117,7 +117,7 @@ def check_scene(
         images = find_images(photos or ())
     splats = splats if isinstance(splats, Splats) else read_splats(splats, settings.kernel)
     if not isinstance(cameras, Cameras):
-        cameras = read_cameras(cameras, views=features.views if features is not None else list(images))
+        cameras = read_cameras(cameras)
     with shown_progress(progress) as reporter:
         return _check(splats, cameras, images, features, reporter, settings.for_splats(splats))
 

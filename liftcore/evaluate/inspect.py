@@ -14,12 +14,11 @@ import torch
 from liftcore.errors import InvalidInput, InvalidSplats, InvalidTable
 from liftcore.evaluate.class_masks import describe_masks
 from liftcore.features.smoothness import some_grids, unlike_maps
-from liftcore.io.cameras import TRANSFORMS, camera_source, has_nerfstudio_beside, other_models, read_cameras
+from liftcore.io.cameras import camera_source, read_cameras
 from liftcore.io.kinds import EXPORT_PLY, SplatFormat, identify
 from liftcore.io.photo_zip import describe_photos
 from liftcore.io.ply import nearest_dialect
 from liftcore.io.splats import format_of, read_splats, splat_files
-from liftcore.io.transforms import FRAME_FILE
 from liftcore.runtime.arguments import as_path, check_choice
 from liftcore.scene.cameras import Cameras, distortion_warning
 from liftcore.scene.compositing import ALPHA_FLOOR
@@ -42,10 +41,6 @@ FAR = 1e5  # scene units; float32 resolves only a hundredth there
 TINY = 1e-7  # scene units
 LARGEST = 1e300  # replaces infinity, which JSON cannot hold
 OFF_CENTRE = 0.1  # of the image's side
-OTHER_FRAME = (
-    f"the COLMAP model was read, and beside it lies nerfstudio's {TRANSFORMS}, which is in another frame: if "
-    f"nerfstudio trained the splats, put its run's {FRAME_FILE} beside them"
-)
 MAX_NAMES = 3  # names in a warning
 FLAT = 100  # times thinner than wide, as converters store discs
 NARROW = 4  # times longer than wide, or wider: photos are not
@@ -142,19 +137,12 @@ def describe_splats(splats: Splats) -> dict[str, Any]:
 
 
 def describe_camera_file(path: Path) -> dict[str, Any]:
-    """Describe a camera file or folder, with warnings of parts that were not read.
+    """Describe a camera file or folder.
 
     Raises:
         InvalidCameras: the file is malformed.
     """
-    description, other_paths = describe_cameras(read_cameras(path)), other_models(path)
-    if other_paths:
-        description["warnings"].append(
-            f"{len(other_paths)} more COLMAP models were not read: {', '.join(other_paths[:MAX_NAMES])}"
-        )
-    if description["frame"] is None:
-        description["warnings"] += [OTHER_FRAME] if has_nerfstudio_beside(path) else []
-    return description
+    return describe_cameras(read_cameras(path))
 
 
 def describe_cameras(cameras: Cameras) -> dict[str, Any]:

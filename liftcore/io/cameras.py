@@ -1,22 +1,20 @@
 """Cameras from a folder, a JSON file or a zip: choice of its files, and their readers.
 
-A folder or zip may hold COLMAP models, a transforms.json or cameras.json, and nerfstudio's ``FRAME_FILE``, which
-has the transform to the frame of the splats. A zip is read as the folder that was zipped, under limits.
+A folder or zip may hold a COLMAP model, a transforms.json or cameras.json, and nerfstudio's ``FRAME_FILE``, which has
+the transform to the frame of the splats. A zip is read as the folder that was zipped, under limits.
 
 COLMAP writes several models (``sparse/0``, ``sparse/1``, ...) where photos do not form one connected scene, each in a
-frame of its own. The model with cameras for most views of the features is read, else the one with most images.
+frame of its own. Only the user knows which is that of the splats, so a folder of several is refused.
 """
 
 import errno
 import os
 import tempfile
 import zipfile
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
-from itertools import islice
-from pathlib import Path, PurePath, PurePosixPath
-from typing import TypeVar
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
 
 from liftcore.errors import InvalidCameras, Unavailable
 from liftcore.io.colmap import MODEL_FILES, has_model, is_whole, model_files, read_colmap, read_image_names
@@ -25,34 +23,24 @@ from liftcore.io.inria import parse_inria
 from liftcore.io.json_file import read_json
 from liftcore.io.kinds import wrong_kind
 from liftcore.io.photos import PhotosBeside
-from liftcore.io.transforms import (
-    FISHEYE,
-    FRAME_FILE,
-    OF_NERFSTUDIO,
-    is_export,
-    parse_export,
-    parse_transforms,
-    read_frame,
-)
+from liftcore.io.transforms import FRAME_FILE, is_export, parse_export, parse_transforms, read_frame
 from liftcore.runtime.arguments import as_path
 from liftcore.runtime.folders import scratch_folder
 from liftcore.scene.cameras import Cameras, cameras_from
-from liftcore.scene.distortion import Fisheye
-from liftcore.scene.views import cameras_of_views
 
 TRANSFORMS, TRAINED_ON = "transforms.json", "transforms_train.json"
 JSON_FILES = (TRANSFORMS, "cameras.json", TRAINED_ON)
 FORMATS = "a COLMAP sparse model (folder or .zip), a transforms.json or a cameras.json"
-# Places where trainers, COLMAP's reconstructor and its undistorter put models; the first that exists is read.
-MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "0", "dense/0/sparse", "dense/sparse")
-DEPTH = 4  # levels of folders that are searched for other models
-MAX_FOLDERS = 10_000  # of that search
+# Places where trainers, COLMAP's reconstructor and its undistorter put models; N is a number.
+MODEL_PLACES = (".", "sparse/N", "sparse", "colmap/sparse/N", "N", "dense/N/sparse", "dense/sparse")
 MAX_UNZIPPED_BYTES = 512 * 1024 * 1024
 MAX_ZIP_MEMBERS = 100_000
-MAX_MODELS = 8  # of a zip that are compared
-MAX_LISTED = 3  # files or models in a warning
+MAX_LISTED = 3  # models in an error
+OTHER_FRAME = (
+    f"the COLMAP model was read, and {TRANSFORMS} beside it was not: splats that nerfstudio trained are in a frame "
+    f"of their own, so put its run's {FRAME_FILE} beside them"
+)
 ONE_RUN = "zip those of one run alone"
-P = TypeVar("P", bound=PurePath)
 
 
 @dataclass(frozen=True)
@@ -62,7 +50,7 @@ class CameraSource:
     model: Path | None = None  # a folder
     file: Path | None = None  # a JSON document or a zip
     frame: Path | None = None  # a FRAME_FILE
-    data: Path | None = None  # a transforms.json or a COLMAP model, with the intrinsics of nerfstudio's camera export
+    data: Path | None = None  # a transforms.json with the intrinsics of nerfstudio's camera export
     photos: zipfile.Path | None = None  # the folder of the file within its zip; None: on the disk
     warnings: tuple[str, ...] = ()  # about files beside it that are not read
 
@@ -70,8 +58,7 @@ class CameraSource:
     def files(self) -> list[Path]:
         """All files that are read."""
         cameras = [self.file] if self.file else model_files(self.model) if self.model else []
-        data = [] if self.data is None else model_files(self.data) if self.data.is_dir() else [self.data]
-        return cameras + ([self.frame] if self.frame else []) + data
+        return [*cameras, *(path for path in (self.frame, self.data) if path is not None)]
 
     def read(self) -> Cameras:
         """Read the cameras, in the frame of the splats where ``frame`` has the transform.
@@ -105,83 +92,63 @@ class CameraSource:
         photos = PhotosBeside(self.photos or Path(os.path.abspath(self.file)).parent)
         with cameras_from(source):
             if is_export(document):
-                return parse_export(document, source, _intrinsics_in(self.data) if self.data else None, photos)
+                return parse_export(document, source, read_json(self.data) if self.data else None, photos)
             if isinstance(document, list):
                 return parse_inria(document, source)
             return parse_transforms(document, source, photos)
 
 
-def _intrinsics_in(data: Path) -> object:
-    """Read a transforms.json, or make one without poses from the intrinsics of a COLMAP model's images."""
-    if data.is_file():
-        return read_json(data)
-    frames = []
-    for name, camera in read_colmap(data).items():
-        lens = camera.lens
-        image = lens or camera
-        frame = {"file_path": name, "w": image.width, "h": image.height, "fl_x": image.fx, "fl_y": image.fy}
-        frame |= {"cx": image.cx, "cy": image.cy}
-        if lens is not None:
-            frame |= {key: value for key, value in asdict(lens.distortion).items() if value}
-            frame["camera_model"] = FISHEYE if isinstance(lens.distortion, Fisheye) else "OPENCV"
-        frames.append(frame)
-    intrinsics = [{key: value for key, value in frame.items() if key != "file_path"} for frame in frames]
-    return {"frames": frames, **(intrinsics[0] if all(entry == intrinsics[0] for entry in intrinsics) else {})}
-
-
-def read_cameras(path: Path | str, *, choosing: bool = True, views: Collection[str] = ()) -> Cameras:
+def read_cameras(path: Path | str) -> Cameras:
     """Read cameras from a folder, a JSON file or a zip, recognised by content (`camera_source`).
 
-    Args:
-        path: the folder or file.
-        choosing: refuse distorted cameras beside undistorted ones, as the caller has to choose.
-        views: names of views of features or a lift, which select one of several COLMAP models.
-
     Raises:
-        InvalidCameras: no camera format is recognised, or the content is malformed.
+        InvalidCameras: no camera format is recognised, several models are, or the content is malformed.
         Unavailable: the temporary folder has no free space for the files of a zip.
     """
     path = as_path(path)
     try:
-        return _read(path, choosing=choosing, views=views)
+        return _read(path)
     except InvalidCameras as error:
         raise wrong_kind(path, "cameras", InvalidCameras, expected=FORMATS) or error from None
 
 
-def _read(path: Path, *, choosing: bool, views: Collection[str]) -> Cameras:
-    if path.is_dir():
-        return _from_folder(path, choosing=choosing, views=views)
+def _read(path: Path) -> Cameras:
     if not path.exists():
         raise InvalidCameras(str(path), expected=FORMATS, got="no such file or folder")
+    source = camera_source(path)
+    if source.file is None:
+        if source.model is not None:
+            return source.read()
+        candidates = sorted(path.glob("transforms*.json"))
+        hint = f"name one of the files, such as {candidates[0]}" if candidates else ""
+        raise InvalidCameras(str(path), expected=FORMATS, got="a folder without any of them", hint=hint)
     try:
-        with open_regular(path) as handle:
+        with open_regular(source.file) as handle:
             start = handle.read(64).lstrip(b"\xef\xbb\xbf \t\r\n")
-        if zipfile.is_zipfile(path):
-            return _from_zip(path, camera_source(path).frame, choosing=choosing, views=views)
+        if zipfile.is_zipfile(source.file):
+            return _from_zip(source.file, source.frame)
     except OSError as error:
         got = f"a file that does not open ({error.strerror})"
         raise InvalidCameras(str(path), expected=FORMATS, got=got) from None
-    source = camera_source(path)
-    if source.model is None and start[:1] not in (b"[", b"{"):
+    if start[:1] not in (b"[", b"{"):
         got = f"a file that begins with {start[:8]!r}" if start else "an empty file"
         hint = "of a COLMAP model give the folder, or a zip of its cameras.* and images.* together"
         raise InvalidCameras(str(path), expected=FORMATS, got=got, hint=hint)
     return source.read()
 
 
-def camera_source(path: Path, views: Collection[str] = ()) -> CameraSource:
+def camera_source(path: Path) -> CameraSource:
     """Return the source of a path: in a folder a complete model, else a JSON file, else an incomplete model.
 
     A ``FRAME_FILE`` applies from the folder, from beside the file, and from a model's folder up to its scene's. Where
     there is one, a transforms.json is preferred, as nerfstudio trains on its intrinsics. nerfstudio's camera export
     is preferred to all, as it is in the frame of the splats.
 
-    Args:
-        path: the folder or file.
-        views: as `read_cameras` has them.
+    Raises:
+        InvalidCameras: the folder has several COLMAP models.
     """
     if path.is_dir():
-        return _source_in_folder(path, views)
+        return _source_in_folder(path, _frame_in(path))
     return _of_model(path.parent) if path.name in MODEL_FILES and has_model(path.parent) else _of_document(path)
 
 
@@ -190,173 +157,63 @@ def camera_files(path: Path | str) -> list[Path]:
     return camera_source(Path(path)).files
 
 
-def _source_in_folder(path: Path, views: Collection[str]) -> CameraSource:
+def _source_in_folder(path: Path, frame: Path | None) -> CameraSource:
     documents = [path / name for name in JSON_FILES if (path / name).is_file()]
     export = path / TRAINED_ON
     if export in documents and _begins_a_list(export):
         return _of_document(export, folder=path)
-    if (path / TRANSFORMS) in documents and _frame_in(path):
-        return _of_document(path / TRANSFORMS)
-    models = _usual_models(path)
+    if (path / TRANSFORMS) in documents and frame is not None:
+        return replace(_of_document(path / TRANSFORMS), frame=frame)
+    models = [model for place in MODEL_PLACES for model in _models_at(path, place) if is_whole(model)]
+    models = models[:1] if is_whole(path) else models  # what is named is read
+    if len(models) > 1:
+        raise _several_models(path, models)
     if models:
-        model, warnings = choose_model(models, path, views)
-        return replace(_of_model(model), warnings=warnings)
-    halves = [path / name for name in MODEL_FOLDERS if has_model(path / name)]
+        source = _of_model(models[0])
+        warnings = (OTHER_FRAME,) if (path / TRANSFORMS) in documents else ()
+        return replace(source, frame=source.frame or frame, warnings=warnings)
+    halves = [model for place in MODEL_PLACES for model in _models_at(path, place) if has_model(model)]
     if halves and not documents:
         return _of_model(halves[0])
-    return _of_document(documents[0], folder=path) if documents else CameraSource(frame=_frame_in(path))
+    if not documents:
+        return CameraSource(frame=frame)
+    return replace(_of_document(documents[0], folder=path), frame=frame)
 
 
-def other_models(path: Path) -> list[str]:
-    """Return the folders of COLMAP models in a folder or a zip that are of another reconstruction than the one read.
-
-    The warnings of the cameras name models of the same reconstruction (`choose_model`).
-    """
-    if path.is_dir():
-        chosen_model = camera_source(path).model
-        return (
-            []
-            if chosen_model is None
-            else [
-                str(model) for model in _models_below(path) if not _is_same_reconstruction(path / model, chosen_model)
-            ]
-        )
-    if not zipfile.is_zipfile(path):
-        return []
-    with open_zip(path) as archive:
-        first, *remaining = _complete_models(_files(archive)) or [PurePosixPath()]
-    return [str(model) for model in remaining if not _is_same_reconstruction(model, first)]
+def _models_at(scene: Path, place: str) -> list[Path]:
+    """Return the folders at one of MODEL_PLACES, in the order of their numbers."""
+    above, number, inner = place.partition("N")
+    if not number:
+        return [scene / place]
+    folder = scene / above
+    numbered = [path for path in folder.iterdir() if path.name.isdecimal()] if folder.is_dir() else []
+    return [path / inner.strip("/") for path in sorted(numbered, key=lambda path: int(path.name))]
 
 
-def choose_model(models: Sequence[Path], scene: Path, views: Collection[str]) -> tuple[Path, tuple[str, ...]]:
-    """Choose one of COLMAP's several models, and return it with a warning that names the others and their sizes.
-
-    Args:
-        models: folders, in the order of COLMAP's numbers; the first of equal ones wins.
-        scene: the folder that names are relative to.
-        views: names of views of features, which the model should have cameras for.
-    """
-    if len(models) == 1:
-        return models[0], ()
-    names: dict[Path, list[str]] = {model: [] for model in models}
-    for model in models:
-        with suppress(InvalidCameras):  # the error of the chosen model is raised when it is read
-            names[model] = read_image_names(model)
-    paired = {model: len(cameras_of_views(views, names[model])) for model in models}
-    best = max(models, key=lambda model: (paired[model], len(names[model])))
-
-    def describe_model(model: Path) -> str:
-        cameras = f", cameras of {paired[model]} of the {len(views)} views" if views else ""
-        return f"{model.relative_to(scene).as_posix()} ({len(names[model])} images{cameras})"
-
-    descriptions = [describe_model(model) for model in models if model != best]
-    suffix = f" and {len(descriptions) - MAX_LISTED} more" if len(descriptions) > MAX_LISTED else ""
-    were = "was not" if len(descriptions) == 1 else "were not"
-    frames = "COLMAP's models have a frame each, so the splats must be those of the one that was read"
-    return best, (
-        f"{describe_model(best)} was read, and {', '.join(descriptions[:MAX_LISTED])}{suffix} {were}: {frames}",
-    )
-
-
-def _better_models(model: Path, cameras: Collection[str], views: Collection[str]) -> tuple[str, ...]:
-    """Warn if another COLMAP model of the scene has cameras of more views than the one that the caller named."""
-    paired = len(cameras_of_views(views, cameras))
-    if paired == len(views):
-        return ()
-    folder = Path(os.path.abspath(model))
-    scene, alternatives = _scene_of(folder), list[str]()
-    for other in _models_below(scene)[:MAX_MODELS]:
-        if scene / other == folder:
-            continue
+def _several_models(scene: Path, models: list[Path]) -> InvalidCameras:
+    """Return the error that lists the models of a scene with their numbers of images."""
+    listing = []
+    for model in models[:MAX_LISTED]:
+        count = "not read"
         with suppress(InvalidCameras):
-            names = read_image_names(scene / other)
-            if (count := len(cameras_of_views(views, names))) > paired:
-                alternatives.append(f"{other} ({len(names)} images) has cameras of {count}")
-    if not alternatives:
-        return ()
-    name = folder.relative_to(scene).as_posix()
-    summary = f"{name} was read, and has cameras of {paired} of the {len(views)} views"
-    listing = ", ".join(alternatives[:MAX_LISTED])
-    return (f"{summary}; {listing}: the splats must be those of the one that is read",)
-
-
-def has_nerfstudio_beside(path: Path) -> bool:
-    """Return True if poses in nerfstudio's frame lie beside the COLMAP model read from a folder, file or zip."""
-    source = camera_source(path)
-    if source.model is not None:
-        candidates = (folder / TRANSFORMS for folder in _up_to_scene(source.model))
-        return any(_is_of_nerfstudio(document) for document in candidates if document.is_file())
-    if source.file is None or not zipfile.is_zipfile(source.file):
-        return False
-    with open_zip(source.file) as archive:
-        files = _files(archive)
-        return bool(_complete_models(files) and _names_matching(files, lambda name: name == TRANSFORMS))
-
-
-def _is_of_nerfstudio(document: Path) -> bool:
-    """Return True if a transforms.json parses and was written by nerfstudio's own converter."""
-    try:
-        content = read_json(document)
-    except InvalidCameras:
-        return False
-    return isinstance(content, dict) and any(key in content for key in OF_NERFSTUDIO)
-
-
-# ---- folders
-
-
-def _from_folder(folder: Path, *, choosing: bool, views: Collection[str]) -> Cameras:
-    source = camera_source(folder, views)
-    if source.model is None and source.file is None:
-        candidates = [folder / model for model in _models_below(folder)] + sorted(folder.glob("transforms*.json"))
-        hint = (
-            f"name one of the models or files, such as {' or '.join(map(str, candidates[:2]))}" if candidates else ""
-        )
-        got = "a folder without any of them" + (" at the usual places" if candidates else "")
-        raise InvalidCameras(str(folder), expected=FORMATS, got=got, hint=hint)
-    cameras = source.read()
-    if source.model is not None and not source.warnings:
-        cameras.warnings += _better_models(source.model, cameras, views)
-    if choosing and source.model is not None and cameras.distorted:
-        candidates = [folder / model for model in _models_below(folder) if folder / model != source.model]
-        straight = [str(model) for model in candidates if _is_undistorted(model)]
-        _refuse_both(str(folder), str(source.model), straight, "name the one")
-    return cameras
-
-
-def _is_undistorted(model: Path) -> bool:
-    """Return True if a folder has a valid model whose cameras are all pinholes."""
-    try:
-        return not read_colmap(model).distorted
-    except InvalidCameras:
-        return False
-
-
-def _refuse_both(source: str, distorted: str, undistorted: list[str], choose: str) -> None:
-    """Refuse the distorted model that was read if undistorted ones lie beside it: the caller must choose."""
-    if undistorted:
-        got = f"distorted ones in {distorted} and undistorted ones in {undistorted[0]}"
-        hint = f"{choose} whose photos the features were made of"
-        raise InvalidCameras(source, expected="distorted or undistorted cameras, not both", got=got, hint=hint)
+            count = f"{len(read_image_names(model))} images"
+        listing.append(f"{model.relative_to(scene).as_posix()} ({count})")
+    more = f" and {len(models) - MAX_LISTED} more" if len(models) > MAX_LISTED else ""
+    hint = f"each has a frame of its own: name the folder of the one that the splats were trained on, as {models[0]}"
+    return InvalidCameras(str(scene), expected="one COLMAP model", got=f"{', '.join(listing)}{more}", hint=hint)
 
 
 def _of_document(path: Path, folder: Path | None = None) -> CameraSource:
     """Return the source of a JSON file or zip; if the caller named its ``folder``, warn of others in it."""
     data = path.with_name(TRANSFORMS)
-    may_export = path != data and path.name.startswith("transforms") and _begins_a_list(path)
-    models = _usual_models(path.parent) if may_export and not data.is_file() else []
-    if models:
-        data = choose_model(models, path.parent, ())[0]
-    siblings = (
-        sorted(other.name for other in folder.glob("transforms*.json") if other not in (path, data)) if folder else []
-    )
-    file_name, *unread = [path.name, *siblings]
-    warning = f"{file_name} was read, and {', '.join(unread)} not: name a file to read that one" if unread else ""
+    others = sorted(folder.glob("transforms*.json")) if folder and path.name != TRANSFORMS else []
+    unread = [other.name for other in others if other not in (path, data)]
+    warning = f"{path.name} was read, and {', '.join(unread)} not: name a file to read that one"
     return CameraSource(
         file=path,
         frame=_frame_in(path.parent),
-        data=data if may_export and (models or data.is_file()) else None,
-        warnings=(warning,) if warning and file_name != TRANSFORMS else (),
+        data=data if path != data and data.is_file() and _begins_a_list(path) else None,
+        warnings=(warning,) if unread else (),
     )
 
 
@@ -367,51 +224,11 @@ def _begins_a_list(path: Path) -> bool:
     return False
 
 
-def _usual_models(scene: Path) -> list[Path]:
-    """Return the complete models at the first of the usual places that has any, in the order of their numbers."""
-    for place in MODEL_FOLDERS:
-        parts = _split_at_number(PurePosixPath(place))
-        if parts is None:
-            models = [scene / place] if is_whole(scene / place) else []
-        else:
-            above, inner = parts
-            folders = _numbered_in(scene / above) if above.parts or is_whole(scene / place) else []
-            models = [folder / inner for folder in folders if is_whole(folder / inner)]
-        if models:
-            return models
-    return []
-
-
-def _numbered_in(folder: Path) -> list[Path]:
-    """Return the folders in a folder whose names are numbers, sorted by these."""
-    inner = [path for path in folder.iterdir() if path.name.isdecimal() and path.is_dir()] if folder.is_dir() else []
-    return sorted(inner, key=lambda path: int(path.name))
-
-
-def _split_at_number(model: P) -> tuple[P, P] | None:
-    """Split the path of a numbered model into the folder of the numbers and the path below; None without a number."""
-    parts = model.parts
-    for last in (1, 2):  # sparse/0, dense/0/sparse
-        if len(parts) >= last and parts[-last].isdecimal() and (last == 1 or parts[-1] == "sparse"):
-            cut = len(parts) - last
-            return type(model)(*parts[:cut]), type(model)(*parts[cut + 1 :])
-    return None
-
-
-def _is_same_reconstruction(model: P, reference: P) -> bool:
-    """Return True if two models are equal, or of one reconstruction: their paths differ by COLMAP's number alone."""
-    return model == reference or (_split_at_number(model) or 0) == (_split_at_number(reference) or 1)
-
-
 def _of_model(model: Path) -> CameraSource:
-    frames = filter(None, map(_frame_in, _up_to_scene(model)))
-    return CameraSource(model=model, frame=next(frames, None))
-
-
-def _up_to_scene(model: Path) -> list[Path]:
-    """Return the folders from a model's up to its scene's."""
     folder = Path(os.path.abspath(model))  # links are not resolved: files beside the link count
-    return [folder, *(parent for parent in folder.parents if parent.is_relative_to(_scene_of(folder)))]
+    scene = Path(_scene_of(PurePosixPath(folder.as_posix())))
+    upwards = [folder, *(parent for parent in folder.parents if parent.is_relative_to(scene))]
+    return CameraSource(model=model, frame=next(filter(None, map(_frame_in, upwards)), None))
 
 
 def _frame_in(folder: Path) -> Path | None:
@@ -429,62 +246,24 @@ def _frame_in(folder: Path) -> Path | None:
     return None
 
 
-def _models_below(folder: Path) -> list[PurePosixPath]:
-    """Return folders with complete models below one, relative to it, in the order of ``_preference``.
-
-    Hidden folders, links and deep levels are left out, so that a folder of many scenes is searched fast.
-    """
-    names: list[str] = []
-    for parent, inner, files in islice(os.walk(folder), MAX_FOLDERS):
-        relative = Path(parent).relative_to(folder)
-        names += [(relative / name).as_posix() for name in files if name in MODEL_FILES]
-        inner[:] = [name for name in sorted(inner) if len(relative.parts) < DEPTH and not is_system_file(Path(name))]
-    return _complete_models(names)
-
-
-def _complete_models(names: Iterable[str]) -> list[PurePosixPath]:
-    """Return the folders with both files of a model among names of files, the preferred first."""
-    paths = {PurePosixPath(name) for name in names}
-    folders = {
-        path.parent
-        for path in paths
-        if path.stem == "cameras" and path.with_stem("images") in paths and path.name in MODEL_FILES
-    }
-    return sorted(folders, key=_preference)
-
-
-def _preference(model: PurePosixPath) -> tuple[bool, int, str, int, int]:
-    """Return the sort key of models: as if folders were opened as scenes one by one, the outermost first.
-
-    So the first model of a zip is the one that is read from the same files in a folder. Models in a folder
-    ``distorted`` come last: 3DGS's ``convert.py`` keeps the input of its undistortion there.
-    """
-    scene = _scene_of(model)
-    place = MODEL_FOLDERS.index(str(_at_nought(model).relative_to(scene)))
-    number = int("".join(filter(str.isdecimal, model.relative_to(scene).as_posix())) or 0)
-    return "distorted" in model.parts, len(scene.parts), str(scene), place, number
-
-
-def _scene_of(model: P) -> P:
-    """Return the outermost folder in which a model has one of the usual places; its own folder at least."""
-    places, parts = [PurePosixPath(place).parts for place in MODEL_FOLDERS], _at_nought(model).parts
-    cut = max(len(place) for place in places if parts[len(parts) - len(place) :] == place)
-    return type(model)(*model.parts[: len(model.parts) - cut])
-
-
-def _at_nought(model: P) -> P:
-    """Return the path with COLMAP's number of the model replaced by 0; a folder that is a mere number stays."""
-    above, inner = _split_at_number(model) or (None, None)
-    if above is None or inner is None or (above.name != "sparse" and not inner.parts):
-        return model
-    return above / "0" / inner
+def _scene_of(model: PurePosixPath) -> PurePosixPath:
+    """Return the outermost folder in which a model has one of MODEL_PLACES; its own folder at least."""
+    parts = [*model.parts]
+    for place in sorted(MODEL_PLACES[1:], key=len, reverse=True):
+        names = place.split("/")
+        ends = parts[len(parts) - len(names) :]
+        if len(ends) == len(names) and all(
+            end.isdecimal() if name == "N" else end == name for end, name in zip(ends, names, strict=True)
+        ):
+            return PurePosixPath(*parts[: len(parts) - len(names)])
+    return model
 
 
 # ---- zips
 
 
-def _from_zip(path: Path, frame_file: Path | None, *, choosing: bool, views: Collection[str]) -> Cameras:
-    """Read the cameras of the preferred model in a zip; with a ``FRAME_FILE`` in or beside it, a transforms.json."""
+def _from_zip(path: Path, frame_file: Path | None) -> Cameras:
+    """Read the cameras of a zip as those of the folder; ``frame_file`` lies beside the zip."""
     try:
         archive = open_zip(path)
     except BROKEN_ZIP as error:
@@ -492,61 +271,39 @@ def _from_zip(path: Path, frame_file: Path | None, *, choosing: bool, views: Col
     with archive, scratch_folder("splatlift-") as root:
         names = _unzip(archive, path, root)
         try:
-            source = _source_in_zip(names, root, path, frame_file, views)
+            source = _source_in_zip(names, root, path, frame_file)
             if source.file is not None:
                 inner = source.file.parent.relative_to(root).as_posix()
                 source = replace(source, photos=zipfile.Path(archive, "" if inner == "." else f"{inner}/"))
-            cameras = source.read()
+            return source.read()
         except InvalidCameras as error:
             argument, got, hint = (
                 text.replace(str(root), str(path)) for text in (error.argument, error.got, error.hint)
             )
             raise InvalidCameras(argument, expected=error.expected, got=got, hint=hint) from None
-        if choosing and source.model is not None and cameras.distorted:
-            model_folder = source.model.relative_to(root)
-            candidates = [model for model in _complete_models(names)[:MAX_MODELS] if root / model != source.model]
-            straight = [str(model) for model in candidates if _is_undistorted(root / model)]
-            _refuse_both(str(path), str(model_folder), straight, "zip the one alone")
-    return cameras
 
 
-def _source_in_zip(
-    names: list[str], root: Path, path: Path, frame_file: Path | None, views: Collection[str]
-) -> CameraSource:
+def _source_in_zip(names: list[str], root: Path, path: Path, frame_file: Path | None) -> CameraSource:
     """Return the source of a zip whose camera files lie unzipped in ``root``, at any depth."""
-    models, frames = _complete_models(names), _names_matching(names, lambda name: name == FRAME_FILE)
-    transforms = _names_matching(names, _is_transforms)
-    exports = [name for name in transforms if _begins_a_list(root / name)]
-    if exports:
-        return _of_document(root / _train_first(exports), folder=root / PurePosixPath(exports[0]).parent)
-    documents = [name for name in transforms if PurePosixPath(name).name == TRANSFORMS] or transforms
-    if documents and (frames or frame_file):
-        frame = root / _require_one(frames, FRAME_FILE, path) if frames else frame_file
-        return CameraSource(file=root / _require_one(documents, TRANSFORMS, path), frame=frame)
-    if not models and documents:
-        first = _train_first(documents)
-        siblings = [name for name in documents if PurePosixPath(name).parent == PurePosixPath(first).parent]
-        if len(siblings) < len(documents):
-            _require_one(documents, TRANSFORMS, path)
-        return _of_document(root / first, folder=(root / first).parent)
-    if not models:
+    files = sorted(map(PurePosixPath, names), key=lambda file: (len(file.parts), file))
+    frames = [file for file in files if file.name == FRAME_FILE]
+    models = {file.parent for file in files if file.name in MODEL_FILES and is_whole(root / file.parent)}
+    # 3DGS's convert.py keeps the input of its undistortion in a folder "distorted".
+    models = {model for model in models if "distorted" not in model.parts} or models
+    scenes = {_scene_of(model) for model in models} | {file.parent for file in files if _is_transforms(file.name)}
+    for noun, found in (("scene", sorted(map(str, scenes))), (FRAME_FILE, [str(frame) for frame in frames])):
+        if len(found) > 1:
+            raise InvalidCameras(str(path), expected=f"one {noun}", got=" and ".join(found[:2]), hint=ONE_RUN)
+    if not scenes:
         got, hint = _what_else(names)
         expected = "a COLMAP model (cameras and images, .bin or .txt) in the zip"
         raise InvalidCameras(str(path), expected=expected, got=got, hint=hint)
-    above = [name for name in frames if models[0].is_relative_to(PurePosixPath(name).parent)]
-    if frames and not above and len({_scene_of(model) for model in models}) > 1:
-        got = f"one of {PurePosixPath(frames[0]).parent} and the model {models[0]}"
-        raise InvalidCameras(str(path), expected=f"the {FRAME_FILE} of the model", got=got, hint=ONE_RUN)
-    frames = above[-1:] or frames
-    frame = root / _require_one(frames, FRAME_FILE, path) if frames else frame_file
-    parts = [root / model for model in models if _is_same_reconstruction(model, models[0])]
-    model, warnings = choose_model(parts, root, views)
-    return CameraSource(model=model, frame=frame, warnings=warnings)
-
-
-def _train_first(documents: list[str]) -> str:
-    """Return the one of several documents of cameras that trainers train on."""
-    return next((name for name in documents if PurePosixPath(name).name == TRAINED_ON), documents[0])
+    folder = root / scenes.pop()
+    source = _source_in_folder(folder, root / frames[0] if frames else frame_file)
+    if source.file is None and source.model is None:  # transforms of another name
+        documents = sorted(file for file in files if _is_transforms(file.name))
+        return replace(_of_document(root / documents[0], folder=folder), frame=source.frame)
+    return source
 
 
 def _files(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
@@ -605,25 +362,8 @@ def _unzip_one(archive: zipfile.ZipFile, member: zipfile.ZipInfo, target: Path, 
     return size
 
 
-def _names_matching(names: Iterable[str], fits: Callable[[str], bool]) -> list[str]:
-    """Return the names whose last part fits, the outermost first."""
-    matches = [name for name in names if fits(PurePosixPath(name).name)]
-    return sorted(matches, key=lambda name: (name.count("/"), name))
-
-
 def _is_transforms(name: str) -> bool:
     return name.startswith("transforms") and name.endswith(".json")
-
-
-def _require_one(matches: list[str], name: str, path: Path) -> str:
-    """Return the only one of these files.
-
-    Raises:
-        InvalidCameras: there are several.
-    """
-    if len(matches) > 1:
-        raise InvalidCameras(str(path), expected=f"one {name}", got=" and ".join(matches[:2]), hint=ONE_RUN)
-    return matches[0]
 
 
 def _what_else(names: Iterable[str]) -> tuple[str, str]:

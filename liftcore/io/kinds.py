@@ -658,9 +658,10 @@ def _folder_rules(path: Path) -> Iterator[FileKind | None]:
 def _has_cameras(path: Path) -> bool:
     from liftcore.io.cameras import camera_source  # which imports `wrong_kind`
 
-    with suppress(InvalidInput):
+    try:
         return bool(camera_source(path).files)
-    return False
+    except InvalidInput:  # several models, of which one is to be named
+        return True
 
 
 def _has_splats(path: Path) -> bool:

@@ -130,7 +130,7 @@ def parse_export(records: Any, source: str, data: Any = None, photos: PhotosBesi
         )
         if not any(key in keys for key in FOCALS):
             got = f"none of {name!r}: this is nerfstudio's camera export (ns-export cameras), which has poses alone"
-            hint = "put the transforms.json or the COLMAP model of the data that nerfstudio was trained on beside it"
+            hint = "put the transforms.json of the data that nerfstudio was trained on beside it"
             raise InvalidCameras(source, expected="intrinsics in the file or beside it", got=got, hint=hint)
         scoped.append(keys)
     views = zip(names, scoped, strict=True)

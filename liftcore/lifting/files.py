@@ -55,7 +55,7 @@ def lift_files(
         with timings.step("read"):
             sources = open_files(*paths, settings)
         with timings.step("digest"):
-            inputs = input_files(*paths, views=sources[2].views)
+            inputs = input_files(*paths)
         keywords = {"threads": threads, "on_plan": on_plan, "checkpoint": checkpoint, "engine": engine}
         result = lift(*sources, settings, progress=reporter, **keywords)
     facts = {"splats": inputs[0], "cameras": inputs[1], "features": tuple(inputs[2:])}
@@ -94,7 +94,7 @@ def open_files(
         scene = replace(scene, **base)
     settings.for_splats(scene)  # raises if they do not suit the splats, before gigabytes are read
     packs = read_features(*_pack_paths(features))
-    return scene, read_cameras(cameras, views=packs.views), packs
+    return scene, read_cameras(cameras), packs
 
 
 def _pack_paths(features: Sequence[Path | str]) -> list[Path]:

@@ -264,7 +264,5 @@ def _frame(scene: OpenedLift) -> str:
     except InvalidLift:
         return "file"
     is_transformed = cameras.frame is not None or cameras.of_nerfstudio
-    is_colmap = bool(path.name) and (
-        camera_source(path, scene.metadata.views).model is not None or zipfile.is_zipfile(path)
-    )
+    is_colmap = bool(path.name) and (camera_source(path).model is not None or zipfile.is_zipfile(path))
     return "colmap" if is_colmap and not is_transformed else "file"

@@ -419,9 +419,7 @@ class OpenedLift:
         """
         from liftcore.io.cameras import read_cameras
 
-        # Of several models the same is read as by the lift, which its digest verifies.
-        path = self._verified_input("cameras", self.metadata.cameras)
-        return read_cameras(path, choosing=False, views=self.metadata.views)
+        return read_cameras(self._verified_input("cameras", self.metadata.cameras))
 
     @cached_property
     def packs(self) -> Views:

@@ -31,7 +31,7 @@ from liftcore.io.shards import INDEX, SUFFIX, map_shards, write_shards
 from liftcore.runtime.arguments import as_path
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
     from torch import Tensor
 
@@ -226,11 +226,9 @@ def _check_tree(arrays: dict[str, np.ndarray], path: Path | str) -> None:
         raise InvalidLift(str(path), expected=expected, got="others")
 
 
-def input_files(
-    splats: Path, cameras: Path, features: Sequence[Path], views: Collection[str] = ()
-) -> list[InputFile]:
+def input_files(splats: Path, cameras: Path, features: Sequence[Path]) -> list[InputFile]:
     """Return the inputs of a lift with their digests: splats, cameras (by `camera_input`) and feature packs."""
-    return [input_file(splats), camera_input(cameras, views), *(input_file(pack) for pack in features)]
+    return [input_file(splats), camera_input(cameras), *(input_file(pack) for pack in features)]
 
 
 def input_file(path: Path) -> InputFile:
@@ -249,19 +247,19 @@ def input_file(path: Path) -> InputFile:
     return InputFile(path=str(resolved), sha256=sha256_of(resolved))
 
 
-def camera_input(path: Path, views: Collection[str] = ()) -> InputFile:
+def camera_input(path: Path) -> InputFile:
     """Return the path of cameras, and the digest of their file or, of several, of the names and digests of all read.
 
     Photos, features and lifts that lie in the same folder do not count: they may come and go.
 
     Args:
-        path: of the cameras. views: of the features, as `read_cameras` has them.
+        path: of the cameras.
     """
     from liftcore.io.cameras import camera_source
     from liftcore.values.lift import InputFile
 
     absolute = Path(os.path.abspath(path))  # links stay: other files count beside them than where they lead
-    files = camera_source(absolute, views).files
+    files = camera_source(absolute).files
     if files == [absolute]:
         return InputFile(path=str(absolute), sha256=sha256_of(absolute))
     return InputFile(
@@ -289,7 +287,7 @@ def found_input(role: str, recorded: InputFile, metadata: LiftMetadata, lift: Pa
     for place in places:
         if place.exists():
             with suppress(InvalidInput, OSError):
-                candidate = camera_input(place, metadata.views) if role == "cameras" else input_file(place)
+                candidate = camera_input(place) if role == "cameras" else input_file(place)
                 if candidate.sha256 == recorded.sha256 or (role == "cameras" and has_poses(place, metadata)):
                     return place
     return None
@@ -318,7 +316,7 @@ def has_poses(place: Path, metadata: LiftMetadata) -> bool:
     """
     from liftcore.io.cameras import read_cameras
 
-    cameras = read_cameras(place, choosing=False, views=metadata.views)
+    cameras = read_cameras(place)
     matches = [cameras[view] for view in metadata.views if view in cameras]
     if len(matches) != len(metadata.views):
         return False

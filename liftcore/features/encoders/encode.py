@@ -181,7 +181,7 @@ def encode_images(
     check_output(out, list(photos.values()), "pack")
     model = open_image_encoder(encoder, device) if isinstance(encoder, str) else encoder
     if isinstance(cameras, Path | str):
-        cameras = read_cameras(cameras, views=list(photos))
+        cameras = read_cameras(cameras)
     sizes = {} if cameras is None else photo_sizes(photos, cameras)
     file = as_path(out, "output")
     with shown_progress(progress) as reporter, writing(file):

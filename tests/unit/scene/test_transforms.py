@@ -229,19 +229,17 @@ def test_inria_cameras_are_in_the_frame_of_their_splats(run: Path, tmp_path: Pat
 def test_zip_of_several_runs_is_refused(name: str, run: Path) -> None:
     (run / "other").mkdir()
     shutil.copy(run / name, run / "other")
-    with pytest.raises(InvalidCameras, match=rf"expected one {name}, got {name} and other/{name}; zip those of one"):
+    with pytest.raises(InvalidCameras, match=r"expected one .*, got .* and other.*; zip those of one"):
         read_cameras(zipped(run))
 
 
-def test_frame_of_another_model_of_a_zip_is_refused(run: Path, model: Path, expected: Cameras) -> None:
+def test_zip_of_several_scenes_is_refused(run: Path, model: Path) -> None:
     for name in ("a", "b"):
         shutil.copytree(model, run / name / "sparse/0")
     (run / "transforms.json").unlink()
     (run / FRAME_FILE).rename(run / "b" / FRAME_FILE)
-    with pytest.raises(InvalidCameras, match=r"got one of b and the model a/sparse/0; zip those of one run alone"):
+    with pytest.raises(InvalidCameras, match=r"expected one scene, got a and b; zip those of one run alone"):
         read_cameras(zipped(run))
-    shutil.copy(run / "b" / FRAME_FILE, run / "a")
-    assert_same(read_cameras(zipped(run)), expected)
 
 
 def test_the_frame_is_reported_or_where_to_take_it_from(run: Path, model: Path) -> None:
@@ -255,12 +253,9 @@ def test_the_frame_is_reported_or_where_to_take_it_from(run: Path, model: Path) 
             [warning] = inspect_file(path)["warnings"]
             assert "--orientation-method none" in warning and f"Put its run's {FRAME_FILE} beside" in warning
     shutil.copytree(model, run / "colmap/sparse/0")
-    for path in (run, run / "colmap/sparse/0", run / "colmap/sparse/0/cameras.bin", zipped(run)):
-        assert any("the COLMAP model was read, and beside it" in text for text in inspect_file(path)["warnings"])
-    change(run / "transforms.json", ply_file_path=None)
-    for other in ((run / "transforms.json").read_text(), "[]", "{"):
-        (run / "transforms.json").write_text(other)
-        assert inspect_file(run)["warnings"] == inspect_file(run / "colmap/sparse/0")["warnings"] == []
+    for path in (run, zipped(run)):
+        assert any("the COLMAP model was read, and" in text for text in inspect_file(path)["warnings"])
+    assert inspect_file(run / "colmap/sparse/0")["warnings"] == []
 
 
 @pytest.mark.parametrize("name", ["", "transforms.json"])
@@ -449,24 +444,6 @@ def test_an_export_of_nerfstudio_has_poses_of_the_splats_and_intrinsics_of_the_d
     before = camera_input(path)
     change(run / "transforms.json", fl_x=7.0)
     assert camera_input(path).sha256 != before.sha256
-
-
-def test_an_export_of_nerfstudio_takes_intrinsics_of_the_colmap_model_beside_it(
-    run: Path, model: Path, expected: Cameras, tmp_path: Path
-) -> None:
-    shutil.copytree(model, tmp_path / "sparse/0")
-    path = exported(expected, tmp_path / "transforms_train.json")
-    for source in (path, tmp_path):
-        assert_same(read_cameras(source), expected)
-    before = camera_input(path)
-    (tmp_path / "sparse/0/images.bin").write_bytes((tmp_path / "sparse/0/images.bin").read_bytes() + b"more")
-    assert camera_input(path).sha256 != before.sha256
-
-
-def test_the_frame_of_a_run_does_not_move_its_export_again(run: Path, expected: Cameras) -> None:
-    path = exported(expected, run / "transforms_train.json")
-    for source in (path, run, zipped(run)):
-        assert_same(read_cameras(source), expected)
 
 
 def test_an_export_without_intrinsics_is_refused_as_what_it_is(run: Path, expected: Cameras, tmp_path: Path) -> None:
