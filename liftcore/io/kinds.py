@@ -11,7 +11,6 @@ import json
 import os
 import re
 import stat
-import struct
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
@@ -39,7 +38,6 @@ CAMERA_FILES = re.compile(
     r"(^|/)((cameras|images|frames|rigs)\.(bin|txt)|(dataparser_)?transforms[^/]*\.json|cameras\.json)$"
 )
 MAX_JSON_BYTES = 64 << 20  # of a document that is parsed
-MAX_LINE_BYTES = 1 << 20  # of a line that is parsed
 HEAD_BYTES = 4096  # of files recognised by their beginning
 DEPTH = 5  # folders down
 MAX_FOLDERS = 2_000
@@ -56,10 +54,8 @@ EXPORT_PLY = (
     "simple_trainer: --save-ply)"
 )
 UNPACK = "unpack it and give the splats in it"
-MAYBE_DOWNLOAD = "if it was downloaded, that went wrong: fetch the file itself"
 DOWNLOAD = "the download went wrong: fetch the file itself"
 TRAINED = "give the trained splats; the 3DGS trainers keep them in point_cloud/iteration_N/point_cloud.ply"
-OPEN_COPY = "open it where it lies, so that it is downloaded, and copy that"
 
 
 class SplatFormat(StrEnum):
@@ -129,113 +125,44 @@ _PICTURE = FileKind(None, "a picture")
 _VIDEO = FileKind(
     None, "a video", "take frames of it, reconstruct their cameras with COLMAP, and train splats on them"
 )
-_RAD = FileKind(None, "splats in Spark's .rad format", f"{NOT_CONVERTED}; or give the file that it was made of")
-_SPX = FileKind(None, "splats in Reall3D's .spx format", NOT_CONVERTED)
 _MESH = FileKind(None, "a mesh", TRAINED)
 _CLOUD = FileKind(None, "a point cloud", TRAINED)
-_UNFINISHED = FileKind(None, "a download that has not finished", "wait until it has, or fetch the file again")
-_PLACEHOLDER = FileKind(None, "a placeholder of a file that lies in a cloud", OPEN_COPY)
-_LINK = FileKind(None, "a shortcut to a file", "give the file that it leads to")
-_TABLE_OF_MATCHES = FileKind(
-    None, "a database of COLMAP or another program", "of COLMAP give the folder of the model, such as sparse/0"
+_ARCHIVE = FileKind(None, "an archive", UNPACK)
+_ARRAY = FileKind(
+    None, "a NumPy array", "of features, 'splatlift pack npy' makes a pack of a folder of them; of splats, export PLY"
 )
-
-# Of programs that find cameras, by what their files begin with.
-_CAMERA_TEXTS = {
-    "Bundler": re.compile(rb"# bundle file"),
-    "VisualSFM": re.compile(rb"nvm_v3"),
-    "Metashape": re.compile(rb"(<\?xml[^>]*>\s*)?<document[^>]*>\s*<chunk"),
-    "RealityScan": re.compile(rb"#(name|cameras)\b[^\n]*(,alt|,heading|,yaw|[0-9]\n)"),
-}
-_CAMERA_KEYS = {  # of its JSON
-    "OpenMVG": {"sfm_data_version"},
-    "Meshroom": {"views", "poses", "featuresFolders"},
-    "OpenSfM": {"cameras", "shots"},
-    "Record3D": {"K", "poses"},
-}
-_POSES = "poses_bounds.npy"  # of LLFF
 # By the bytes at a place of a file. Of two that fit the first counts.
 _MAGIC: tuple[tuple[int, bytes, FileKind], ...] = (
     (0, LFS_POINTER, FileKind(None, "a Git LFS pointer, which stands for the file", LFS_HINT)),
-    (0, b"/annex/objects/", FileKind(None, "a git-annex pointer, which stands for the file", "run 'git annex get'")),
-    (0, b"\x1f\x8b", FileKind(
-        None, "a gzip file", f"{UNPACK} (gunzip)")),
-    (0, b"7z\xbc\xaf\x27\x1c", FileKind(None, "a 7z archive", UNPACK)),
-    (0, b"Rar!\x1a\x07", FileKind(None, "a RAR archive", UNPACK)),
-    (0, b"\xfd7zXZ\x00", FileKind(None, "an xz file", UNPACK)),
-    (0, b"BZh", FileKind(None, "a bzip2 file", UNPACK)),
-    (0, b"\x28\xb5\x2f\xfd", FileKind(None, "a zstd file", UNPACK)),
-    (257, b"ustar", FileKind(None, "a tar archive", UNPACK)),
-    (0, b"\x93NUMPY", FileKind(
-        None, "a NumPy array", "of features, 'splatlift pack npy' makes a pack of a folder of them; of splats, "
-        "export PLY from the program that trained them")),
+    *((0, magic, _ARCHIVE) for magic in (
+        b"\x1f\x8b", b"7z\xbc\xaf\x27\x1c", b"Rar!\x1a\x07", b"\xfd7zXZ\x00", b"BZh", b"\x28\xb5\x2f\xfd",
+    )),
+    (257, b"ustar", _ARCHIVE),
+    (0, b"\x93NUMPY", _ARRAY),
     (0, b"glTF", _GLTF),
     (0, b"PXR-USDC", _USD),
     (0, b"#usda", _USD),
-    (0, b"RAD0", _RAD),
-    *((0, b"spx" + version, _SPX) for version in (b"\1", b"\2", b"\3")),
-    (0, b"\x89HDF\r\n\x1a\n", FileKind(None, "an HDF5 file", "save its arrays; 'splatlift pack npy' takes them")),
-    (0, b"SQLite format 3\x00", _TABLE_OF_MATCHES),
-    (0, b"BLENDER", FileKind(None, "a Blender file", TRAINED)),
-    (0, b"Kaydara FBX Binary", _MESH),
-    (0, b"LASF", _CLOUD),
-    (0, b"ASTM-E57", _CLOUD),
-    (0, b"# .PCD", _CLOUD),
-    (0, b"\xff\xd8\xff", _PICTURE),
-    (0, b"\x89PNG\r\n", _PICTURE),
-    (0, b"GIF8", _PICTURE),
-    (0, b"II*\x00", _PICTURE),
-    (0, b"MM\x00*", _PICTURE),
-    (0, b"\x76\x2f\x31\x01", _PICTURE),
-    (8, b"WEBP", _PICTURE),
-    *((8, brand, _PICTURE) for brand in (b"heic", b"heix", b"mif1", b"avif")),
+    *((0, magic, _PICTURE) for magic in (
+        b"\xff\xd8\xff", b"\x89PNG\r\n", b"GIF8", b"II*\x00", b"MM\x00*", b"\x76\x2f\x31\x01",
+    )),
+    *((8, magic, _PICTURE) for magic in (b"WEBP", b"heic", b"heix", b"mif1", b"avif")),
     (4, b"ftyp", _VIDEO),
     (0, b"\x1a\x45\xdf\xa3", _VIDEO),
     (8, b"AVI ", _VIDEO),
-    (0, b"%PDF", FileKind(None, "a PDF")),
-    (0, b"\x00\x05\x16\x07", FileKind(
-        None, "what macOS keeps beside a file", "give the file of that name without '._' before it")),
-    (0, b"L\x00\x00\x00\x01\x14\x02\x00", _LINK),
-    (0, b"book\x00\x00\x00\x00mark", _LINK),
-    (0, b"[InternetShortcut]", _LINK),
-    (0, b"bplist00", _PLACEHOLDER),
-    (0, b"!!python/object", FileKind(
-        None, "a run's config.yml of nerfstudio", "give its last nerfstudio_models/step-*.ckpt, or ns-export "
-        "gaussian-splat --load-config config.yml --output-dir OUT and give OUT/splat.ply")),
 )  # fmt: skip
 # By the suffix, if the content is ambiguous.
 _BY_SUFFIX: dict[str, FileKind] = {
     ".ksplat": FileKind(None, "splats in GaussianSplats3D's .ksplat format", CONVERT),
-    ".lcc": FileKind(None, "splats in XGRIDS's .lcc format", CONVERT),
-    ".lcc2": FileKind(None, "splats in XGRIDS's .lcc2 format", CONVERT),
-    ".psht": FileKind(None, "a project of Postshot", "export the splats from Postshot as .ply (Export Splat PLY)"),
-    ".lfsp": FileKind(None, "a project of LichtFeld Studio", "export the splats from it as .ply"),
-    ".ssproj": FileKind(
-        None,
-        "a project of SuperSplat",
-        "export the splats from SuperSplat as .ply, or unzip it: splat_0.ply is in it",
-    ),
-    ".vkgs": FileKind(None, "a project of vk_gaussian_splatting", "give the .ply, .spz or .splat that it names"),
     **dict.fromkeys((".usdz", ".usdc", ".usda", ".usd"), _USD),
-    ".rad": _RAD,
-    ".spx": _SPX,
-    ".html": _VIEWER,
-    ".htm": _VIEWER,
-    **dict.fromkeys((".obj", ".fbx", ".stl", ".mtl", ".off", ".dae", ".3ds"), _MESH),
-    **dict.fromkeys((".las", ".laz", ".e57", ".pcd", ".pts", ".ptx", ".xyz"), _CLOUD),
-    ".blend": FileKind(None, "a Blender file", TRAINED),
-    **dict.fromkeys((".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".insv", ".360"), _VIDEO),
-    **dict.fromkeys((".crdownload", ".download", ".part", ".partial"), _UNFINISHED),
-    ".icloud": _PLACEHOLDER,
-    **dict.fromkeys((".lnk", ".url", ".webloc"), _LINK),
-    ".db": _TABLE_OF_MATCHES,
+    **dict.fromkeys((".html", ".htm"), _VIEWER),
+    **dict.fromkeys((".obj", ".fbx", ".stl"), _MESH),
+    **dict.fromkeys((".las", ".laz", ".e57", ".pcd", ".xyz"), _CLOUD),
+    **dict.fromkeys((".mp4", ".mov", ".avi", ".mkv", ".webm"), _VIDEO),
     **dict.fromkeys(
         (".pkl", ".pickle"),
         FileKind(None, "a Python pickle, which may run code when it is opened", EXPORT_PLY),
     ),
-    **dict.fromkeys(
-        (".gz", ".tgz", ".bz2", ".xz", ".zst", ".tar", ".7z", ".rar"), FileKind(None, "an archive", UNPACK)
-    ),
+    **dict.fromkeys((".gz", ".tgz", ".bz2", ".xz", ".zst", ".tar", ".7z", ".rar"), _ARCHIVE),
 }
 _COLMAP_POINTS = ("points3D.bin", "points3D.txt", "frames.bin", "rigs.bin", "frames.txt", "rigs.txt")
 _TRAINERS = {  # by what lies in their folders
@@ -247,11 +174,6 @@ _CHECKPOINT = re.compile(r"(^|/)(ckpt_[0-9]+[^/]*\.pt|step-[0-9]+\.ckpt)$")
 _NO_SCENE = re.compile(r"(^|/)(points?3d|sparse_pc|input|fused|dense|mesh|poisson|meshed)[^/]*\.ply$", re.IGNORECASE)
 _OF_FEATURES = re.compile(r"(_features|_filtered|_labels)\.pt$")  # of splat-distiller, beside the checkpoint
 Fault = TypeVar("Fault", bound=InvalidInput)
-
-
-def kind_of(path: Path) -> str | None:
-    """Return the kind of a file or folder; None where it is none of those of `FileKind`, or does not open."""
-    return identify(path).kind
 
 
 def wrong_kind(
@@ -313,18 +235,11 @@ def identify(path: Path | str) -> FileKind:
             return FileKind(None, "no regular file (a device, pipe or socket)", "give the file itself")
         return _file(path)
     except FileNotFoundError:
-        if path.with_name(f".{path.name}.icloud").exists():
-            return _PLACEHOLDER
         return FileKind(None, "no such file or folder", recognised=False)
     except (OSError, ValueError) as error:
         return FileKind(
             None, f"one that does not open ({getattr(error, 'strerror', None) or error})", recognised=False
         )
-
-
-def splat_format(path: Path) -> SplatFormat | None:
-    """Return the format of splats that are read, by content; None of anything else."""
-    return identify(path).format
 
 
 # ---- files
@@ -347,7 +262,6 @@ def _file_rules(path: Path, head: bytes, size: int) -> Iterator[FileKind | None]
     yield _colmap_part(path) if path.name in (*MODEL_FILES, *_COLMAP_POINTS) else None
     yield _ply(head) if head[:4] in (b"ply\n", b"ply\r") else None
     yield _splats_as(SplatFormat.SPZ) if begins_like_spz(head) else None
-    yield _cameras_of("LLFF") if path.name == _POSES else None
     yield _zip(path) if head[:2] == b"PK" and zipfile.is_zipfile(path) else None
     damaged = FileKind(None, "a zip that is cut short or damaged", "copy or download it again")
     yield damaged if head[:4] == b"PK\3\4" else None
@@ -361,10 +275,7 @@ def _file_rules(path: Path, head: bytes, size: int) -> Iterator[FileKind | None]
     is_part = by_content is _PICTURE and meta.is_file() and _is_sog(meta)
     yield replace(_PICTURE, name="a picture of a SOG", hint=f"give {meta}") if is_part else None
     yield by_content
-    yield _BY_SUFFIX[".ksplat"] if _is_ksplat(head, size) else None
     yield _BY_SUFFIX.get(suffix)
-    zeros = FileKind(None, "a file of zeros", "a copy or download did not finish: fetch it again")
-    yield None if head.strip(b"\0") else zeros
     yield FileKind(None, f"a file that begins with {head[:8]!r}", recognised=False)
 
 
@@ -429,37 +340,18 @@ def _by_magic(head: bytes) -> FileKind | None:
     return identified
 
 
-def _is_ksplat(head: bytes, size: int) -> bool:
-    """Return whether a header of GaussianSplats3D's format fits: version 0.1, sections and splats within maxima."""
-    if len(head) < HEAD_BYTES or head[:2] != b"\0\1":
-        return False
-    most_sections, sections, most_splats, splats, level = struct.unpack_from("<4IH", head, 4)
-    return 0 < sections <= most_sections and 0 < splats <= most_splats and level <= 2 and splats < size
-
-
-def _cameras_of(program: str) -> FileKind:
-    hint = "export a COLMAP model from it, or a transforms.json, of the cameras that the splats were trained on"
-    return FileKind(None, f"cameras of {program}", hint)
-
-
 def _by_text(path: Path, head: bytes, size: int) -> FileKind | None:
     """Return the kind of a text: JSON, a page, a mesh, COLMAP's text, or a server's error."""
     start = head[:HEAD_BYTES].lstrip(b"\xef\xbb\xbf \t\r\n")
     lower, suffix = start.lower(), path.suffix.lower()
     if start[:1] in (b"{", b"["):
         return _json(path, size)
-    for program, beginning in _CAMERA_TEXTS.items():
-        if beginning.match(lower):
-            return _cameras_of(program)
     if lower.startswith((b"<!doctype html", b"<html", b"<head", b"<!--")):
         is_viewer = suffix in (".html", ".htm") or (size > HEAD_BYTES and b"splat" in head.lower())
         return _VIEWER if is_viewer else _WEB_PAGE
-    if lower.startswith((b"solid ", b"mtllib ", b"o ", b"v ", b"off\n", b"# blender")):
-        return _MESH
     if re.match(rb"#[^\n]*list with one line of data per", lower):
         return _colmap_part(path)
-    is_answer = size < HEAD_BYTES and suffix not in (*_BY_SUFFIX, ".txt", ".yml", ".yaml", ".md", ".csv")
-    return FileKind(None, f"a text that begins with {_shorten(start)}", MAYBE_DOWNLOAD) if is_answer else None
+    return None
 
 
 def _colmap_part(path: Path) -> FileKind:
@@ -471,11 +363,6 @@ def _is_text(head: bytes) -> bool:
     return not any(byte < 9 or 13 < byte < 32 for byte in head[:HEAD_BYTES])
 
 
-def _shorten(start: bytes) -> str:
-    text = " ".join(start[: 4 * TEXT_SHOWN].decode("utf-8", "replace").split())
-    return repr(text[:TEXT_SHOWN])
-
-
 def _json(path: Path, size: int) -> FileKind:
     if size > MAX_JSON_BYTES:
         return FileKind(None, f"a JSON file of {size} bytes", recognised=False)
@@ -483,18 +370,8 @@ def _json(path: Path, size: int) -> FileKind:
         with open_regular(path) as handle:
             document = json.loads(handle.read(MAX_JSON_BYTES))
     except (ValueError, RecursionError, MemoryError):
-        return _json_lines(path) or FileKind("cameras", "JSON that does not parse", recognised=False)
+        return FileKind("cameras", "JSON that does not parse", recognised=False)
     return _document(document, path)
-
-
-def _json_lines(path: Path) -> FileKind | None:
-    """Return the kind of a text of which each line is JSON; None where the first two are not."""
-    with suppress(ValueError, RecursionError, OSError), open_regular(path) as handle:
-        first, _ = (json.loads(handle.readline(MAX_LINE_BYTES)) for _ in range(2))
-        if isinstance(first, dict) and first.keys() >= {"format", "made_by"}:  # `liftcore.io.labels`
-            return FileKind(None, "the objects of a lift, one a line (JSON Lines)", "give the lift that they are of")
-        return FileKind(None, "JSON Lines, a document a line", "give a file of one JSON document")
-    return None
 
 
 def _document(document: Any, path: Path) -> FileKind:
@@ -510,7 +387,6 @@ def _list_rules(document: list[Any]) -> Iterator[FileKind | None]:
     first = document[0] if document and isinstance(document[0], dict) else {}
     is_cameras = not document or first.keys() & {"img_name", "transform", "file_path"}
     yield FileKind("cameras", "cameras") if is_cameras else None
-    yield _cameras_of("OpenSfM") if _CAMERA_KEYS["OpenSfM"] <= first.keys() else None
     hint = "'splatlift pack masks' or 'splatlift pack prompts' makes a feature pack of its folder"
     yield FileKind(None, "masks as JSON", hint) if "segmentation" in first else None
     yield FileKind(None, "a JSON list of something else", recognised=False)
@@ -520,12 +396,7 @@ def _object_rules(document: dict[str, Any], path: Path) -> Iterator[FileKind | N
     keys = document.keys()
     yield _splats_as(SplatFormat.SOG) if is_sog_document(document) else None
     yield _STREAMED if keys >= {"tree", "filenames"} else None
-    frames = document.get("frames")
-    first = frames[0] if isinstance(frames, list) and frames and isinstance(frames[0], dict) else {}
-    yield _cameras_of("sdfstudio") if {"rgb_path", "camtoworld"} <= first.keys() else None
     yield FileKind("cameras", "cameras") if "frames" in keys else None
-    program = next((name for name, required in _CAMERA_KEYS.items() if required <= keys), None)
-    yield _cameras_of(program) if program else None
     frame = FileKind(None, f"the frame of a nerfstudio run ({FRAME_FILE})", "give the cameras that it belongs to")
     yield frame if keys >= {"transform", "scale"} else None
     is_gltf = "asset" in keys and keys & {"buffers", "accessors", "scenes", "meshes"}
@@ -533,11 +404,6 @@ def _object_rules(document: dict[str, Any], path: Path) -> Iterator[FileKind | N
     yield (_splats_as(SplatFormat.GLTF) if has_splats else _GLTF) if is_gltf else None
     hint = "'splatlift pack prompts' makes a feature pack of its folder"
     yield FileKind(None, "masks as JSON (COCO)", hint) if keys >= {"annotations", "images"} else None
-    is_project = keys >= {"splats", "camera"} or keys >= {"view", "poseSets"} or keys >= {"timeline", "version"}
-    yield replace(_BY_SUFFIX[".ssproj"], name="the document of a SuperSplat project") if is_project else None
-    is_viewer = keys >= {"camera", "background"} or "postEffectSettings" in keys
-    hint = "give the splats that it shows, as .ply or .sog"
-    yield FileKind(None, "settings of a SuperSplat viewer", hint) if is_viewer else None
     yield _BY_SUFFIX.get(path.suffix.lower())
     is_answer = len(keys) <= 6 and keys & {"error", "errors", "detail", "message", "Message"}
     yield FileKind(None, f"an answer of a server ({str(document)[:TEXT_SHOWN]!r})", DOWNLOAD) if is_answer else None
@@ -584,7 +450,6 @@ def _of_names_in_zip(names: list[str], head_of: Callable[[str], bytes]) -> Itera
     yield _USD if names[0].lower().endswith((".usd", ".usda", ".usdc")) else None
     hint = "save each as .npy; 'splatlift pack npy' makes a feature pack of them"
     yield FileKind(None, "NumPy arrays (.npz)", hint) if suffixes == {".npy"} else None
-    yield _BY_SUFFIX[".ssproj"] if "document.json" in lasts and ".ply" in suffixes else None
     splats = _splat_files(names, lambda name: _begins_with_splats(head_of(name)))
     is_cameras = any(CAMERA_FILES.search(name.replace("\\", "/")) for name in names)
     yield FileKind("cameras", "a zip of cameras", splats=splats) if is_cameras else None
@@ -711,7 +576,7 @@ def page_table() -> dict[str, Any]:
 
 __all__ = [
     "CONVERT", "EXPORT_PLY", "PICKLED", "SPLATS_SENT", "SUFFIX", "TRAINED", "FileKind", "SplatFormat", "identify",
-    "keys_of", "kind_of", "page_table", "splat_format", "wrong_kind",
+    "keys_of", "page_table", "wrong_kind",
 ]  # fmt: skip
 
 if __name__ == "__main__":  # run by `make web` to build the page
