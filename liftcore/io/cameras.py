@@ -291,9 +291,9 @@ def _source_in_zip(names: list[str], root: Path, path: Path, frame_file: Path | 
     # 3DGS's convert.py keeps the input of its undistortion in a folder "distorted".
     models = {model for model in models if "distorted" not in model.parts} or models
     scenes = {_scene_of(model) for model in models} | {file.parent for file in files if _is_transforms(file.name)}
-    for noun, found in (("scene", sorted(map(str, scenes))), (FRAME_FILE, [str(frame) for frame in frames])):
-        if len(found) > 1:
-            raise InvalidCameras(str(path), expected=f"one {noun}", got=" and ".join(found[:2]), hint=ONE_RUN)
+    for noun, places in (("scene", sorted(map(str, scenes))), (FRAME_FILE, [str(frame) for frame in frames])):
+        if len(places) > 1:
+            raise InvalidCameras(str(path), expected=f"one {noun}", got=" and ".join(places[:2]), hint=ONE_RUN)
     if not scenes:
         got, hint = _what_else(names)
         expected = "a COLMAP model (cameras and images, .bin or .txt) in the zip"
