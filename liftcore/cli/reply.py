@@ -56,7 +56,8 @@ def check_outputs(
     if len({path.absolute() for path in files.values()}) < len(files):
         option_names = " and ".join(f"--{name.replace('_', '-')}" for name in files)
         raise InvalidInput(option_names, expected="different files", got="the same file twice")
-    inputs = [path for name in INPUTS for path in paths_of(getattr(options, name, None))]
+    paths = [(name, path) for name in INPUTS for path in paths_of(getattr(options, name, None))]
+    inputs = [path for name, path in paths if name.startswith("camera") or path.is_file()]  # no other folder
     if files and scene is not None:
         metadata = scene.metadata
         inputs += [Path(file.path) for file in (metadata.splats, metadata.cameras, *metadata.features)]
