@@ -485,6 +485,7 @@ def test_tradeoff_compares_within_its_budget_and_saves(scene: Path) -> None:
     words = ["tradeoff", *sources(scene), "--budget", "0.1", "--threads", 1, "-o", out]
     document = run(*words, "--json").document
     (exact,) = document["runs"]
+    assert document["budget_s"] == 0.1
     assert (exact["name"], exact["views"]) == ("exact", 2) and exact["cosine"] == pytest.approx(1)
     assert not document["choice"]["recommended"] and "exact alone fitted" in document["choice"]["why"]
     assert document["over_budget"] and document["files"] == [
