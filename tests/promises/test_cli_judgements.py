@@ -79,8 +79,6 @@ CAUSES: dict[str, tuple[Change, str]] = {  # change of the photos -> the cause t
     "on their side": (np.rot90, "lie on their side"),
     "turned": (lambda image: image[::-1, ::-1], "photos and cameras are turned to each other"),
     "mirrored": (lambda image: image[:, ::-1], "mirrored left to right"),
-    "shifted": (lambda image: np.roll(image, (-9, 14), axis=(0, 1)), "principal points"),
-    "darker": (lambda image: image // 4, "another exposure"),
 }
 
 
