@@ -57,10 +57,10 @@ def _lines(report: CheckReport, document: dict, verbose: bool) -> Iterable[str]:
             yield f"  {view.view}: row sums {view.row_sum:.3f}{photo_match}{other_match}"
         yield f"  {report.in_view:.1%} of the splats are in some view"
         yield from (f"  features, {name.replace('_', ' ')}: {value:.3f}" for name, value in report.features.items())
-    compared = [view for view in report.views if view.psnr is not None]
-    if compared:
-        worst = min(compared, key=lambda view: view.psnr or 0.0)
-        typical = median(view.psnr for view in compared if view.psnr is not None)
+    photo_views = [view for view in report.views if view.psnr is not None]
+    if photo_views:
+        worst = min(photo_views, key=lambda view: view.psnr or 0.0)
+        typical = median(view.psnr for view in photo_views if view.psnr is not None)
         yield f"renders are {typical:.1f} dB from their photos in the median, {worst.psnr:.1f} in {worst.view}"
     yield from (f"note: {text}" for text in report.notes)
     yield from (f"wrong: {text}" for text in report.wrong)

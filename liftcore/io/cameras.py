@@ -186,8 +186,8 @@ def _models_at(scene: Path, place: str) -> list[Path]:
     if not number:
         return [scene / place]
     folder = scene / above
-    numbered = [path for path in folder.iterdir() if path.name.isdecimal()] if folder.is_dir() else []
-    return [path / inner.strip("/") for path in sorted(numbered, key=lambda path: int(path.name))]
+    folders = [path for path in folder.iterdir() if path.name.isdecimal()] if folder.is_dir() else []
+    return [path / inner.strip("/") for path in sorted(folders, key=lambda path: int(path.name))]
 
 
 def _several_models(scene: Path, models: list[Path]) -> InvalidCameras:
@@ -198,16 +198,16 @@ def _several_models(scene: Path, models: list[Path]) -> InvalidCameras:
         with suppress(InvalidCameras):
             count = f"{len(read_image_names(model))} images"
         listing.append(f"{model.relative_to(scene).as_posix()} ({count})")
-    more = f" and {len(models) - MAX_LISTED} more" if len(models) > MAX_LISTED else ""
+    rest = f" and {len(models) - MAX_LISTED} more" if len(models) > MAX_LISTED else ""
     hint = f"each has a frame of its own: name the folder of the one that the splats were trained on, as {models[0]}"
-    return InvalidCameras(str(scene), expected="one COLMAP model", got=f"{', '.join(listing)}{more}", hint=hint)
+    return InvalidCameras(str(scene), expected="one COLMAP model", got=f"{', '.join(listing)}{rest}", hint=hint)
 
 
 def _of_document(path: Path, folder: Path | None = None) -> CameraSource:
-    """Return the source of a JSON file or zip; if the caller named its ``folder``, warn of others in it."""
+    """Return the source of a JSON file or zip; if the caller named its ``folder``, warn of documents in it."""
     data = path.with_name(TRANSFORMS)
-    others = sorted(folder.glob("transforms*.json")) if folder and path.name != TRANSFORMS else []
-    unread = [other.name for other in others if other not in (path, data)]
+    documents = sorted(folder.glob("transforms*.json")) if folder and path.name != TRANSFORMS else []
+    unread = [other.name for other in documents if other not in (path, data)]
     warning = f"{path.name} was read, and {', '.join(unread)} not: name a file to read that one"
     return CameraSource(
         file=path,
