@@ -55,7 +55,7 @@ def lift_and_ask(lc: Any, folder: Path) -> None:
     assert answer.count == 20, answer.count
     assert scene.render("middle", "rgb").max() > 0
     assert scene.mask(answer, "middle").any()
-    for name in ("apple.ply", "apple.glb", "apple.spz", "apple.zip"):
+    for name in ("apple.ply", "apple.glb", "apple.spz"):
         scene.export(folder / name, answer)
     assert lc.read_splats(folder / "apple.glb").count == answer.count
     check_replacing(lc, folder)

@@ -8,6 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -37,10 +38,11 @@ def running() -> list[int]:
     """Return the ids of child processes of this one that run service.process or service.query_worker."""
     ids = []
     for task in Path("/proc/self/task").iterdir():
-        for child in (task / "children").read_text().split():
-            command = Path(f"/proc/{child}/cmdline").read_bytes()
-            if b"service.process" in command or b"service.query_worker" in command:
-                ids.append(int(child))
+        with suppress(FileNotFoundError, ProcessLookupError):  # a thread or a child that ends meanwhile
+            for child in (task / "children").read_text().split():
+                command = Path(f"/proc/{child}/cmdline").read_bytes()
+                if b"service.process" in command or b"service.query_worker" in command:
+                    ids.append(int(child))
     return ids
 
 

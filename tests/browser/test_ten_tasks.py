@@ -22,7 +22,7 @@ from .looking import AMBER, FIND_COLOUR, READY, ask, columns, splat_at, text_of
 
 pytestmark = pytest.mark.slow
 APPLE = 5  # a splat of it
-SAVE_ZIP = "splatlift.exporter.saveZip(true).then(() => document.querySelector('#toast').textContent)"
+SAVE_OBJECTS = "splatlift.exporter.saveLabels(true).then(() => document.querySelector('#toast').textContent)"
 BOTH_SETTLED = "splatlift.comparison.scene && splatlift.comparison.left.settled && splatlift.viewer.settled"
 
 
@@ -82,7 +82,7 @@ def test_ten_tasks_are_done_without_a_manual(
     page.write("#hand .name", "lamp and a bit")  # rename it
     page.key("Enter")
     page.until("splatlift.objects.selections[0]?.name === 'lamp and a bit'")
-    assert page.value(SAVE_ZIP) == "The ZIP is saved."  # export all with names
+    assert page.value(SAVE_OBJECTS) == "The file is saved."  # export all with names
     page.press("#hand button[title='Ctrl+Z']")  # undo
     page.until(f"splatlift.editor.selection.step === 0 && !splatlift.editor.isBusy && {FIND_COLOUR}")
     assert page.value("splatlift.query.current.count") == 20

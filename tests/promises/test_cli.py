@@ -154,6 +154,7 @@ def test_stopped_lift_leaves_no_half_and_goes_on(tmp_path: Path) -> None:
     words = ["lift", *files, "-o", lift, "--preset", "row-sum", "--checkpoint", checkpoint]
     command = [sys.executable, "-m", "liftcore.cli", *map(str, words)]
     for number, status in ((signal.SIGINT, cli.INTERRUPTED), (signal.SIGKILL, -signal.SIGKILL)):
+        lift.unlink(missing_ok=True)  # of one that ended before its signal
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         until(lambda process=process: process.poll() is not None or any(checkpoint.glob("*")))
         process.send_signal(number)

@@ -127,7 +127,6 @@ ROWS: list[Row] = [
     (lc.pack_folder, {"folder": ".", "out": "x", "kind": "npy", "unlabelled": 3}, N, "unlabelled"),
     (lc.pack_folder, {"folder": ".", "out": "x", "kind": "npy", "normalised": "maybe"}, N, "normalised"),
     (lc.pack_folder, {"folder": ".", "out": "x", "kind": "prompts", "text_space": "x"}, N, "text_space"),
-    (lc.pack_folder, {"folder": ".", "out": "x", "kind": "prompts", "names": "nope"}, N, "names"),
     (lc.pack_folder, {"folder": ".", "out": "x", "kind": "masks", "photos": "."}, N, "encoder"),
     (lc.encode_images, {"images": [], "out": "x", "encoder": "timm:resnet18"}, N, "images"),
     (lc.retag_pack, {"pack": "nope", "out": "x", "names": {"foo": "x"}}, N, "names"),

@@ -133,7 +133,7 @@ def test_a_model_that_comes_later_changes_no_lift(tmp_path: Path) -> None:
                 lift_files(splats, scene, [features], LiftSettings.of(preset="row-sum")),
                 tmp_path / "made.safetensors",
             )
-    with pytest.raises(InvalidCameras, match="not both"):
+    with pytest.raises(InvalidCameras, match="one COLMAP model"):
         read_cameras(scene)
     lift_scene = Scene(tmp_path / "made.safetensors")
     assert lift_scene.cameras.distorted == tuple(VIEWS)

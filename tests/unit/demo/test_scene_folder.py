@@ -13,6 +13,7 @@ from safetensors.numpy import save_file as save_arrays
 from safetensors.torch import save_file
 
 from liftcore.errors import InvalidInput
+from liftcore.text import BUILT_IN
 from service.commands.demo import find_scene
 
 
@@ -24,7 +25,11 @@ def folder(tmp_path: Path) -> Path:
     for name in ("cameras.bin", "images.bin"):
         (scene / "sparse" / "0" / name).write_bytes(b"model")
     save_file({"words": torch.ones(1)}, str(scene / "a.safetensors"))
-    save_file({"v/grid": torch.ones(1, 1, 2)}, str(scene / "grids.safetensors"), metadata={"text_space": "other"})
+    save_file(
+        {"v/grid": torch.ones(1, 1, 2)},
+        str(scene / "grids.safetensors"),
+        metadata={"text_space": next(iter(BUILT_IN.values()))},
+    )
     objects = [{"class": name} for name in ("cat", "boat", "cow", "fish")]
     (scene / "truth.json").write_text(json.dumps({"objects": objects}))
     save_arrays({"v/mask": np.array([[0, -1, 3]], np.int16)}, str(scene / "truth.safetensors"))

@@ -255,7 +255,7 @@ def test_other_engines_go_on_from_the_pieces_of_each_stage(scene: dict[str, Any]
     ("overrides", "got"),
     [
         ({"aggregation": True}, "aggregation=True"),
-        ({"smoothness": 2}, "smoothness=2"),
+        ({"smoothness": 2.0}, "smoothness=2.0"),
         ({"reference_channels": 1}, "reference_channels=1"),
     ],
 )

@@ -285,7 +285,7 @@ def test_threshold_of_examples_is_above_a_least_likeness(scene: Scene) -> None:
     by_example = ask(lifted, Query.of((SplatTerm(0),)))
     assert np.flatnonzero(by_example.selected).tolist() == list(range(10))
     assert by_example.threshold.value > 0.4 and find_threshold(by_example.scores).value < 0.0
-    in_words = ask(lifted, Query.of(("x", "y")), Axes())
+    in_words = ask(lifted, Query.of(("x",)), Axes())
     assert in_words.threshold.value == find_threshold(in_words.scores).value
     combined = ask(lifted, Query.of((SplatTerm(0), "x")), Axes())
     assert combined.threshold.value == find_threshold(combined.scores).value

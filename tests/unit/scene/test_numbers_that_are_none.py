@@ -61,7 +61,7 @@ def test_no_ray_meets_a_splat_that_is_no_number(kernel: Kernel) -> None:
         np.testing.assert_allclose(images.numpy().reshape(len(images), -1).T, dense_weights, atol=1e-5)
     cameras = {f"v{number}": random_camera(number, name=f"v{number}") for number in range(3)}
     views = {name: observed(number, 0) for number, name in enumerate(cameras)}
-    for preset in ("default", "mean"):
+    for preset in ("default", "row-sum"):
         result, expected = (lc.lift(scene, cameras, views, preset, device="cpu") for scene in (splats, valid_splats))
         assert not result.has_feature[~VALID_ROWS].any() and not result.features[~VALID_ROWS].any()
         assert torch.equal(result.features[VALID_ROWS], expected.features)
