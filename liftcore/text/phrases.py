@@ -240,10 +240,13 @@ def heads(text: str) -> Iterator[str]:
     name = name[: qualifier.start()] if (qualifier := _QUALIFIER.search(name)) else name
     left, _, right = name.partition(" of ")
     owner = next((word.removesuffix("'s") for word in name.split() if word.endswith("'s")), "")
-    noun = right if right and left.split()[-1] in _PARTITIVES else left
-    words = [word.strip(PUNCTUATION) for word in noun.split()]
-    while len(words) > 1 and words[-1] in _PARTITIVES:
-        words.pop()
-    for first in range(max(0, len(words) - _HEAD_WORDS), len(words)):
-        yield " ".join(words[first:])
+    sides = [right if right and left.split()[-1] in _PARTITIVES else left]
+    if right.split(" ")[0] in _DETERMINERS:  # the object of a part that may have no word
+        sides.append(right)
+    for side in sides:
+        words = [word.strip(PUNCTUATION) for word in side.split()]
+        while len(words) > 1 and words[-1] in _PARTITIVES:
+            words.pop()
+        for first in range(max(0, len(words) - _HEAD_WORDS), len(words)):
+            yield " ".join(words[first:])
     yield from filter(None, [owner])
