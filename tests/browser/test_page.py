@@ -362,7 +362,8 @@ def test_everything_is_named_and_one_word_is_seen_alone(page: Browser) -> None:
     assert text_of(page, "#what-words li").startswith("apple") and page.value(EXAMPLES) == []
     assert "named=*" in page.value("location.search") and "only=lamp" in page.value("location.search")
     page.open(page.value("location.href"))  # the link tells all of it
-    page.until("splatlift.labels.isShown && splatlift.labels.selectedValues.size === 1")
+    is_restored = "splatlift.labels.isShown && splatlift.labels.selectedValues.size === 1 && splatlift.viewer.settled"
+    page.until(f"{is_restored} && document.querySelectorAll('#legend button').length === 3")
     page.value("document.querySelector('#vocabulary').value = 'own'")
     page.value("document.querySelector('#vocabulary').dispatchEvent(new Event('change'))")
     page.write("#own-words", "lamp, book")

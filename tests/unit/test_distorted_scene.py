@@ -130,7 +130,7 @@ def test_a_model_that_comes_later_changes_no_lift(tmp_path: Path) -> None:
         (folder / "images.txt").write_text(lines[0])
         if place == "sparse/0":
             save_lift(
-                lift_files(splats, scene, [features], LiftSettings.of(preset="row-sum")),
+                lift_files(splats, folder, [features], LiftSettings.of(preset="row-sum")),
                 tmp_path / "made.safetensors",
             )
     with pytest.raises(InvalidCameras, match="one COLMAP model"):
