@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from safetensors.torch import save_file
 
-from liftcore.io.inria import write_inria_cameras
 from liftcore.io.splats import write_splats
 from liftcore.query.result import LiftResult
 from liftcore.scene.cameras import Camera, Cameras
@@ -21,6 +20,7 @@ from liftcore.scene.splats import Splats
 from liftcore.values.lift import LiftMetadata
 from liftcore.values.lift_file import input_file, save_lift
 from liftcore.values.settings import LiftSettings
+from tests.inria_file import write_inria_cameras
 
 WIDTH, HEIGHT, FOCAL, DISTANCE = 160, 120, 100.0, 4.0
 SPACING = 0.08  # units between splats: 2 pixels

@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from liftcore.io.inria import write_inria_cameras
 from liftcore.io.splats import write_splats
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Kernel, Splats
 from liftcore.values.pack import write_pack
 from liftcore.values.views import FeatureGrid, Regions, ViewFeatures
+from tests.inria_file import write_inria_cameras
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 ROTATION = (0.9, 0.1, 0.3, 0.2)

@@ -1,17 +1,11 @@
 """The cameras.json that Inria's trainer writes beside its splats."""
 
-import json
-from pathlib import Path
 from typing import Any
 
 from liftcore.errors import InvalidCameras
-from liftcore.io.files import whole_file
 from liftcore.io.json_file import FORMATS, entry, matrix, number, pixels
 from liftcore.scene.cameras import Camera, Cameras, check_count, pose_from, read_views, viewmat_of
 from liftcore.scene.views import view_names
-
-CENTRE_TOLERANCE = 1e-6  # pixels
-KEEP = "keep these cameras as a COLMAP model or transforms.json"
 
 
 def parse_inria(document: Any, source: str) -> Cameras:
@@ -45,33 +39,3 @@ def _cameras(name: str, record: dict[str, Any], source: str) -> list[Camera]:
         (position,) = matrix([entry(record, "position", camera_source)], (1,), 3, f"{camera_source} position")
     pose = viewmat_of(rotation, position)
     return [Camera.pinhole(name, width, height, fx, fy, width / 2, height / 2, viewmat=pose)]
-
-
-def write_inria_cameras(cameras: Cameras, path: Path) -> None:
-    """Write cameras.json, whole or not at all.
-
-    Raises:
-        InvalidCameras: a photo is distorted, or its principal point off the centre, which the format cannot store.
-    """
-    records = [_record(i, camera) for i, camera in enumerate(cameras.values())]
-    with whole_file(path) as handle:
-        handle.write(json.dumps(records, indent=1).encode())
-
-
-def _record(index: int, camera: Camera) -> dict[str, Any]:
-    if camera.lens is not None:
-        raise InvalidCameras("cameras.json", expected="cameras without distortion", got=repr(camera.name), hint=KEEP)
-    off = max(abs(camera.cx - camera.width / 2), abs(camera.cy - camera.height / 2))
-    if off > CENTRE_TOLERANCE:
-        got = f"one {off:g} pixels off in {camera.name!r}"
-        raise InvalidCameras("cameras.json", expected="principal points at the centre", got=got, hint=KEEP)
-    return {
-        "id": index,
-        "img_name": camera.name,
-        "width": camera.width,
-        "height": camera.height,
-        "position": camera.centre.tolist(),
-        "rotation": camera.viewmat[:3, :3].T.tolist(),
-        "fy": camera.fy,
-        "fx": camera.fx,
-    }

@@ -97,8 +97,8 @@ def _require_same_kind(path: Path, output: OutputType) -> None:
     if not path.is_file() or path.stat().st_size == 0:
         return
     present = identify(path)
-    is_unnamed = present.kind is None and present.name.startswith(output.kind_name)
-    if not (present.kind == output.kind if output.kind else is_unnamed):
+    is_alike = present.name.startswith(output.kind_name) if output.kind_name else not present.recognised
+    if not (present.kind == output.kind if output.kind else present.kind is None and is_alike):
         expected = f"a new file, or one of {output.name} to replace"
         hint = "name another file, or remove that one first"
         raise InvalidInput("output", expected=expected, got=f"{path}, which is {present.name}", hint=hint)

@@ -16,7 +16,6 @@ from liftcore.errors import InvalidQuery
 from liftcore.runtime.cores import cores
 from liftcore.runtime.jit import vectorised
 
-DEFAULT_NEGATIVES = ("object", "things", "stuff", "texture")  # LangSplat's canonical phrases
 LOWEST_COSINE = -1.0  # score of a splat without a feature
 # An example's score is 1 for an equal feature and 0 for the scene's mean; words have no such scale.
 LEAST_LIKENESS = 0.4  # to an example, the least value of the automatic threshold

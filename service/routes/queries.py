@@ -68,7 +68,7 @@ WORD_OUTPUTS: dict[WordOutput, tuple[str, str]] = {
 EXPORTS: dict[str, tuple[str, str, str, str]] = {
     "ply": ("labelled", ".ply", BINARY, "the splats with columns of numbers, which `names` explains"),
     "glb": ("labelled", ".glb", BINARY, "glTF with feature ids and property tables"),
-    "usdz": ("labelled", ".usdz", BINARY, "OpenUSD, a subset of the splats for each object"),
+    "usdz": ("labelled", ".usdz", BINARY, "OpenUSD, a prim for each object"),
     "names": ("names", ".json", JSON, "names, colours, counts and boxes of the labels"),
     "masks": ("masks", ".json", JSON, "COCO's masks of the objects in the views"),
 }

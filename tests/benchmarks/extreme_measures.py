@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike
 
 import liftcore as lc
 from liftcore.evaluate.inspect import describe_cameras, describe_packs, describe_splats
-from liftcore.io.inria import write_inria_cameras
 from liftcore.io.splats import write_splats
 from liftcore.lifting.files import lift_files
 from liftcore.query.question import METHODS
@@ -28,6 +27,7 @@ from liftcore.scene.splats import Kernel
 from liftcore.solve.diagnostics import FAINT, order_warnings
 from liftcore.values.pack import read_features, write_pack
 from liftcore.values.views import ViewFeatures
+from tests.inria_file import write_inria_cameras
 from tests.scenes import IDENTITY, camera_at_origin, splats_at
 
 KERNELS = (Kernel.GAUSSIAN_3D, Kernel.GAUSSIAN_2D, Kernel.BETA)

@@ -17,12 +17,12 @@ import numpy as np
 import torch
 
 import liftcore as lc
-from liftcore.io.inria import write_inria_cameras
 from liftcore.io.splats import write_splats
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.values.pack import as_views, write_pack
 from liftcore.values.views import NO_LABEL, ViewFeatures
 from tests.benchmarks.room import PART_LEVELS, room_cameras, room_parts, room_regions, room_splats
+from tests.inria_file import write_inria_cameras
 
 NOISE = 0.45
 WRONG, MERGED = 0.1, 0.3  # shares of a view's regions

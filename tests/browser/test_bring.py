@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 
 from liftcore.io.cameras import read_cameras
-from liftcore.io.inria import write_inria_cameras
 from liftcore.io.splats import read_splats
+from tests.inria_file import write_inria_cameras
 from tests.still_life.files import write_still_life
 from tests.still_life.scene import still_life
 from tests.tiny_scene import colmap_zip, make_scene

@@ -30,13 +30,13 @@ from liftcore.cli import main
 from liftcore.features.encoders import Pixels
 from liftcore.features.encoders.crops import CropEncoder
 from liftcore.io.cameras import read_cameras
-from liftcore.io.inria import write_inria_cameras
 from liftcore.io.splats import read_splats, write_splats
 from liftcore.text.table import TableEncoder
 from liftcore.values.pack import read_features, write_pack
 from service import models
 from service.commands.demo import find_scene
 from service.errors import Problem
+from tests.inria_file import write_inria_cameras
 from tests.run_lengths import sam_records
 from tests.tiny_scene import HEIGHT, WIDTH, WORDS, cameras_document, codebook, colmap_zip, labels, make_scene
 

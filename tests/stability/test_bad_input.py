@@ -15,10 +15,10 @@ import torch
 from safetensors.torch import save_file
 
 from liftcore import cli
-from liftcore.io.inria import write_inria_cameras
 from liftcore.io.splats import write_splats
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.values.pack import write_pack
+from tests.inria_file import write_inria_cameras
 from tests.scenes import random_regions, random_splats
 
 if TYPE_CHECKING:

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from safetensors.numpy import save_file
 
-from liftcore.io.inria import write_inria_cameras
 from liftcore.io.splats import write_splats
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.text.table import TableEncoder
 from liftcore.values.pack import write_pack
+from tests.inria_file import write_inria_cameras
 from tests.still_life.masks import Mistakes, observe
 from tests.still_life.scene import StillLife
 

@@ -9,12 +9,12 @@ import numpy as np
 import torch
 
 from liftcore import cli
-from liftcore.io.inria import write_inria_cameras
 from liftcore.io.splats import write_splats
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
 from liftcore.values.pack import write_pack
 from liftcore.values.views import Regions
+from tests.inria_file import write_inria_cameras
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -13,7 +13,6 @@ from PIL import Image
 
 from liftcore.errors import InvalidCameras, InvalidQuery
 from liftcore.io.cameras import read_cameras
-from liftcore.io.inria import write_inria_cameras
 from liftcore.lifting.files import lift_files
 from liftcore.query.ask import ask
 from liftcore.query.question import Query
@@ -137,5 +136,3 @@ def test_a_model_that_comes_later_changes_no_lift(tmp_path: Path) -> None:
         read_cameras(scene)
     lift_scene = Scene(tmp_path / "made.safetensors")
     assert lift_scene.cameras.distorted == tuple(VIEWS)
-    with pytest.raises(InvalidCameras, match="cameras without distortion, got 'left'; keep these"):
-        write_inria_cameras(lift_scene.cameras, tmp_path / "cameras.json")

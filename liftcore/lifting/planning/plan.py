@@ -70,29 +70,6 @@ SPARE = 0.9  # of the free memory: 10 % are left to other processes
 DEVICE_SPLAT_BYTES = 400  # of a splat on a GPU, with the smallest batches of tiles
 
 
-@dataclass(frozen=True)
-class PlannedScene:
-    """The splats of a plan, and how they are rendered."""
-
-    kernel: str
-    antialiased: bool  # opacities are compensated for the low-pass
-    rendering: str  # the reason of ``antialiased``: a file, a trainer or a setting
-    splats: int  # P
-
-    @property
-    def rendered(self) -> str:
-        """The kernel and the rendering, as text for people."""
-        return f"{self.kernel}, antialiased: {self.rendering}" if self.antialiased else self.kernel
-
-
-def planned_scene(splats: Splats, settings: LiftSettings) -> PlannedScene:
-    """Describe splats as a lift with these settings renders them."""
-    antialiased = settings.compositing.antialiased
-    return PlannedScene(
-        str(splats.kernel), antialiased, rendering_reason(splats.render_mode, antialiased), splats.count
-    )
-
-
 def scene_warnings(
     splats: Splats, cameras: Cameras, views: Sequence[Camera], settings: LiftSettings
 ) -> tuple[str, ...]:
@@ -102,9 +79,13 @@ def scene_warnings(
 
 
 @dataclass(frozen=True)
-class Plan(PlannedScene):
+class Plan:
     """The plan of a lift. Plain values: the same inputs and settings give the same plan."""
 
+    kernel: str
+    antialiased: bool  # opacities are compensated for the low-pass
+    rendering: str  # the reason of ``antialiased``: a file, a trainer or a setting
+    splats: int  # P
     views: tuple[str, ...]  # that will be lifted, in the order of the sums
     left_out: tuple[str, ...]  # that the settings' coverage or view_cosine leaves out
     available_views: int  # views with features and a camera, also those that the settings leave out
@@ -122,6 +103,11 @@ class Plan(PlannedScene):
     seconds: float | None  # estimate for the geometry of all views on this machine now; None for few views
     warnings: tuple[str, ...]  # of this machine, today
     input_warnings: tuple[str, ...]  # of splats, cameras and features; the diagnostics of the lift have them too
+
+    @property
+    def rendered(self) -> str:
+        """The kernel and the rendering, as text for people."""
+        return f"{self.kernel}, antialiased: {self.rendering}" if self.antialiased else self.kernel
 
     def __repr__(self) -> str:
         views = f"{len(self.views)} of {self.available_views} views"
@@ -246,9 +232,12 @@ def plan_lift(
     phases = memory_phases(splats, visible, cameras, features, names, settings, entries)
     free = None if in_workers else free_memory()
     in_files = 0 if in_workers else max(0, weights - MEMORY_LIMIT)
-    lifted = set(names)
+    lifted, antialiased = set(names), settings.compositing.antialiased
     return Plan(
-        **vars(planned_scene(splats, settings)),
+        kernel=str(splats.kernel),
+        antialiased=antialiased,
+        rendering=rendering_reason(splats.render_mode, antialiased),
+        splats=splats.count,
         views=tuple(names),
         left_out=tuple(name for name in views.names if name not in lifted),
         available_views=len(features),

@@ -2,7 +2,6 @@
 // right one follows the page.
 import { fetchAnswer, heatOf, questionLabel, linkedQuestions, paintedQuestions } from "./query.js";
 import { byId, formatCount, el, notify } from "./dom.js";
-import { currentLayerName } from "./layers.js";
 import { liftTitle } from "./lifts.js";
 import { wordLayer, linkedWords, segmentSplats } from "./labels.js";
 import { fetchBytes, fetchJson, readNpy, problemText } from "./service.js";
@@ -112,7 +111,7 @@ async function layerOf(lift, link) {
     const isVisible = value => !only.length || segmentation.named_words.some(entry => entry.value === value && only.includes(entry.word));
     return { ...wordLayer(segmentation, values, isVisible), name: "labels" };
   }
-  const layer = currentLayerName(link.get("what"));
+  const layer = link.get("what");
   const input = [...document.querySelectorAll("input[name=layer]")].find(({ value }) => value === layer); // a link may have any value
   if (!input || ["rgb", "depth", "photo"].includes(layer)) return null;
   return { colours: readNpy(await fetchBytes(`/lifts/${lift.id}/colours?what=${layer}`)), cover: 1, name: input.nextSibling.textContent };

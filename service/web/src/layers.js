@@ -15,12 +15,9 @@ const LAYERS = {
   depth: "The depth of the splats.",
 };
 const SCALE_ENDS = { total_weight: ["low", "high"], confidence: ["low", "high"], depth: ["far", "near"] }; // dark and bright
-const OLD_NAMES = { evidence: "total_weight" }; // of layers in old links: their names now
 const MODES = ["scene", "both", "view"];
 const CLICK_DISTANCE = 5; // pixels that the pointer may move during a click
 const RENDERED_LAYERS = ["rgb", "pca", "cluster", "confidence", "depth"]; // layers that the service renders
-
-export const currentLayerName = name => (Object.hasOwn(OLD_NAMES, name) ? OLD_NAMES[name] : name);
 
 export class LayerPanel {
   // onChange(): colours or the link must be updated. flyToView(view): move the camera. onExample(term, less): a box or a
@@ -118,8 +115,7 @@ export class LayerPanel {
     if (Object.hasOwn(SCALE_ENDS, name)) byId("layer-scale").querySelectorAll("span").forEach((end, index) => { end.textContent = SCALE_ENDS[name][index]; });
   }
 
-  async setLayer(linkName) {
-    const name = currentLayerName(linkName);
+  async setLayer(name) {
     if (!Object.hasOwn(LAYERS, name)) return undefined;
     this.showLayer(name);
     this.drawView();

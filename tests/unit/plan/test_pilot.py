@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from liftcore.evaluate.accuracy import cosine_figures
-from liftcore.io.inria import write_inria_cameras
 from liftcore.io.splats import write_splats
 from liftcore.lifting.files import lift_files, open_files
 from liftcore.lifting.planning.plan import FEW_VIEWS
@@ -21,6 +20,7 @@ from liftcore.values.pack import write_pack
 from liftcore.values.settings import LiftSettings
 from liftcore.values.views import Regions
 from tests.benchmarks.scenes import RoomSpec, write_room
+from tests.inria_file import write_inria_cameras
 from tests.scenes import centred, random_splats
 from tests.unit.plan.test_views import ring
 

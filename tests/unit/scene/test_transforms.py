@@ -21,11 +21,11 @@ from liftcore.errors import InvalidCameras, Unavailable
 from liftcore.evaluate.inspect import inspect_file
 from liftcore.io import cameras
 from liftcore.io.cameras import read_cameras
-from liftcore.io.inria import write_inria_cameras
 from liftcore.io.transforms import FRAME_FILE, transforms_of
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.distortion import Brown, Fisheye, Lens
 from liftcore.values.lift_file import camera_input
+from tests.inria_file import write_inria_cameras
 
 
 def test_opengl_camera_looks_along_its_negative_z(tmp_path: Path) -> None:

@@ -15,12 +15,12 @@ from camera_files import IMAGES, binary_files, text_files, with_json, write_file
 
 from liftcore.errors import InvalidCameras, InvalidFeatures, NotFound
 from liftcore.io.cameras import read_cameras
-from liftcore.io.inria import write_inria_cameras
 from liftcore.io.transforms import transforms_of
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
 from liftcore.scene.views import cameras_of_views, require_pairs, view_names
+from tests.inria_file import write_inria_cameras
 
 K = np.array([[50.0, 0.0, 32.0], [0.0, 51.0, 24.0], [0.0, 0.0, 1.0]])
 

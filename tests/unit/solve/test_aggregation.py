@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from liftcore.errors import InvalidLift
-from liftcore.io.inria import write_inria_cameras
 from liftcore.io.splats import write_splats
 from liftcore.lifting.files import lift_files
 from liftcore.query.result import load_lift
@@ -25,6 +24,7 @@ from liftcore.values.lift_views import LiftViews
 from liftcore.values.pack import read_features, write_pack
 from liftcore.values.settings import LiftSettings
 from liftcore.values.views import FeatureGrid, Regions
+from tests.inria_file import write_inria_cameras
 from tests.scenes import centred, random_camera, random_grid, random_regions, random_splats
 
 pytestmark = pytest.mark.slow
