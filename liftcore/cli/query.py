@@ -131,7 +131,9 @@ def _picture(photo: Path | None, size: tuple[int, int]) -> Image | None:
 def _lines(document: dict[str, Any]) -> Iterable[str]:
     answer = document["answer"]
     threshold, query_text = answer["threshold"], ", ".join(map(repr, [*answer["text"], *answer["like"]]))
-    yield from (f"{entry['text']!r} is queried as {entry['word']!r}" for entry in answer["wording"])
+    for entry in answer["wording"]:
+        relation = "excludes" if entry["match"] == "negation" else "is queried as"
+        yield f"{entry['text']!r} {relation} {entry['word']!r}"
     if answer["present"] is not None or document["encoder"]:
         yield answer["reason"]
     if threshold["value"] is not None:

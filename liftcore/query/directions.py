@@ -55,7 +55,7 @@ def read_query(scene: OpenedLift, query: Query, encoder: TextEncoder | None, nam
             reading = read_phrase(term, is_word)
             if is_negative and reading.negatives:
                 raise InvalidQuery("negatives", expected="names of what it is not", got=repr(term[:80]))
-        form = "negation" if reading.negatives else "list" if reading.names != (term,) else ""
+        form = "list" if reading.negatives or reading.names != (term,) else ""
         terms.extend((is_negative, False, place, form, name) for name in reading.names)
         terms.extend((True, False, place, "negation", name) for name in reading.negatives)
     terms.sort(key=itemgetter(0, 1))

@@ -394,7 +394,7 @@ class WordMatch(Value):
     word: str = Field(description="for a part: that part of the object in which it is searched")
     match: Literal["spelling", "qualifier", "synonym", "number", "head", "part", "list", "negation"] = Field(
         description="the kind of match: letters, a word that says which is meant, meaning, one or several, the "
-        "head of a phrase, a part that it names, one of a list, or one that is looked for or excluded by a negation"
+        "head of a phrase, a part that it names, one of several that it names, or one that a negation excludes"
     )
 
 

@@ -469,7 +469,7 @@ const paragraph = (...parts) => el("p", {}, ...parts);
 
 function adviceLines(question, panel) {
   const { answer, problem, text } = question;
-  const paragraphs = (answer?.wording || []).map(match => paragraph(`\u201c${match.text}\u201d is matched to `, el("b", {}, match.word), "."));
+  const paragraphs = (answer?.wording || []).map(match => paragraph(`\u201c${match.text}\u201d ${match.match === "negation" ? "excludes" : "is matched to"} `, el("b", {}, match.word), "."));
   if (problem?.nearest) {
     const suggestions = problem.nearest.length ? problem.nearest : panel.sceneWords.slice(0, 5);
     paragraphs.push(paragraph(`\u201c${text.join(", ")}\u201d is not in the list of words of this scene. `, suggestions.length ? "Try " : "Try another word.",
