@@ -6,6 +6,7 @@ The operations are those of the OpenAPI document, so a new one is held to this t
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -55,7 +56,7 @@ def require_no_fault(reply: httpx.Response, *request: object) -> None:
 
 def test_odd_parts_of_paths_are_refused(fast: httpx.Client, operations: Operations) -> None:
     for method, path, _ in operations:
-        if "{" in path:
+        if re.search(r"\{(job|lift|tradeoff|asset)\}", path):  # which take an odd part
             for part in ODD_PARTS:
                 address = address_of(path, part, part)
                 reply = fast.request(method, address, json=None if method == "GET" else {})
