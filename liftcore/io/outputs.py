@@ -19,7 +19,7 @@ class OutputType:
     name: str  # as errors have it
     suffixes: tuple[str, ...]
     kind: str | None  # of `liftcore.io.kinds`, that a file may have which is replaced
-    kind_name: str = ""  # of a file without a kind, what the name of its kind begins with; empty: of a text
+    kind_name: str = ""  # of a file without a kind, what the name of its kind has; empty: of a file of no known kind
 
 
 OUTPUT_TYPES = {
@@ -30,7 +30,7 @@ OUTPUT_TYPES = {
     "lift": OutputType("a lift", (".safetensors", ".shards"), "lift"),
     "pack": OutputType("a feature pack", (".safetensors",), "features"),
     "csv": OutputType("a table", (".csv",), None),
-    "json": OutputType("JSON", (".json",), None),
+    "json": OutputType("JSON", (".json",), None, "JSON"),
 }
 CONVERTED = (".sog", ".html", ".csv", ".compressed.ply", ".splat", ".spz")  # which splat-transform writes
 
@@ -97,7 +97,7 @@ def _require_same_kind(path: Path, output: OutputType) -> None:
     if not path.is_file() or path.stat().st_size == 0:
         return
     present = identify(path)
-    is_alike = present.name.startswith(output.kind_name) if output.kind_name else not present.recognised
+    is_alike = output.kind_name in present.name if output.kind_name else not present.recognised
     if not (present.kind == output.kind if output.kind else present.kind is None and is_alike):
         expected = f"a new file, or one of {output.name} to replace"
         hint = "name another file, or remove that one first"

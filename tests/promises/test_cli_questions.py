@@ -181,8 +181,8 @@ def test_words_to_a_lift_without_words_are_refused(space: str, message: str, tmp
 def test_table_that_ships_stands_in_for_absent_weights(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     files, words = write_files(tmp_path), lc.open_encoder("lvis").encode(["cat", "boat", "mug"])
     views = {view: replace(regions, codebook=torch.from_numpy(words)) for view, regions in regions_of(files).items()}
