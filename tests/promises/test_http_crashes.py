@@ -101,3 +101,4 @@ def test_job_whose_process_is_killed_goes_on_until_its_third_attempt(
         server.kill_children()
     table = upload(client, "table", tiny.table)
     assert client.delete(f"/assets/{table}").status_code == 204
+    until(lambda: client.get("/readyz").status_code == 200)  # for the tests that share the server
