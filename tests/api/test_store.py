@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import shutil
 import sqlite3
 import threading
 from collections.abc import Iterator
@@ -20,7 +22,7 @@ from liftcore.errors import NotFound
 from service.commands.store import back_up, clean, verify
 from service.errors import Busy, Conflict, KeyReused, Misconfigured, NoSpace
 from service.models import FINAL_STATES, Job
-from service.store import DATABASE, MAX_ATTEMPTS, SERVICE, Owner, Store
+from service.store import DATABASE, MAX_ATTEMPTS, SERVICE, Owner, Store, open_keys, revoke_key
 
 ANNA, BERT = Owner("anna"), Owner("bert")
 KINDS = ("splats", "cameras", "features")
@@ -173,7 +175,82 @@ def test_job_that_is_being_canceled_gets_no_result(store: Store) -> None:
         store.lift(ANNA, job.id)
 
 
+def test_result_goes_only_with_a_job_that_is_deleted_with_it(store: Store) -> None:
+    store.submit(ANNA, order_of(store, ANNA))
+    job = store.claim()
+    assert job is not None
+    finish(store, job)
+    with pytest.raises(Conflict, match="with_lift"):
+        store.delete_job(ANNA, job.id, with_result=False)
+    assert store.lift(ANNA, job.id).file.is_file()
+    store.delete_job(ANNA, job.id, with_result=True)
+    assert list((store.root / "lifts").iterdir()) == []
+
+
+def test_revoked_key_follows_no_job_and_its_queued_jobs_are_canceled(store: Store) -> None:
+    running, _ = store.submit(ANNA, order_of(store, ANNA))
+    assert store.claim() is not None
+    queued, _ = store.submit(ANNA, order_of(store, ANNA))
+    other, _ = store.submit(BERT, order_of(store, BERT))
+    assert store.events(ANNA, running.id, 0)
+    with open_keys(store.root) as connection:
+        revoke_key(connection, ANNA.owner)
+    with pytest.raises(NotFound):
+        store.events(ANNA, running.id, 0)
+    claimed = store.claim()
+    assert claimed is not None and claimed.id == other.id
+    assert [store.job(SERVICE, job.id).state for job in (running, queued)] == ["running", "canceled"]
+
+
+@pytest.mark.parametrize("table", ["assets", "jobs"])
+def test_pages_have_each_record_once_where_clocks_stand_still(
+    store: Store, table: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("time.time", lambda: 1.0)
+    order = order_of(store, ANNA)
+    count = len(KINDS) if table == "assets" else 5
+    for _ in range(5):
+        store.submit(ANNA, order)
+    ids, cursor = list[str](), None
+    while not ids or cursor:
+        rows, cursor = store.page(table, ANNA, 2, cursor)
+        ids += [row["id"] for row in rows]
+    assert len(ids) == len(set(ids)) == count
+
+
 # Disks
+
+
+def test_files_are_on_the_disk_before_their_rows(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    flushed, flush = set[int](), os.fsync
+
+    def note(handle: int) -> None:
+        assert store.rows("SELECT count(*) AS count FROM assets UNION ALL SELECT count(*) FROM lifts") == before
+        flushed.add(os.fstat(handle).st_ino)
+        flush(handle)
+
+    job, _ = store.submit(ANNA, order_of(store, ANNA))
+    active = store.claim()
+    assert active is not None
+    before = store.rows("SELECT count(*) AS count FROM assets UNION ALL SELECT count(*) FROM lifts")
+    monkeypatch.setattr(os, "fsync", note)
+    finish(store, active)
+    lift = store.lift(ANNA, job.id).file
+    assert flushed == {path.stat().st_ino for path in (lift, lift.parent)}
+    before = store.rows("SELECT count(*) AS count FROM assets UNION ALL SELECT count(*) FROM lifts")
+    asset = store.asset(ANNA, add_asset(store, ANNA, "splats", b"x")).file
+    assert {path.stat().st_ino for path in (asset, asset.parent)} < flushed
+    with store.write() as connection:
+        assert connection.execute("PRAGMA synchronous").fetchone()[0] == 2  # each commit waits for the disk
+
+
+def test_another_file_in_the_place_of_the_database_is_noticed(store: Store) -> None:
+    store.require_usable()
+    copy = store.root / "copy"
+    shutil.copyfile(store.root / DATABASE, copy)
+    copy.replace(store.root / DATABASE)
+    with pytest.raises(sqlite3.OperationalError, match="another file"):
+        store.require_usable()
 
 
 def test_disk_below_its_floor_takes_no_work_and_gives_room(tmp_path: Path) -> None:
