@@ -49,6 +49,16 @@ def with_scores(scores: Sequence[float] | np.ndarray, folder: Path) -> tuple[lc.
     return scene_with(rows), encoder
 
 
+@pytest.mark.parametrize("words", [["cup"], ["cup", "mug"]])
+def test_one_word_written_twice_does_not_compete_with_itself(words: list[str], tmp_path: Path) -> None:
+    cup, sofa, other = np.eye(3, 8)
+    rows = np.repeat([cup, sofa], 40, axis=0) + 0.02 * np.random.default_rng(3).normal(size=(80, 8))
+    vectors = [cup, cup + 1e-3 * other]  # as another rounding of one vector
+    table = write_table(tmp_path / "words.safetensors", words, np.stack(vectors[: len(words)]))
+    answer = scene_with(rows).ask(lc.Query(text=["cup"]), encoder=table)
+    assert np.array_equal(answer.selected, np.arange(80) < 40)
+
+
 def test_scores_are_cosines_and_negatives_only_take_away(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     rows, vectors = rng.normal(size=(30, 16)), rng.normal(size=(2, 16))
