@@ -66,7 +66,7 @@ def main() -> int:
     ]
     is_above = len(places) > MOST_PLACES
     if is_above:
-        print(*places, "take nouns of the field and verbs with objects: CONTRIBUTING.md, Names", sep="\n")
+        print(*places, "take nouns of the field and verbs with objects: CONTRIBUTING.md", sep="\n")
     print(f"{len(places)} names and docstrings that are riddles, at most {MOST_PLACES} may be")
     return is_above
 
