@@ -24,6 +24,7 @@ from liftcore.lifting.files import lift_files as lift_files
 from liftcore.lifting.files import plan_files as plan_files
 from liftcore.lifting.operators import region_weights as region_weights
 from liftcore.lifting.operators import render as render
+from liftcore.lifting.operators import weights_at as weights_at
 from liftcore.lifting.pipeline import lift as lift
 from liftcore.lifting.pipeline import plan as plan
 from liftcore.lifting.planning.plan import Plan as Plan

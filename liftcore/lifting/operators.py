@@ -1,9 +1,9 @@
-"""The weights A without a lift: region weights ``A^T S``, and renders ``A X``."""
+"""The weights A without a lift: region weights ``A^T S``, renders ``A X``, and rows of A."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Unpack, overload
+from collections.abc import Mapping, Sequence
+from typing import Unpack
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from liftcore.lifting.in_memory import InMemory, SceneWeights
 from liftcore.lifting.inputs import LiftInputs
 from liftcore.lifting.pipeline import find_objects, needs_separate_levels, reweigh
 from liftcore.raster import check_splats_and_threads, open_raster
+from liftcore.raster.base import Raster
 from liftcore.runtime.device import choose_device
 from liftcore.runtime.progress import Progress, Timings, shown_progress
 from liftcore.runtime.torch_modes import callers_modes, default_modes
@@ -27,7 +28,7 @@ from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import LiftSettings, Preset
 
 
-@overload
+@default_modes()
 def render(
     splats: Splats,
     camera: Camera,
@@ -37,33 +38,10 @@ def render(
     normalise: bool = False,
     device: str | torch.device = "auto",
     threads: int | None = None,
-) -> Tensor: ...
-@overload
-def render(
-    splats: Splats,
-    camera: Mapping[str, Camera],
-    values: Tensor | np.ndarray,
-    params: CompositingParams | None = None,
-    *,
-    normalise: bool = False,
-    device: str | torch.device = "auto",
-    threads: int | None = None,
-) -> dict[str, Tensor]: ...
-@default_modes()
-def render(
-    splats: Splats,
-    camera: Camera | Mapping[str, Camera],
-    values: Tensor | np.ndarray,
-    params: CompositingParams | None = None,
-    *,
-    normalise: bool = False,
-    device: str | torch.device = "auto",
-    threads: int | None = None,
-) -> Tensor | dict[str, Tensor]:
+) -> Tensor:
     """Composite values on splats front to back, as a rasterizer does colours: ``A X``.
 
     Args:
-        camera: the camera, or several by their names, such as all of a scene.
         values: [P] or [P, F] of any numbers or booleans, a row a splat, in the splats' order; without gradients.
         params: of compositing; None: those of the splats' training (`Splats.antialiased`), with the usual constants.
             The scale of the opacity logits is 1; the background is zero.
@@ -72,7 +50,7 @@ def render(
             CPU; the result is bitwise identical for any number.
 
     Returns:
-        [H, W] or [H, W, F] f32, on the CPU; for several cameras a dict of such images by their names.
+        [H, W] or [H, W, F] f32, on the CPU.
 
     Raises:
         InvalidSplats, InvalidCameras: splats or camera are of another type, such as a path or a name.
@@ -80,31 +58,72 @@ def render(
             number.
         Unavailable: the device does not exist.
     """
+    raster, params = _open_view(splats, camera, params, device, threads)
+    rows = _rows(raster.splats, values)
+    image = raster.render(camera, rows if rows.ndim == 2 else rows[:, None], params)
+    if normalise:
+        sums = raster.row_sums(camera, params)[:, :, None]
+        image = torch.where(sums > 0, image / sums.clamp_min(torch.finfo(torch.float32).tiny), 0.0)
+    return (image if rows.ndim == 2 else image[:, :, 0]).cpu()
+
+
+@default_modes()
+def weights_at(
+    splats: Splats,
+    camera: Camera,
+    pixels: Tensor | np.ndarray | Sequence[tuple[int, int]],
+    params: CompositingParams | None = None,
+    *,
+    device: str | torch.device = "auto",
+    threads: int | None = None,
+) -> list[tuple[Tensor, Tensor]]:
+    """Find the splats that make pixels, with their weights: the entries of rows of A that are not zero.
+
+    The weights of a pixel multiply the colours of its splats; what they leave of 1 is background.
+
+    Args:
+        pixels: [n, 2] integers (x, y), from 0 at the top left. params, device, threads: as in `render`.
+
+    Returns:
+        A pair for each pixel, in their order: numbers of splats [k] i64, near to far, and their weights [k] f32, on
+        the CPU.
+
+    Raises:
+        InvalidSplats, InvalidCameras: as in `render`.
+        InvalidSettings: pixels are no pairs of integers, or lie outside the image; or threads are no number.
+        Unavailable: the device does not exist.
+    """
+    raster, params = _open_view(splats, camera, params, device, threads)
+    places, size = np.asarray(pixels), (camera.width, camera.height)
+    if places.ndim != 2 or places.shape[1] != 2 or not np.issubdtype(places.dtype, np.integer):
+        got = f"{places.dtype} {list(places.shape)}"
+        raise InvalidSettings("pixels", expected="integers [n, 2], the x and y of each pixel", got=got)
+    outside = places[((places < 0) | (places >= size)).any(axis=1)]
+    if outside.size:
+        expected = f"pixels (x, y) of an image of {camera.width} x {camera.height}"
+        raise InvalidSettings("pixels", expected=expected, got=str(tuple(outside[0].tolist())))
+    rows = raster.ray_rows(camera, torch.from_numpy(places.astype(np.int32)), params)
+    counts = rows.indptr.diff().tolist()
+    return list(zip(rows.splats.cpu().long().split(counts), rows.weights.cpu().split(counts), strict=True))
+
+
+def _open_view(
+    splats: Splats,
+    camera: Camera,
+    params: CompositingParams | None,
+    device: str | torch.device,
+    threads: int | None,
+) -> tuple[Raster, CompositingParams]:
+    """Check the arguments of `render`, and return the raster of the splats with the parameters of compositing."""
     splats = check_splats_and_threads(splats, threads)
     params = CompositingParams(antialiased=splats.antialiased) if params is None else params
     if not isinstance(params, CompositingParams):
         raise InvalidSettings("params", expected="CompositingParams, or None", got=repr(params)[:80])
     check_antialiased(splats.kernel, params.antialiased)
-    cameras = camera if isinstance(camera, Mapping) else {"": camera}
-    for view_camera in cameras.values():
-        if not isinstance(view_camera, Camera):
-            got, hint = repr(view_camera)[:80], "cameras[name] is the camera of a view"
-            raise InvalidCameras("camera", expected="a Camera", got=got, hint=hint)
-    rows = _rows(splats, values)
-    raster = open_raster(splats, choose_device(device), threads)
-
-    def image_of(camera: Camera) -> Tensor:
-        image = raster.render(camera, rows if rows.ndim == 2 else rows[:, None], params)
-        if normalise:
-            sums = raster.row_sums(camera, params)[:, :, None]
-            image = torch.where(sums > 0, image / sums.clamp_min(torch.finfo(torch.float32).tiny), 0.0)
-        return (image if rows.ndim == 2 else image[:, :, 0]).cpu()
-
-    return (
-        image_of(camera)
-        if isinstance(camera, Camera)
-        else {name: image_of(view_camera) for name, view_camera in cameras.items()}
-    )
+    if not isinstance(camera, Camera):
+        got, hint = repr(camera)[:80], "cameras[name] is the camera of a view"
+        raise InvalidCameras("camera", expected="a Camera", got=got, hint=hint)
+    return open_raster(splats, choose_device(device), threads), params
 
 
 def _rows(splats: Splats, values: Tensor | np.ndarray) -> Tensor:

@@ -120,16 +120,21 @@ def test_render_composites_numbers_of_splats(scene):
         lc.render(splats, camera, torch.ones(splats.count + 1))
 
 
-def test_render_of_cameras_is_an_image_of_each_by_its_name(scene):
+def test_weights_at_pixels_are_their_renders(scene):
     _, splats, cameras, _ = scene
-    selected = splats.means[:, 0] > 0
-    images = lc.render(splats, cameras, selected, normalise=True)
-    assert list(images) == list(cameras)
-    for name, camera in cameras.items():
-        assert torch.equal(images[name], lc.render(splats, camera, selected, normalise=True))
-        assert images[name].shape == (camera.height, camera.width) and bool((images[name] > 0.5).any())
-    with pytest.raises(lc.InvalidCameras, match="camera: expected a Camera, got 3"):
-        lc.render(splats, {"v0": cameras["v0"], "v1": 3}, selected)  # pyright: ignore
+    pixels = np.array([[0, 0], [20, 15], [9, 11], [20, 15]])
+    answers = lc.weights_at(splats, cameras["v0"], pixels)
+    image = lc.render(splats, cameras["v0"], torch.eye(splats.count))
+    assert len(answers) == len(pixels) and any(len(rows) for rows, _ in answers)
+    for (x, y), (rows, weights) in zip(pixels, answers, strict=True):
+        assert torch.allclose(torch.zeros(splats.count).index_add(0, rows, weights), image[y, x], atol=1e-6)
+        depths = splats.means.numpy()[rows] @ cameras["v0"].viewmat[2, :3]
+        assert (np.diff(depths) >= -1e-5).all()
+    for wrong in ([(0.5, 0)], [0, 0], [(cameras["v0"].width, 0)], [(0, -1)]):
+        with pytest.raises(lc.InvalidSettings, match="pixels: expected"):
+            lc.weights_at(splats, cameras["v0"], wrong)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(lc.InvalidCameras, match="camera: expected a Camera"):
+        lc.weights_at(splats, "v0", pixels)  # pyright: ignore[reportArgumentType]
 
 
 def test_stages_are_reported_in_order_and_the_plan_after_the_first_views(tmp_path):
