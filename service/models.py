@@ -55,7 +55,6 @@ JobId = Annotated[str, Field(pattern=JOB_ID)]
 Seconds = Annotated[float, Field(description="seconds since 1970")]
 Text = Annotated[str, Field(min_length=1, max_length=WORD_CHARACTERS)]
 Name = Annotated[str, Field(min_length=1, max_length=NAME_CHARACTERS, pattern=PRINTABLE)]
-SettingText = Annotated[str, Field(min_length=1, max_length=WORD_CHARACTERS, pattern=PRINTABLE)]
 Next = Annotated[str | None, Field(description="the cursor of the page after this one; null at the end")]
 NextNumber = Annotated[int | None, Field(description="likewise")]
 BODY_CONFIG = ConfigDict(defer_build=False)  # of models of bodies, which FastAPI builds at the start
@@ -95,21 +94,6 @@ class Asset(BaseModel):
         """Return the kernel with which a lift of those settings interprets these splats."""
         kernel = settings.get("kernel", "auto")
         return self.counts.get("kernel", "3dgs") if kernel == "auto" else kernel
-
-
-class Assets(BaseModel):
-    """Some of the assets, newest first."""
-
-    assets: list[Asset]
-    next: Next
-
-
-class PackChange(Body):
-    """Names of a feature pack; fields that are left out stay as in the pack."""
-
-    model_config = BODY_CONFIG
-    encoder: SettingText | None = Field(None, description="the encoder of the features")
-    text_space: SettingText | None = Field(None, description="the text encoder that shares their space, or 'none'")
 
 
 # Jobs
@@ -242,13 +226,6 @@ class Job(BaseModel):
         return links
 
 
-class Jobs(BaseModel):
-    """Some of the jobs, newest first."""
-
-    jobs: list[Job]
-    next: Next
-
-
 # Lifts and trade-offs
 
 
@@ -257,8 +234,8 @@ class Lift(BaseModel):
 
     id: JobId
     name: str | None = Field(description="set by a user")
-    bytes: int = Field(description="size of the file, as it was made")
-    sha256: str = Field(description="of the file, as it was made; after a change of `world` the download has another")
+    bytes: int = Field(description="size of the file")
+    sha256: str = Field(description="of the file")
     splats: AssetId
     cameras: AssetId
     features: list[AssetId]
@@ -284,7 +261,6 @@ class Lift(BaseModel):
     file: Path = Field(exclude=True)
     parameters: dict[str, Any] = Field(exclude=True)
     pack_count: int = Field(exclude=True)  # of the packs that it was made of; `features` are those that are here
-    is_world_changed: bool = Field(exclude=True)
 
     @computed_field
     @property
@@ -298,15 +274,8 @@ class Lift(BaseModel):
     def of_row(cls, row: dict[str, Any]) -> Self:
         """Return the lift of a row, in which the metadata of its file stand beside its own columns."""
         metadata, world = row["metadata"], row["world"]
-        row = row | {"pack_count": len(metadata["features"]), "is_world_changed": world is not None}
-        return cls(**metadata | row | {"world": metadata.get("world") or {} if world is None else world})
-
-
-class Lifts(BaseModel):
-    """Some of the lifts, newest first."""
-
-    lifts: list[Lift]
-    next: Next
+        world = metadata.get("world") or {} if world is None else world
+        return cls(**metadata | row | {"pack_count": len(metadata["features"]), "world": world})
 
 
 class WorldUpdate(WorldFrame):
@@ -323,7 +292,9 @@ class LiftChange(Body):
         Field(None, description="for people; null or an empty one takes the name away")
     )
     photos: AssetId | None = Field(None, description="an asset of kind photos; null takes them away")
-    world: WorldUpdate | None = Field(None, description="in place of all known values; null: none is known")
+    world: WorldUpdate | None = Field(
+        None, description="for answers and exports, in place of all known values; null: none is known"
+    )
 
 
 class View(BaseModel):

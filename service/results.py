@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import json
-import shutil
 import time
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError, safe_open
-
 from liftcore.errors import InvalidLift, NotFound
-from liftcore.files import require_pairs, with_metadata
+from liftcore.files import require_pairs
 from service.errors import Conflict, InvalidRequest
 from service.models import Key, Lift, NewShare, Share, Tradeoff
-from service.store import LIFTS, VALID, VISIBLE, Owner, Store, create_key, require_whole, sync
+from service.store import LIFTS, VALID, VISIBLE, Owner, Store, create_key, sync
 
 MOST_SHARES = 100  # valid keys of one lift
 
@@ -36,34 +33,6 @@ def change_lift(store: Store, owner: Owner, lift: str, changes: dict[str, Any]) 
         for column in changes.keys() & {"name", "photos", "world"}:
             connection.execute(f"UPDATE lifts SET {column} = ? WHERE id = ?", (changes[column] or None, lift))
     return store.lift(owner, lift)
-
-
-def changed_copy(lift: Lift, draft: Path) -> bool:
-    """Write the lift's file with its present ``world`` to a draft; return False if the file has it.
-
-    Raises:
-        NotFound: the file is not there, or no longer a lift.
-    """
-    require_whole(lift.file, lift.bytes)
-    if not lift.is_world_changed:
-        return False
-    try:
-        handle: Any
-        with safe_open(str(lift.file), framework="np") as handle:
-            metadata = json.loads(handle.metadata()["splatlift"])
-        world = lift.world.model_dump(mode="json", exclude_none=True)
-        if {name: value for name, value in (metadata.get("world") or {}).items() if value is not None} == world:
-            return False
-        text = json.dumps(metadata | {"world": world}, ensure_ascii=False, separators=(",", ":"))
-        header = next(with_metadata(lift.file, {"splatlift": text}))
-    except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
-        got = f"one that does not open: {error}"[:200]
-        raise NotFound("content", expected="the file of a lift", got=got, hint="lift again") from None
-    with lift.file.open("rb") as source, draft.open("wb") as target:
-        target.write(header)
-        source.seek(8 + int.from_bytes(source.read(8), "little"))
-        shutil.copyfileobj(source, target, 1 << 20)
-    return True
 
 
 def find_lift_file(store: Store, owner: Owner, sha256: str) -> Lift | None:

@@ -146,7 +146,7 @@ def encoder_spec(settings: ServiceSettings, text_space: str, requested: str | No
         "lift", expected="features of a text space that this server has an encoder for",
         got=f"text space {text_space!r}" if text_space else "features that name no text space",
         hint="ask with table=ID of an uploaded text table, or by example, with like="
-        + ("" if text_space else "; PATCH /assets/{asset} names a pack's text space, for a lift of it")
+        + ("" if text_space else "; splatlift pack retag names a pack's text space, for a lift of it")
         + f"; or the operator sets SPLATLIFT_TEXT_SPACES='{example}' or SPLATLIFT_ENCODER;"
         f" encoder=default asks {encoder_label(settings.encoder)} all the same",
     )  # fmt: skip

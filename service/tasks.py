@@ -1,4 +1,4 @@
-"""What children do: checks, renamed packs and plans while a request waits, and the work of jobs.
+"""What children do: checks and plans while a request waits, and the work of jobs.
 
 A task is a function of an order and a reporter; it returns the result as JSON, or raises the error that is reported.
 """
@@ -33,7 +33,7 @@ from liftcore import (
 )
 from liftcore.errors import InvalidFeatures, InvalidInput, InvalidLift, SplatliftError
 from liftcore.evaluate import inspect_file
-from liftcore.files import finite, identify, with_metadata, wrong_kind
+from liftcore.files import finite, identify, wrong_kind
 from liftcore.text.table import TableEncoder
 from service.errors import replace_names
 from service.models import FILE_CHARACTERS, VIEW_CHARACTERS, WORD_CHARACTERS
@@ -186,17 +186,6 @@ def _of_another_kind(kind: str, path: Path) -> InvalidInput | None:
         return None
     hint = "POST it to /lifts" if identity.kind == "lift" else f"PUT it to /assets/{identity.kind}"
     return error(kind, expected=expected, got=f"one of {identity.kind}", hint=hint)
-
-
-def retag(order: Order, report: Reporter) -> dict[str, Any]:
-    """Write a feature pack with other names to ``output``; return its ``sha256``, and its check."""
-    source, output, digest = Path(order["file"]), Path(order["output"]), hashlib.sha256()
-    read_features(source)  # it may have changed since it was stored
-    with output.open("wb") as file:
-        for block in with_metadata(source, order["changes"]):
-            digest.update(block)
-            file.write(block)
-    return check(order | {"file": str(output)}, report) | {"sha256": digest.hexdigest()}
 
 
 # Plans and jobs

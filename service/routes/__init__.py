@@ -12,11 +12,11 @@ from typing import Annotated, Any, TypeVar
 import anyio
 from fastapi import APIRouter, Body, Depends, Query, Request, Response
 from fastapi.responses import FileResponse
-from pydantic import BaseModel
+from pydantic import BaseModel, create_model
 from starlette.convertors import Convertor
 
 from liftcore.files import PhotoIndexes
-from service.models import CURSOR, PAGE, Key
+from service.models import CURSOR, PAGE, Key, Next
 from service.process import Children
 from service.query_client import QueryClient
 from service.runner import Runner
@@ -107,6 +107,21 @@ def file_answer(request: Request, file: Path, size: int, sha256: str, name: str)
     etag = f'"{sha256}"'
     headers = cache_headers(etag)
     return unchanged(request, etag) or FileResponse(file, headers=headers, media_type=BINARY, filename=name)
+
+
+def add_list(
+    router: APIRouter, table: str, model: type[BaseModel], record_of: Callable[[dict[str, Any]], BaseModel]
+) -> None:
+    """Register the route that lists the records of a table."""
+    fields: dict[str, Any] = {table: (list[model], ...), "next": (Next, ...)}
+    page = create_model(table.capitalize(), __doc__=f"Some of the {table}.", **fields)
+
+    @router.get(
+        f"/{table}", name=f"list_{table}", response_model=page, description=f"List the {table}, newest first."
+    )
+    def list_records(deps: Deps, owner: Caller, limit: Limit = PAGE, cursor: Cursor = None) -> dict[str, Any]:
+        rows, following = deps.store.page(table, owner, limit, cursor)
+        return {table: [record_of(row) for row in rows], "next": following}
 
 
 def get_and_post(

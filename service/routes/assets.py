@@ -7,18 +7,16 @@ import re
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import anyio
 from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as PathParameter
 
-from service import models
 from service.errors import InvalidRequest, TooLarge, UnsupportedMedia
-from service.models import Asset, AssetKind, Assets
-from service.routes import BINARY, Caller, Cursor, Deps, Limit, Parts, content_of, file_answer
+from service.models import Asset, AssetKind
+from service.routes import BINARY, Caller, Deps, Parts, add_list, content_of, file_answer
 
-Value = TypeVar("Value")
 BATCH = 1 << 20  # bytes that are collected before a thread writes them
 CHECK_BASE_BYTES, CHECK_FACTOR = 1 << 30, 16  # memory of a check: a reader holds several copies of a file
 UPLOAD: dict[str, Any] = {
@@ -36,10 +34,11 @@ Kind = Annotated[AssetKind, PathParameter(alias="asset", description="its kind")
 Sha256 = Annotated[str | None, Query(pattern="^[0-9a-fA-F]{64}$", description="of the content; checked if given")]
 REPEATED: dict[int | str, dict[str, Any]] = {200: {"model": Asset, "description": "It was here already"}}
 
-router = APIRouter(prefix="/assets", tags=["assets"])
+router = APIRouter(tags=["assets"])
+add_list(router, "assets", Asset, Asset.model_validate)
 
 
-@router.put("/{asset}", status_code=201, responses=REPEATED, **UPLOAD)
+@router.put("/assets/{asset}", status_code=201, responses=REPEATED, **UPLOAD)
 async def put_asset(
     kind: Kind, request: Request, response: Response, deps: Deps, owner: Caller, sha256: Sha256 = None
 ) -> Asset:
@@ -53,7 +52,7 @@ async def put_asset(
         if asset is not None and asset.kind == kind and asset.file.exists():
             response.status_code = 200
         else:
-            content = await check_upload(deps, kind, draft, draft.parent)
+            content = await check_upload(deps, kind, draft)
             asset = await in_thread(deps, deps.store.add_asset, owner, kind, draft, digest, content)
     response.headers["Location"] = f"/assets/{asset.id}"
     return asset
@@ -132,35 +131,28 @@ def require_file(request: Request) -> None:
         raise UnsupportedMedia("Content-Type", expected="the file itself as the body", got=media[:80], hint=hint)
 
 
-async def check_upload(deps: Parts, kind: str, file: Path, scratch: Path, **more: Any) -> dict[str, Any]:
-    """Check a file in a child; return what its task returns.
-
-    Args:
-        more: other fields of the order.
-    """
-    size = sum(Path(path).stat().st_size for path in (file, *([more["cameras"]] if "cameras" in more else [])))
-    names = {str(file): kind, f"text table {file.name}": kind} | more.pop("names", {})
-    memory = min(deps.settings.check_memory_bytes, CHECK_BASE_BYTES + CHECK_FACTOR * size)
-    order = {"task": "check", "kind": kind, "file": str(file), "scratch": str(scratch), "memory": memory}
-    order |= {"names": names, **more}
-    seconds = deps.settings.check_seconds
-    return await anyio.to_thread.run_sync(deps.children.check, order, seconds, kind, limiter=deps.checks)
-
-
-@router.get("")
-def list_assets(deps: Deps, owner: Caller, limit: Limit = models.PAGE, cursor: Cursor = None) -> Assets:
-    """List the assets, newest first, in pages. Names of views and words are given with each single asset."""
-    rows, following = deps.store.page("assets", owner, limit, cursor)
-    return Assets(assets=[Asset(**row) for row in rows], next=following)
+async def check_upload(deps: Parts, kind: str, draft: Path, cameras: Asset | None = None) -> dict[str, Any]:
+    """Check a file in a child, a lift with other cameras; return what its task returns."""
+    size, settings = draft.stat().st_size + (cameras.bytes if cameras else 0), deps.settings
+    order = {
+        "task": "check", "kind": kind, "file": str(draft), "scratch": str(draft.parent),
+        "memory": min(settings.check_memory_bytes, CHECK_BASE_BYTES + CHECK_FACTOR * size),
+        "names": {str(draft): kind, f"text table {draft.name}": kind},
+    }  # fmt: skip
+    if cameras is not None:
+        order |= {"cameras": str(cameras.file)}
+        order["names"][str(cameras.file)] = cameras.client_name
+    check = deps.children.check
+    return await anyio.to_thread.run_sync(check, order, settings.check_seconds, kind, limiter=deps.checks)
 
 
-@router.get("/{asset}")
+@router.get("/assets/{asset}")
 def get_asset(asset: str, deps: Deps, owner: Caller) -> Asset:
     """Get one asset, with the names of its views or its words if they are not very many."""
     return deps.store.asset(owner, asset)
 
 
-@router.get("/{asset}/content", response_class=Response, responses=content_of(BINARY))
+@router.get("/assets/{asset}/content", response_class=Response, responses=content_of(BINARY))
 def get_asset_content(asset: str, request: Request, deps: Deps, owner: Caller) -> Response:
     """Download an asset, or a range of its bytes."""
     record = deps.store.asset(owner, asset)
@@ -168,19 +160,7 @@ def get_asset_content(asset: str, request: Request, deps: Deps, owner: Caller) -
     return file_answer(request, record.file, record.bytes, digest, record.download_name)
 
 
-@router.patch("/{asset}", status_code=201)
-async def change_pack(asset: str, change: models.PackChange, deps: Deps, owner: Caller) -> Asset:
-    """Set the encoder or the text space of a feature pack: returns a new asset with the same features."""
-    source = await in_thread(deps, deps.store.asset, owner, asset, "features")
-    async with open_scratch(deps) as folder:
-        draft, changes = folder / "pack", change.model_dump(exclude_none=True)
-        names = {str(source.file): source.client_name}
-        more = {"task": "retag", "changes": changes, "output": str(draft), "names": names}
-        content = await check_upload(deps, "features", source.file, folder, **more)
-        return await in_thread(deps, deps.store.add_asset, owner, "features", draft, content["sha256"], content)
-
-
-@router.delete("/{asset}", status_code=204)
+@router.delete("/assets/{asset}", status_code=204)
 def delete_asset(asset: str, deps: Deps, owner: Caller) -> None:
     """Delete an asset. Refused (409) while a job or a lift refers to it."""
     deps.store.delete_asset(owner, asset)

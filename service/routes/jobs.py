@@ -10,9 +10,8 @@ from fastapi import APIRouter, Header, Query, Response
 from fastapi.sse import EventSourceResponse, format_sse_event
 
 from liftcore.errors import SplatliftError
-from service import models
-from service.models import FINAL_STATES, Job, Jobs, LiftRequest, Plan, TradeoffRequest
-from service.routes import Caller, Cursor, Deps, Limit, Parts
+from service.models import FINAL_STATES, Job, LiftRequest, Plan, TradeoffRequest
+from service.routes import Caller, Deps, Parts, add_list
 from service.store import Owner, assets_of
 
 POLL_SECONDS = 0.25  # between polls for new events
@@ -39,6 +38,7 @@ EVENTS: dict[int | str, dict[str, Any]] = {
 }
 
 router = APIRouter(tags=["jobs"])
+add_list(router, "jobs", Job, Job.model_validate)
 
 
 @router.post("/lift", status_code=202, responses=REPEATED)
@@ -80,13 +80,6 @@ def _plan(order: dict[str, Any], deps: Parts, owner: Owner) -> dict[str, Any]:
             "names": {str(item.file): item.client_name for item in (splats, cameras, *packs)},
         }  # fmt: skip
         return deps.children.check(work, settings.check_seconds, "plan")
-
-
-@router.get("/jobs")
-def list_jobs(deps: Deps, owner: Caller, limit: Limit = models.PAGE, cursor: Cursor = None) -> Jobs:
-    """List the jobs, newest first, in pages."""
-    rows, following = deps.store.page("jobs", owner, limit, cursor)
-    return Jobs(jobs=[Job(**row) for row in rows], next=following)
 
 
 @router.get("/jobs/{job}")

@@ -8,23 +8,22 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as PathParameter
 from fastapi.responses import StreamingResponse
-from starlette.background import BackgroundTask
 from starlette.convertors import register_url_convertor
 
 from liftcore.errors import NotFound
 from liftcore.files import in_camera_orientation
 from service import models, results
-from service.models import Lift, Lifts
+from service.models import Lift
 from service.routes import (
     BINARY,
     Caller,
     CallerKey,
-    Cursor,
     Deps,
     Limit,
     Number,
     OneOf,
     Parts,
+    add_list,
     cache_headers,
     content_of,
     file_answer,
@@ -51,13 +50,7 @@ Layer = Annotated[
 REPEATED: dict[int | str, dict[str, Any]] = {200: {"model": Lift, "description": "It was here already"}}
 
 router = APIRouter(tags=["lifts"])
-
-
-@router.get("/lifts")
-def list_lifts(deps: Deps, owner: Caller, limit: Limit = models.PAGE, cursor: Cursor = None) -> Lifts:
-    """List the lifts, newest first, in pages."""
-    rows, following = deps.store.page("lifts", owner, limit, cursor)
-    return Lifts(lifts=[Lift.of_row(row) for row in rows], next=following)
+add_list(router, "lifts", Lift, Lift.of_row)
 
 
 @router.post("/lifts", status_code=201, responses=REPEATED, **UPLOAD)
@@ -79,11 +72,8 @@ async def create_lift(
         if lift is not None:
             response.status_code = 200
         else:
-            more = {}
-            if cameras is not None:
-                asset = await in_thread(deps, deps.store.asset, owner, cameras, "cameras")
-                more = {"cameras": str(asset.file), "names": {str(asset.file): asset.client_name}}
-            content = await check_upload(deps, "lift", draft, draft.parent, **more)
+            asset = cameras and await in_thread(deps, deps.store.asset, owner, cameras, "cameras")
+            content = await check_upload(deps, "lift", draft, asset)
             lift = await in_thread(deps, results.add_lift, deps.store, owner, draft, content, cameras)
     response.headers["Location"] = f"/lifts/{lift.id}"
     return lift
@@ -109,23 +99,9 @@ def get_lift(lift: str, deps: Deps, owner: Caller) -> Lift:
 
 @router.get("/lifts/{lift}/features", response_class=Response, responses=content_of(BINARY))
 def get_lift_features(lift: str, request: Request, deps: Deps, owner: Caller) -> Response:
-    """Download the lift file (safetensors), or a range of it, with the ``world`` that a PATCH set."""
+    """Download the lift file (safetensors) as it was made, or a range of it."""
     record = deps.store.lift(owner, lift)
-    name = f"lift-{record.id}.safetensors"
-    if not record.is_world_changed:
-        return file_answer(request, record.file, record.bytes, record.sha256, name)
-    tag = hashlib.sha256(f"{record.sha256} {record.world.model_dump_json()}".encode()).hexdigest()
-    scratch = deps.store.scratch()
-    folder = scratch.__enter__()
-    try:
-        if not results.changed_copy(record, draft := folder / "lift"):
-            draft, tag = record.file, record.sha256
-    except BaseException:
-        scratch.__exit__(None, None, None)
-        raise
-    answer = file_answer(request, draft, draft.stat().st_size, tag, name)
-    answer.background = BackgroundTask(scratch.__exit__, None, None, None)
-    return answer
+    return file_answer(request, record.file, record.bytes, record.sha256, f"lift-{record.id}.safetensors")
 
 
 @router.get("/tradeoffs/{tradeoff}", tags=["trade-offs"])

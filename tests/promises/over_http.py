@@ -126,5 +126,5 @@ def request_to(client: Any, path: str, description: dict[str, Any], values: dict
             name = part.get("$ref", "").rpartition("/")[2]
             schema = client.get("/openapi.json").json()["components"]["schemas"].get(name, schema)
         fields = {name: values[name] for name in schema.get("properties", ()) if name in values}
-        options["json"] = {"encoder": "x"} if path == "/assets/{asset}" else fields
+        options["json"] = fields
     return options
