@@ -56,12 +56,7 @@ class Auth:
         await self._app(scope, receive, send)
 
     async def _caller(self, headers: Headers, line: str) -> tuple[Owner, Key | None]:
-        """Return who sends a request, and the key.
-
-        Raises:
-            Unauthorized: the service wants a key, and none of its keys came.
-            Forbidden: the key may not do that.
-        """
+        """Return who sends a request, and the key."""
         if OPEN.fullmatch(line):
             return NOBODY, None
         authorization = headers.getlist("authorization")
@@ -80,12 +75,7 @@ class Auth:
         return Owner(key.id, "admin" in key.scopes.split(), json.dumps(key.lifts)), key
 
     def _require_host(self, method: str, headers: Headers) -> None:
-        """Require that a request is for this service, and that no page of another site sends it.
-
-        Raises:
-            Misdirected: the Host is another.
-            Forbidden: a page of another site sends more than a GET.
-        """
+        """Require that a request is for this service, and that no page of another site sends it."""
         hosts, origins = headers.getlist("host"), headers.getlist("origin")
         name = host_name(hosts[0]) if len(hosts) == 1 else None
         if name is None or not (name in self._hosts or (self._takes_addresses and is_address(name))):
@@ -104,11 +94,7 @@ class Auth:
 
 
 def require_scope(key: Key, line: str) -> None:
-    """Require that a key may do what needs a scope: of a request's method and path.
-
-    Raises:
-        Forbidden: it may not.
-    """
+    """Require that a key may do what needs a scope: of a request's method and path."""
     scopes, needed = key.scopes.split(), "read" if READS.fullmatch(line) else "write"
     is_shared = "shared" in scopes and needed == "read" and SHARED.fullmatch(line.partition(" ")[2])
     if not (needed in scopes or "admin" in scopes or is_shared):
@@ -117,12 +103,7 @@ def require_scope(key: Key, line: str) -> None:
 
 
 def require_length(headers: Headers, line: str) -> None:
-    """Require that the head of a request announces no more than may come.
-
-    Raises:
-        InvalidRequest: the end of the body is told in two ways.
-        TooLarge: it is too long for JSON.
-    """
+    """Require that the head of a request announces no more than may come."""
     length = headers.get("content-length", "0")
     if "transfer-encoding" in headers and "content-length" in headers:  # a proxy may see another end (RFC 9112)
         raise InvalidRequest("Content-Length", expected="either it or Transfer-Encoding", got="both")

@@ -163,12 +163,7 @@ class Fault(Exception):
 
 
 def fault_of(error: SplatliftError, names: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """Return the error as the JSON of a problem, for an answer, another process or the database.
-
-    Args:
-        error: the error.
-        names: path of the server -> the name that the client knows: paths of the server are private.
-    """
+    """Return the error as the JSON of a problem, with clients' names for private paths of the server."""
     if isinstance(error, ServiceError):
         status, title = error.status, error.title
     else:

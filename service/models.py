@@ -130,11 +130,7 @@ class LiftRequest(LiftInputs):
     )
 
     def job(self) -> dict[str, Any]:
-        """Return the columns of the job.
-
-        Raises:
-            InvalidSettings: a setting is unknown or out of range.
-        """
+        """Return the columns of the job."""
         settings = LiftSettings.of_json(self.settings).model_dump(mode="json")
         return self.order("lift", {} if self.table is None else {"table": self.table}, settings)
 
@@ -160,11 +156,7 @@ class TradeoffRequest(LiftInputs):
     )
 
     def job(self) -> dict[str, Any]:
-        """Return the columns of the job.
-
-        Raises:
-            InvalidSettings: a setting is unknown or out of range.
-        """
+        """Return the columns of the job."""
         if "quality" in self.settings:
             expected, got = "settings that are the same in all runs", "one that is compared"
             raise InvalidSettings("quality", expected=expected, got=got)

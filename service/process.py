@@ -174,11 +174,7 @@ def is_last(message: Message) -> bool:
 
 
 class Children:
-    """Starts children, and keeps one spare.
-
-    Args:
-        threads: of each, for the libraries that it loads.
-    """
+    """Starts children with so many threads, and keeps one spare."""
 
     def __init__(self, threads: int = 1) -> None:
         self.stopping = threading.Event()
@@ -212,9 +208,6 @@ class Children:
             take: called with each message before the last.
             why_end: called a few times a second; a reason ends the child.
             reusable: True if the child may take other orders afterwards, else its group is ended.
-
-        Raises:
-            Busy: the server stops, or there is no room for a process.
         """
         child, last = self._take(), None
         if not reusable:
@@ -251,13 +244,7 @@ class Children:
         return Ending(None, "".join(reasons) or f"its process ended with {ending}", was_killed)
 
     def check(self, order: Message, seconds: float, argument: str) -> Message:
-        """Return the result of an order that a request waits for. After a kill from outside it is sent once more.
-
-        Raises:
-            Fault: the error that the child reports.
-            InvalidRequest: the order ended its process, or took too long.
-            Busy: the server stops, or processes were killed twice.
-        """
+        """Return the result of an order that a request waits for. After a kill from outside it is sent once more."""
         ending = self.run(order, seconds, reusable=True)
         if ending.was_killed:
             ending = self.run(order, seconds, reusable=True)

@@ -64,13 +64,7 @@ class QueryClient:
             self._child.close()
 
     def call(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Send a request to the worker and return its answer: a ``value``, or the ``content``, empty if it is a file.
-
-        Raises:
-            Fault: the worker's own error.
-            Busy: too many calls wait, the server stops, or the process was killed again and again.
-            TimedOut: the answer took too long.
-        """
+        """Send a request to the worker; return its answer: a ``value``, or the ``content``, empty if it is a file."""
         deadline = time.monotonic() + self._seconds
         self.calls += 1
         if not self._places.acquire(blocking=False):

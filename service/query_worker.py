@@ -114,11 +114,7 @@ class Answers:
         self._warm_kernel(Kernel.GAUSSIAN_3D)
 
     def reply(self, request: Request) -> tuple[dict[str, Any], Iterable[bytes]]:
-        """Return the value for a request by its ``operation``, or the content of its answer.
-
-        Raises:
-            SplatliftError: the request cannot be answered.
-        """
+        """Return the value for a request by its ``operation``, or the content of its answer."""
         operation = request["operation"]
         if request["lift"] in self._scenes:  # each request describes its selections, whatever another request set
             self._scenes[request["lift"]].selections.clear()
@@ -381,20 +377,12 @@ def json_of(document: dict[str, Any]) -> bytes:
 
 
 def view_of(request: Request) -> str | Camera:
-    """Return the camera of a picture: a view of the scene, or the camera in the request.
-
-    Raises:
-        InvalidCameras, InvalidQuery: it is not a camera, or there are two.
-    """
+    """Return the camera of a picture: a view of the scene, or the camera in the request."""
     return Viewpoint(view=request.get("view"), camera=request.get("camera")).seen_from()
 
 
 def write_answer(out: BinaryIO, header: dict[str, Any], blocks: Iterable[bytes], draft: Path) -> None:
-    """Write an answer: a small one to the pipe, a large one to the draft that the HTTP process sends and removes.
-
-    Raises:
-        NoSpace: the disk is full.
-    """
+    """Write an answer: a small one to the pipe, a large one to the draft that the HTTP process sends and removes."""
     rest, content = iter(blocks), b""
     for block in rest:
         content += block

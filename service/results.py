@@ -17,11 +17,7 @@ MOST_SHARES = 100  # valid keys of one lift
 
 
 def change_lift(store: Store, owner: Owner, lift: str, changes: dict[str, Any]) -> Lift:
-    """Set a lift's ``name``, ``photos`` (an asset) or ``world``; None removes them.
-
-    Raises:
-        NotFound: there is no such lift, or there are no such photos.
-    """
+    """Set a lift's ``name``, ``photos`` (an asset) or ``world``; None removes them."""
     with store.write() as connection:
         store.lift(owner, lift)
         if photos := changes.get("photos"):
@@ -47,10 +43,6 @@ def add_lift(store: Store, owner: Owner, draft: Path, content: dict[str, Any], c
     Args:
         content: ``sha256``, ``count``, ``channels`` and ``metadata``, as its check returned them.
         cameras: an asset with the same poses, in place of the cameras that the lift names.
-
-    Raises:
-        NotFound: its splats or its cameras are not here.
-        InvalidLift: it does not fit them.
     """
     metadata = content["metadata"]
     files = (metadata["splats"], metadata["cameras"], *metadata["features"])
@@ -80,11 +72,7 @@ def add_lift(store: Store, owner: Owner, draft: Path, content: dict[str, Any], c
 
 
 def get_tradeoff(store: Store, owner: Owner, tradeoff: str) -> tuple[Tradeoff, bytes]:
-    """Return the trade-off of that id, and its chart as a PNG.
-
-    Raises:
-        NotFound: there is none.
-    """
+    """Return the trade-off of that id, and its chart as a PNG."""
     rows = store.rows("SELECT * FROM tradeoffs WHERE id = :id", id=tradeoff)
     if not rows:
         hint = "POST /tradeoff makes one; it has its job's id"
@@ -106,12 +94,7 @@ def list_shares(store: Store, lift: str) -> list[Share]:
 
 
 def create_share(store: Store, maker: Key | None, lift: str, name: str, seconds: float) -> NewShare:
-    """Create a key that can read and query a lift. It ends with the key that makes it, at the latest.
-
-    Raises:
-        InvalidRequest: the service needs no keys.
-        Conflict: the lift has as many as it may.
-    """
+    """Create a key that can read and query a lift. It ends with the key that makes it, at the latest."""
     if maker is None:
         hint, got = "the operator makes a first key with splatlift keys create", "one that is open to its machine"
         raise InvalidRequest("Authorization", expected="a service that wants keys", got=got, hint=hint)
@@ -125,11 +108,7 @@ def create_share(store: Store, maker: Key | None, lift: str, name: str, seconds:
 
 
 def delete_share(store: Store, lift: str, share: str) -> None:
-    """Take a lift away from a key; a key without lifts is revoked.
-
-    Raises:
-        NotFound: it was not given to that key.
-    """
+    """Take a lift away from a key; a key without lifts is revoked."""
     with store.write() as connection:
         rows = store.rows("SELECT lifts FROM keys WHERE id = :id", id=share)
         lifts = rows[0]["lifts"] if rows else []

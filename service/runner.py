@@ -26,11 +26,7 @@ log = logging.getLogger(__name__)
 
 
 class Runner:
-    """Runs jobs until it is stopped.
-
-    Args:
-        store: that holds the jobs. children: that do them.
-    """
+    """Runs jobs until it is stopped."""
 
     def __init__(self, store: Store, children: Children, settings: ServiceSettings) -> None:
         self._store, self._children, self._settings = store, children, settings

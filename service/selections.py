@@ -44,10 +44,6 @@ def get_selection(store: Store, lift: str, selection: str, versions: frozenset[i
 
     Args:
         versions: of which it must have one; None for any.
-
-    Raises:
-        NotFound: the lift has none.
-        VersionMismatch: it has another version.
     """
     rows = store.rows(f"{CURRENT} AND selections.id = :id", lift=lift, id=selection)
     if not rows:
@@ -76,13 +72,7 @@ def bits_of_selection(store: Store, selection: Selection) -> bytes:
 
 
 def create_selection(store: Store, owner: Owner, lift: str, name: str, splats: SplatSet) -> Selection:
-    """Store a new selection of a lift.
-
-    Raises:
-        NotFound: the lift was deleted meanwhile.
-        Conflict: the lift has as many as it may.
-        NoSpace: there is no room for it.
-    """
+    """Store a new selection of a lift."""
     store.require_room(len(splats.bits))
     selection, now = secrets.token_hex(8), time.time()
     with store.write() as connection:
@@ -96,12 +86,7 @@ def create_selection(store: Store, owner: Owner, lift: str, name: str, splats: S
 
 
 def extend_selection(store: Store, selection: Selection, splats: SplatSet) -> Selection:
-    """Add a step to the history; the steps that were undone go, and the oldest ones over the limit.
-
-    Raises:
-        VersionMismatch: it was changed since it was read.
-        NoSpace: there is no room for it.
-    """
+    """Add a step to the history; the steps that were undone go, and the oldest ones over the limit."""
     store.require_room(len(splats.bits))
     with store.write() as connection:
         before = get_selection(store, selection.lift, selection.id, frozenset({selection.version}))
@@ -116,12 +101,7 @@ def extend_selection(store: Store, selection: Selection, splats: SplatSet) -> Se
 def change_selection(
     store: Store, lift: str, selection: str, changes: dict[str, Any], versions: frozenset[int] | None
 ) -> Selection:
-    """Set the ``name``, or go to another ``step`` of the history.
-
-    Raises:
-        NotFound, VersionMismatch: as `get_selection` has it.
-        InvalidRequest: there is no such step.
-    """
+    """Set the ``name``, or go to another ``step`` of the history."""
     with store.write() as connection:
         before = get_selection(store, lift, selection, versions)
         step = changes.get("step", before.step)
@@ -162,12 +142,7 @@ def object_labels(store: Store, lift: str) -> list[ObjectLabel]:
 def change_object_label(
     store: Store, owner: Owner, lift: str, object_id: int, changes: dict[str, Any]
 ) -> ObjectLabel:
-    """Set the ``name`` of an object (None: its own), or ``hidden``.
-
-    Raises:
-        NotFound: the lift was deleted meanwhile.
-        Conflict: too many others of the lift have been changed.
-    """
+    """Set the ``name`` of an object (None: its own), or ``hidden``."""
     with store.write() as connection:
         store.lift(owner, lift)
         if len(object_labels(store, lift)) >= MOST_LABELS:

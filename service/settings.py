@@ -88,14 +88,7 @@ def variables() -> Iterator[tuple[str, str, str]]:
 
 
 def read_settings(**values: Any) -> ServiceSettings:
-    """Return the settings: of a command line, else of the environment, else the defaults.
-
-    Args:
-        values: field -> value; None is not set.
-
-    Raises:
-        Misconfigured: a value that a setting does not take.
-    """
+    """Return the settings: of a command line (None is not set), else of the environment, else the defaults."""
     try:
         return ServiceSettings(**{name: value for name, value in values.items() if value is not None})
     except SettingsError:  # malformed JSON in a variable
@@ -114,9 +107,6 @@ def encoder_spec(settings: ServiceSettings, text_space: str, requested: str | No
 
     The default stands in for a space that has none only where the operator chose it: scores of an encoder of another
     space look like any others, and mean nothing. A lift with words of its own is queried in these.
-
-    Raises:
-        InvalidRequest: no encoder is configured by that name, or for the lift's text space.
     """
     if requested == "default":
         return settings.encoder
@@ -171,9 +161,6 @@ def require_encoder_files(settings: ServiceSettings) -> None:
     """Require that every file of a text encoder is there, and that tables look like tables.
 
     The query process opens an encoder at its first question, whose client could not mend the error.
-
-    Raises:
-        Misconfigured: there is no such encoder, a file is missing or does not open, or a table is none.
     """
     specs = {"encoder": settings.encoder}
     specs |= {f"text_spaces, {space!r}": spec for space, spec in settings.text_spaces.items()}

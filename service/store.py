@@ -103,9 +103,6 @@ class Store:
     Args:
         root: the directory; made if it is not there.
         floor_bytes: free disk that new work must leave.
-
-    Raises:
-        Misconfigured: another server holds it, or its database is missing or of another schema.
     """
 
     def __init__(self, root: Path, floor_bytes: int = 0) -> None:
@@ -157,11 +154,7 @@ class Store:
         return status.st_dev, status.st_ino
 
     def require_usable(self) -> None:
-        """Require that the database is the file that was opened and can be written, and that the disk has room.
-
-        Raises:
-            OSError, sqlite3.Error, NoSpace: it is not so.
-        """
+        """Require that the database is the file that was opened and can be written, and that the disk has room."""
         if self._identify() != self._identity:
             raise sqlite3.OperationalError("another file is in the place of the database")
         self.require_room()
@@ -238,11 +231,7 @@ class Store:
         return shutil.disk_usage(self.root).free
 
     def require_room(self, coming: int = 0) -> None:
-        """Require free disk for new work, of which so many bytes are known.
-
-        Raises:
-            NoSpace: less than the floor would be left.
-        """
+        """Require free disk for new work, of which so many bytes are known."""
         free = self.free_bytes()
         if free - coming < self._floor_bytes:
             raise NoSpace(
@@ -310,11 +299,7 @@ class Store:
         return Asset(**rows[0]) if rows else None
 
     def asset(self, owner: Owner, asset: str, kind: str | None = None) -> Asset:
-        """Return the asset of that id and kind.
-
-        Raises:
-            NotFound: there is none, or it is of another kind.
-        """
+        """Return the asset of that id and kind."""
         record = self.find_asset(owner, asset)
         if record is not None and kind in (None, record.kind):
             return record
@@ -323,12 +308,7 @@ class Store:
         raise NotFound(kind or "asset", expected=expected, got=got, hint="PUT /assets/... first")
 
     def delete_asset(self, owner: Owner, asset: str) -> None:
-        """Remove an asset from its owner, or from all owners for an admin. The bytes go with the last owner.
-
-        Raises:
-            NotFound: there is none.
-            Conflict: a job or a lift of theirs refers to it.
-        """
+        """Remove an asset from its owner, or from all owners for an admin. The bytes go with the last owner."""
         with self._blobs_lock, self._room_to_delete():
             record = self.asset(owner, asset)
             with self.write() as connection:
@@ -366,11 +346,6 @@ class Store:
 
         Returns:
             The job, and True if it is new.
-
-        Raises:
-            NotFound: an asset is missing.
-            Busy: as many jobs are in line as may be.
-            InvalidRequest: the key came with another order before.
         """
         digest = hashlib.sha256(json.dumps(order, sort_keys=True).encode()).hexdigest()
         with self.write():
@@ -407,11 +382,7 @@ class Store:
         return columns["id"]
 
     def job(self, owner: Owner, job: str) -> Job:
-        """Return the job of that id.
-
-        Raises:
-            NotFound: there is none.
-        """
+        """Return the job of that id."""
         rows = self.rows(f"SELECT * FROM jobs WHERE id = :id AND {VISIBLE}", id=job, **vars(owner))
         if not rows:
             raise NotFound("job", expected="the id of a job", got=job[:80])
@@ -508,12 +479,7 @@ class Store:
                 self._move(row["id"], state, attempt=row["attempt"] - 1, progress=None)
 
     def cancel(self, owner: Owner, job: str) -> Job:
-        """Cancel a job: a queued one at once, a running one when its processes have ended.
-
-        Raises:
-            NotFound: there is none.
-            Conflict: it has succeeded or failed.
-        """
+        """Cancel a job: a queued one at once, a running one when its processes have ended."""
         with self.write():
             state = self.job(owner, job).state
             if state in ("succeeded", "failed"):
@@ -523,12 +489,7 @@ class Store:
         return self.job(owner, job)
 
     def delete_job(self, owner: Owner, job: str, *, with_result: bool) -> None:
-        """Delete a job that has ended, with its events and its result.
-
-        Raises:
-            NotFound: there is none.
-            Conflict: it has not ended, or it has a result and ``with_result`` is False.
-        """
+        """Delete a job that has ended, with its events and its result."""
         with self._room_to_delete(), self.write() as connection:
             record = self.job(owner, job)
             if record.state not in FINAL_STATES:
@@ -549,11 +510,7 @@ class Store:
         shutil.rmtree(self.work(job), ignore_errors=True)
 
     def events(self, owner: Owner, job: str, after: int) -> list[dict[str, Any]]:
-        """Return ``number``, ``kind`` and ``data`` (JSON text) of the events of a job after a number.
-
-        Raises:
-            NotFound: there is no such job, or the key that follows it is no longer valid.
-        """
+        """Return ``number``, ``kind`` and ``data`` (JSON text) of the events of a job after a number."""
         self.job(owner, job)
         valid = f"SELECT 1 FROM keys WHERE id = :owner AND {VALID}"
         if owner.owner and not self.rows(valid, owner=owner.owner, now=time.time()):
@@ -576,12 +533,7 @@ class Store:
     # Lifts
 
     def lift(self, owner: Owner, lift: str | None) -> Lift:
-        """Return the lift of that id; the only one without an id.
-
-        Raises:
-            NotFound: there is none.
-            InvalidRequest: there are several, so one must be named.
-        """
+        """Return the lift of that id; the only one without an id."""
         select = f"{LIFTS} WHERE {VISIBLE} AND id = coalesce(:id, id) LIMIT 2"
         rows = self.rows(select, id=lift, **vars(owner))
         if len(rows) == 1:
@@ -616,11 +568,7 @@ def sync(path: Path) -> None:
 
 
 def require_whole(path: Path, size: int) -> None:
-    """Require that a file still has its stored size; a pipe in its place would block.
-
-    Raises:
-        NotFound: it is not there, or no longer what was stored.
-    """
+    """Require that a file still has its stored size; a pipe in its place would block."""
     with suppress(OSError):
         status = path.stat()
         if stat.S_ISREG(status.st_mode) and status.st_size == size:
@@ -631,11 +579,7 @@ def require_whole(path: Path, size: int) -> None:
 
 
 def require_database(root: Path) -> None:
-    """Require a database, or nothing that one belongs to.
-
-    Raises:
-        Misconfigured: there are files without it.
-    """
+    """Require a database, or nothing that one belongs to."""
     is_new = not ((root / DATABASE).exists() and (root / DATABASE).stat().st_size)
     if is_new and any(file for name in ("blobs", "lifts") for file in root.glob(f"{name}/*")):
         hint = "put its newest backup there, or name another directory with --data"
@@ -644,11 +588,7 @@ def require_database(root: Path) -> None:
 
 
 def connect(path: Path, mode: str = "rwc") -> sqlite3.Connection:
-    """Return a connection to the database; ``rwc`` makes it and its tables if it is not there.
-
-    Raises:
-        Misconfigured: it is no database, or of another schema.
-    """
+    """Return a connection to the database; ``rwc`` makes it and its tables if it is not there."""
     uri = f"{path.absolute().as_uri()}?mode={mode}"
     try:
         connection = sqlite3.connect(
@@ -677,11 +617,7 @@ def connect(path: Path, mode: str = "rwc") -> sqlite3.Connection:
 
 @contextmanager
 def open_keys(root: Path, *, make: bool = False) -> Iterator[sqlite3.Connection]:
-    """Yield a connection for changes of keys, also while a server holds the directory.
-
-    Raises:
-        NotFound: there is no database, and none is to be made.
-    """
+    """Yield a connection for changes of keys, also while a server holds the directory."""
     if make:
         root.mkdir(parents=True, exist_ok=True, mode=0o700)
         os.umask(0o077)
@@ -716,11 +652,7 @@ def list_keys(connection: sqlite3.Connection) -> list[Key]:
 
 
 def revoke_key(connection: sqlite3.Connection, key: str) -> Key:
-    """Revoke a key, and the keys with which it shared lifts. What it made stays, for admins.
-
-    Raises:
-        NotFound: there is none of that id.
-    """
+    """Revoke a key, and the keys with which it shared lifts. What it made stays, for admins."""
     update = "UPDATE keys SET revoked = coalesce(revoked, ?) WHERE id = ? OR maker = ?"
     connection.execute(update, (time.time(), key, key))
     row = connection.execute("SELECT * FROM keys WHERE id = ?", (key,)).fetchone()

@@ -55,11 +55,7 @@ log = logging.getLogger(__name__)
 
 
 def check(order: Order, report: Reporter) -> dict[str, Any]:
-    """Check one file of a kind whole; return its ``suffix``, ``counts`` and ``warnings``.
-
-    Raises:
-        InvalidInput: it is malformed, of another kind, or could run code.
-    """
+    """Check one file of a kind whole; return its ``suffix``, ``counts`` and ``warnings``."""
     kind, path = order["kind"], Path(order["file"])
     try:
         if kind == "lift":
@@ -154,11 +150,7 @@ def check_lift(path: Path, cameras: str | None) -> dict[str, Any]:
 
 
 def lift_content(path: Path, shape: Sequence[int], metadata: dict[str, Any]) -> dict[str, Any]:
-    """Return the columns of a lift's row; of long metadata the names of views and the words are left out.
-
-    Raises:
-        InvalidLift: the rest is too long.
-    """
+    """Return the columns of a lift's row; of long metadata the names of views and the words are left out."""
     views = metadata["views"]
     if len(json.dumps(metadata)) > SHOWN_BYTES:
         metadata = metadata | {"views": [], "words": []}

@@ -71,11 +71,7 @@ def run(options: argparse.Namespace) -> int:
 
 @contextmanager
 def serving(data: Path, encoder: str, log: Path) -> Iterator[str]:
-    """Run ``splatlift serve`` on a free port during the block; yield its address.
-
-    Raises:
-        Unavailable: the service does not start; the message holds the end of its log.
-    """
+    """Run ``splatlift serve`` on a free port during the block; yield its address."""
     options = ["--port", "0", "--data", str(data), "--encoder", encoder, "--json"]
     command = [sys.executable, "-m", "liftcore.cli", "serve", *options]
     with (
@@ -106,11 +102,7 @@ class Client:
         self.http = httpx.Client(base_url=url, timeout=TIMEOUT, trust_env=False)
 
     def call(self, method: str, path: str, **options: Any) -> httpx.Response:
-        """Return the response to a request.
-
-        Raises:
-            InvalidInput: the service refused it. Unavailable: it cannot be reached, or failed itself.
-        """
+        """Return the response to a request."""
         try:
             response = self.http.request(method, path, **options)
         except httpx.HTTPError as error:
@@ -288,9 +280,6 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path) -> DemoScene
     Args:
         folder: holds splats, cameras and a pack. scratch: the folder for the zipped model.
         phrases: of the queries; empty = those in ``truth.json``.
-
-    Raises:
-        InvalidInput: something is missing, or there are no words to ask the phrases with; the error says what.
     """
     if not folder.is_dir():
         raise InvalidInput("--scene", expected="a folder", got=f"nothing at {folder}")

@@ -95,9 +95,6 @@ def serve(
 
     Args:
         announce: called with the address. prepare: called with the store before the start.
-
-    Raises:
-        Misconfigured: the address or the data directory cannot be used.
     """
     with closing(bind(settings.host, settings.port)) as listener, logging_to_stderr():
         with data_directory_errors():
@@ -153,11 +150,7 @@ def data_directory_errors() -> Iterator[None]:
 
 
 def require_keys(settings: ServiceSettings) -> None:
-    """Require keys if the service is reachable from other machines.
-
-    Raises:
-        Misconfigured: the address is not loopback, and there is no key.
-    """
+    """Require keys if the service is reachable from other machines."""
     if is_loopback(settings.host):
         return
     with data_directory_errors():
@@ -173,11 +166,7 @@ def require_keys(settings: ServiceSettings) -> None:
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """Return a listening socket.
-
-    Raises:
-        Misconfigured: the address is not of this machine, or it is taken.
-    """
+    """Return a listening socket."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     # asyncio disables Nagle's algorithm only if TCP is named; else answers on kept connections wait 40 ms.
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)

@@ -65,11 +65,7 @@ def files_of(data: Path) -> list[tuple[str, int, str]]:
 
 
 def back_up(data: Path, target: Path) -> int:
-    """Copy a data directory, also while a server holds it; return the number of files beside the database.
-
-    Raises:
-        Misconfigured: the target is there already, or files that the database names are lost.
-    """
+    """Copy a data directory, also while a server holds it; return the number of files beside the database."""
     if target.exists():
         hint = "move it away first"
         raise Misconfigured("directory", expected="one that is not there yet", got=str(target), hint=hint)
@@ -138,11 +134,7 @@ def verify(data: Path) -> list[str]:
 
 
 def clean(data: Path) -> list[str]:
-    """Remove the files that no row names; return their paths below the directory.
-
-    Raises:
-        Misconfigured: a server holds the directory, which may be about to add their rows.
-    """
+    """Remove the files that no row names; return their paths below the directory."""
     with closing(Store(data)) as store:
         paths = store.unnamed_files()
         for path in paths:

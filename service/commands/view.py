@@ -109,11 +109,7 @@ def show_file(path: Path, port: int, *, browser: bool) -> None:
 
 
 def metadata_of(path: Path) -> dict[str, Any]:
-    """Return the metadata of a lift file.
-
-    Raises:
-        InvalidLift: it is none.
-    """
+    """Return the metadata of a lift file."""
     try:
         handle: Any
         with safe_open(str(path), framework="np") as handle:
@@ -127,10 +123,6 @@ def adopt(store: Store, settings: ServiceSettings, path: Path, metadata: dict[st
     """Add a lift and the files that it was made of to a store, by links; return the lift's id.
 
     Packs that moved are left out: only examples of regions need them.
-
-    Raises:
-        InvalidLift: its splats or cameras are not where it remembers them.
-        InvalidInput: one of its files is malformed, or of a format that may hold code.
     """
     packs = [("features", file) for file in metadata["features"] if Path(file["path"]).is_file()]
     children = Children()

@@ -98,11 +98,7 @@ def unchanged(request: Request, etag: str, *, exists: bool = True) -> Response |
 
 
 def file_answer(request: Request, file: Path, size: int, sha256: str, name: str) -> Response:
-    """Return a stored file, whose bytes never change, or a range of it.
-
-    Raises:
-        NotFound: the file is not there, or no longer what was stored.
-    """
+    """Return a stored file, whose bytes never change, or a range of it."""
     require_whole(file, size)
     etag = f'"{sha256}"'
     headers = cache_headers(etag)

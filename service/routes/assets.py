@@ -77,14 +77,7 @@ async def open_scratch(deps: Parts) -> AsyncIterator[Path]:
 
 @asynccontextmanager
 async def receive_upload(request: Request, deps: Parts, sha256: str | None) -> AsyncIterator[tuple[Path, str]]:
-    """Receive a body into a draft; yield that and its sha256 in hex. The draft is removed at the end of the block.
-
-    Raises:
-        TooLarge: there are more bytes than may come.
-        NoSpace: there is no room for them.
-        UnsupportedMedia: it is compressed, or a part of a form.
-        InvalidRequest: its digest is another than was declared.
-    """
+    """Receive a body into a draft; yield that and its sha256 in hex. The draft is removed at the end of the block."""
     require_file(request)
     limit, digest, count, batch = deps.settings.upload_bytes, hashlib.sha256(), 0, bytearray()
     length = request.headers.get("content-length", "")

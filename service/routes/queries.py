@@ -157,11 +157,7 @@ def seen_from(view: models.Viewpoint) -> dict[str, Any]:
 
 
 def with_packs(work: dict[str, Any], lift: models.Lift, deps: Parts, argument: str | None) -> dict[str, Any]:
-    """Add the lift's feature packs, which have its regions, to a request.
-
-    Raises:
-        InvalidRequest: an argument needs them, and they are not all here.
-    """
+    """Add the lift's feature packs, which have its regions, to a request."""
     if argument is not None and len(lift.features) < lift.pack_count:
         hint = "PUT /assets/features each of its packs before POST /lifts, or ask by splat:J or VIEW:x,y"
         got = "one that was brought without some of them"
@@ -174,12 +170,7 @@ def with_packs(work: dict[str, Any], lift: models.Lift, deps: Parts, argument: s
 def with_encoder(
     work: dict[str, Any], words: LiftQuestion | models.NodesRequest, lift: models.Lift, deps: Parts, owner: Owner
 ) -> dict[str, Any]:
-    """Return the request with the encoder of its words: an uploaded table, the lift's, or one of the operator.
-
-    Raises:
-        InvalidRequest: no encoder of the lift's text space is set up, or both a table and an encoder are named.
-        NotFound: there is no such table.
-    """
+    """Return the request with the encoder of its words: an uploaded table, the lift's, or one of the operator."""
     names, table_id = dict(work["names"]), words.table
     if words.table is not None and words.encoder is not None:
         raise InvalidRequest("table", expected="table or encoder", got="both", hint="leave one of them out")
