@@ -59,7 +59,10 @@ def run(options: argparse.Namespace) -> int:
     scene = find_scene(options.scene or unpack_tabletop(out / "scene"), options.ask, out / "scene")
     with serving(data, scene.encoder, out / "service.log") as url:
         say(f"The service listens on {url}.")
-        report = show(scene, url, out, say)
+        try:
+            report = show(scene, url, out, say)
+        except httpx.HTTPError as error:
+            raise Unavailable("service", expected="an answer to each request", got=repr(error)) from None
     report |= {"seconds": round(time.perf_counter() - begin, 1), "out": str(out.resolve())}
     report["lift_file"] = str((data / "lifts" / f"{report['lift']}.safetensors").resolve())
     say(f"Pictures are in {report['out']}. All of it took {report['seconds']:.0f} s.")
@@ -94,62 +97,51 @@ def serving(data: Path, encoder: str, log: Path) -> Iterator[str]:
                 server.kill()
 
 
-class Client:
-    """HTTP client of a service. Answers of 4xx and 5xx become errors with the service's message."""
+def client_of(url: str) -> httpx.Client:
+    """Return a client of a service, which raises its problems as errors."""
 
-    def __init__(self, url: str) -> None:
-        # ignore a proxy of the environment
-        self.http = httpx.Client(base_url=url, timeout=TIMEOUT, trust_env=False)
-
-    def call(self, method: str, path: str, **options: Any) -> httpx.Response:
-        """Return the response to a request."""
-        try:
-            response = self.http.request(method, path, **options)
-        except httpx.HTTPError as error:
-            raise Unavailable("service", expected=f"an answer to {method} {path}", got=repr(error)) from None
+    def require_success(response: httpx.Response) -> None:
         if response.is_error:
-            raise error_of(response.json(), f"{method} {path}")
-        return response
+            response.read()
+            raise error_of(response.json())
 
-    def get(self, path: str, **parameters: str) -> Any:
-        """Return the JSON of a route, or the content of a picture."""
-        response = self.call("GET", path, params=parameters)
-        return response.json() if "json" in response.headers["content-type"] else response.content
-
-    def lift(self, order: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Order a lift and wait; return the job and its lift."""
-        job = self.call("POST", "/lift", json=order).json()
-        while job["state"] not in ("succeeded", "failed", "canceled"):
-            time.sleep(0.25)
-            job = self.get(f"/jobs/{job['id']}")
-        if job["state"] != "succeeded":
-            raise error_of(job["problem"] or {"detail": job["state"]}, "lift")
-        return job, self.get(f"/lifts/{job['id']}")
+    hooks = {"response": [require_success]}  # a proxy of the environment is ignored
+    return httpx.Client(base_url=url, timeout=TIMEOUT, trust_env=False, event_hooks=hooks)
 
 
-def error_of(problem: dict[str, Any], operation: str) -> SplatliftError:
+def error_of(problem: dict[str, Any]) -> SplatliftError:
     """Return a problem of the service as an error."""
-    kind = Unavailable if problem.get("status", 0) >= 500 else InvalidInput
-    got = problem.get("got") or problem["detail"]
-    expected, hint = problem.get("expected") or "success", problem.get("hint") or ""
-    return kind(problem.get("argument") or operation, expected=expected, got=got, hint=hint)
+    kind = Unavailable if problem["status"] >= 500 else InvalidInput
+    got, expected = problem.get("got", problem["detail"]), problem.get("expected", "success")
+    return kind(problem.get("argument", "service"), expected=expected, got=got, hint=problem.get("hint", ""))
+
+
+def wait_for_lift(client: httpx.Client, order: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Order a lift and wait; return the job and its lift."""
+    job = client.post("/lift", json=order).json()
+    while job["state"] in ("queued", "running"):
+        time.sleep(0.25)
+        job = client.get(f"/jobs/{job['id']}").json()
+    if job["state"] == "failed":
+        raise error_of(job["problem"])
+    return job, client.get(f"/lifts/{job['id']}").json()
 
 
 def show(scene: DemoScene, url: str, out: Path, say: Callable[[str], None]) -> dict[str, Any]:
     """Upload, lift and query; write pictures to ``out`` and sentences to ``say``; return the results."""
-    client = Client(url)
-    with client.http:
+    with client_of(url) as client:
         files = {"splats": scene.splats, "cameras": scene.cameras, "features": scene.features}
         ids = {
-            kind: client.call("PUT", f"/assets/{kind}", content=path.read_bytes()).json()["id"]
+            kind: client.put(f"/assets/{kind}", content=path.read_bytes()).json()["id"]
             for kind, path in files.items()
         }
-        job, lift = client.lift(ids | {"features": [ids["features"]]})
+        job, lift = wait_for_lift(client, ids | {"features": [ids["features"]]})
         took, view = job["ended"] - job["started"], scene.views[0]
         say(f"Lifted {lift['channels']} channels onto {lift['count']:,} splats in {took:.1f} s.")
         pictures = {"rgb": f"render-{view}.png", "pca": f"features-{view}.png"}
         for channel, name in pictures.items():
-            (out / name).write_bytes(client.get("/render", lift=lift["id"], view=view, channel=channel))
+            parameters = {"lift": lift["id"], "view": view, "channel": channel}
+            (out / name).write_bytes(client.get("/render", params=parameters).content)
         kind, phrases = "text", scene.phrases
         if not phrases:
             with Image.open(out / pictures["rgb"]) as picture:
@@ -158,7 +150,7 @@ def show(scene: DemoScene, url: str, out: Path, say: Callable[[str], None]) -> d
                 f"  Nothing says what its words are, so it is asked for more of the middle of the view, {phrases[0]}."
             )
         # The first query opens the lift and is not timed.
-        client.get("/query", lift=lift["id"], **{kind: phrases[0]}, threshold="0")
+        client.get("/query", params={"lift": lift["id"], kind: phrases[0], "threshold": "0"})
         findings = [ask(client, lift["id"], kind, phrase, scene, out, say) for phrase in phrases]
     names = ("count", "channels", "diagnostics")
     splats, channels, diagnostics = (lift[name] for name in names)
@@ -170,19 +162,22 @@ def show(scene: DemoScene, url: str, out: Path, say: Callable[[str], None]) -> d
 
 
 def ask(
-    client: Client, lift: str, kind: str, phrase: str, scene: DemoScene, out: Path, say: Callable[[str], None]
+    client: httpx.Client, lift: str, kind: str, phrase: str, scene: DemoScene, out: Path, say: Callable[[str], None]
 ) -> dict[str, Any]:
     """Ask one phrase: write its pictures, say what it selects, and return that."""
     parameters, view, truth = {"lift": lift, kind: phrase}, scene.views[0], scene.truth
     begin = time.perf_counter()
-    answer = client.get("/query", **parameters)
+    answer = client.get("/query", params=parameters).json()
     middle = time.perf_counter()
-    masks = {name: pixels(client.get("/query/mask", view=name, **parameters)) > 0 for name in scene.views}
+    masks = {
+        name: pixels(client.get("/query/mask", params=parameters | {"view": name}).content) > 0
+        for name in scene.views
+    }
     mask_ms = 1e3 * (time.perf_counter() - middle) / len(masks)
     slug = "-".join(re.findall(r"\w+", phrase.casefold()))
     names = {picture: f"{slug}-{picture}-{view}.png" for picture in ("mask", "heat", "found")}
     Image.fromarray(masks[view].astype(np.uint8) * 255).save(out / names["mask"])
-    (out / names["heat"]).write_bytes(client.get("/query/attention", view=view, **parameters))
+    (out / names["heat"]).write_bytes(client.get("/query/attention", params=parameters | {"view": view}).content)
     shade = np.where(masks[view][..., None], 1.0, 0.35)
     Image.fromarray((pixels((out / f"render-{view}.png").read_bytes()) * shade).astype(np.uint8)).save(
         out / names["found"]
@@ -275,11 +270,9 @@ def unpack_tabletop(folder: Path) -> Path:
 
 
 def find_scene(folder: Path, phrases: Sequence[str], scratch: Path) -> DemoScene:
-    """Return a scene folder: files are found by their content, a COLMAP model is zipped for the upload.
+    """Return a scene folder: files are found by their content, a COLMAP model is zipped into ``scratch``.
 
-    Args:
-        folder: holds splats, cameras and a pack. scratch: the folder for the zipped model.
-        phrases: of the queries; empty = those in ``truth.json``.
+    Without phrases those in ``truth.json`` are asked.
     """
     if not folder.is_dir():
         raise InvalidInput("--scene", expected="a folder", got=f"nothing at {folder}")
