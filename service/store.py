@@ -99,10 +99,7 @@ class Store:
     """All records and files of a data directory.
 
     ``blobs/`` has assets by digest, ``lifts/`` lifts by job, ``work/`` checkpoints of jobs, ``tmp/`` drafts.
-
-    Args:
-        root: the directory; made if it is not there.
-        floor_bytes: free disk that new work must leave.
+    New work must leave so many bytes of free disk.
     """
 
     def __init__(self, root: Path, floor_bytes: int = 0) -> None:
@@ -125,7 +122,6 @@ class Store:
         self._write_lock, self._blobs_lock, self._local = threading.RLock(), threading.Lock(), threading.local()
         self._readers: list[sqlite3.Connection] = []
         try:
-            require_database(self.root)
             self._writer = connect(self.root / DATABASE)
             self._identity = self._identify()
             self._put_back()
@@ -276,11 +272,7 @@ class Store:
     # Assets
 
     def add_asset(self, owner: Owner, kind: str, draft: Path, sha256: str, content: dict[str, Any]) -> Asset:
-        """Store a checked upload.
-
-        Args:
-            content: ``suffix``, ``counts`` and ``warnings``, as its check returned them.
-        """
+        """Store an upload, with what its check returned."""
         size, path = draft.stat().st_size, self.root / "blobs" / f"{sha256}{content['suffix']}"
         sync(draft)
         with self._blobs_lock:  # else the deletion of the same bytes might take the new file
@@ -338,11 +330,7 @@ class Store:
     def submit(
         self, owner: Owner, order: dict[str, Any], key: str | None = None, max_queued: int = 1_000_000
     ) -> tuple[Job, bool]:
-        """Queue a job; it is on the disk when this returns.
-
-        Args:
-            order: ``kind``, ``splats``, ``cameras``, ``features``, ``settings`` and ``parameters``.
-            key: the Idempotency-Key: the same key and order are the same job.
+        """Queue a job; it is on the disk when this returns. The same Idempotency-Key and order are the same job.
 
         Returns:
             The job, and True if it is new.
@@ -416,11 +404,7 @@ class Store:
             self._add_event(job, kind, data)
 
     def finish(self, job: Job, result: dict[str, Any], draft: Path) -> None:
-        """Store the result and the success of a job together; a job that is being canceled gets none.
-
-        Args:
-            result: of its task. draft: the lift file, or the chart of a trade-off.
-        """
+        """Store the result and the success of a job together; a job that is being canceled gets none."""
         path = self.root / "lifts" / f"{job.id}.safetensors"
         if job.kind == "lift":
             sync(draft)
@@ -454,9 +438,7 @@ class Store:
     def end(self, job: Job, problem: dict[str, Any] | None = None, *, retries: bool = False) -> None:
         """End an attempt without a result: the job fails, is put back in line, or is canceled as was asked.
 
-        Args:
-            problem: why; None if the server is the reason, and the attempt does not count.
-            retries: True if another attempt may do better, up to `MAX_ATTEMPTS`.
+        Without a problem the server is the reason, and the attempt does not count.
         """
         with self.write():
             state = self.job(SERVICE, job.id).state
@@ -578,17 +560,17 @@ def require_whole(path: Path, size: int) -> None:
     raise NotFound("content", expected=expected, got="none, or one of another size", hint=hint)
 
 
-def require_database(root: Path) -> None:
-    """Require a database, or nothing that one belongs to."""
-    is_new = not ((root / DATABASE).exists() and (root / DATABASE).stat().st_size)
-    if is_new and any(file for name in ("blobs", "lifts") for file in root.glob(f"{name}/*")):
+def connect(path: Path, mode: str = "rwc") -> sqlite3.Connection:
+    """Return a connection to the database; ``rwc`` makes it and its tables in a directory without files."""
+    is_new = not (path.exists() and path.stat().st_size)
+    if (
+        mode == "rwc"
+        and is_new
+        and any(file for name in ("blobs", "lifts") for file in path.parent.glob(f"{name}/*"))
+    ):
         hint = "put its newest backup there, or name another directory with --data"
         expected = f"the {DATABASE} that the files beside it were stored with"
-        raise Misconfigured("data", expected=expected, got=f"none in {root}", hint=hint)
-
-
-def connect(path: Path, mode: str = "rwc") -> sqlite3.Connection:
-    """Return a connection to the database; ``rwc`` makes it and its tables if it is not there."""
+        raise Misconfigured("data", expected=expected, got=f"none in {path.parent}", hint=hint)
     uri = f"{path.absolute().as_uri()}?mode={mode}"
     try:
         connection = sqlite3.connect(
@@ -621,7 +603,6 @@ def open_keys(root: Path, *, make: bool = False) -> Iterator[sqlite3.Connection]
     if make:
         root.mkdir(parents=True, exist_ok=True, mode=0o700)
         os.umask(0o077)
-        require_database(root)
     elif not (root / DATABASE).exists():
         raise NotFound("data", expected="the data directory of a service", got=str(root), hint="name it with --data")
     with closing(connect(root / DATABASE)) as connection:

@@ -11,7 +11,6 @@ import sqlite3
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
-from functools import partial
 from pathlib import Path
 from textwrap import fill
 from types import FrameType
@@ -81,9 +80,11 @@ def run(options: argparse.Namespace) -> int:
     settings = settings_of(options)
     require_keys(settings)
     require_encoder_files(settings)
-    announce = print_address
-    if options.json:
-        announce = partial(print_json, data=settings.data)
+
+    def announce(address: str) -> None:
+        document = json.dumps({"address": address, "data": str(settings.data.absolute())})
+        print(document if options.json else f"listening on {address}", flush=True)
+
     serve(settings, announce)
     return 0
 
@@ -91,11 +92,7 @@ def run(options: argparse.Namespace) -> int:
 def serve(
     settings: ServiceSettings, announce: Callable[[str], None], prepare: Callable[[Store], None] = lambda _: None
 ) -> None:
-    """Run a server until it is stopped.
-
-    Args:
-        announce: called with the address. prepare: called with the store before the start.
-    """
+    """Run a server until it is stopped: `prepare` the store, start, then `announce` the address."""
     with closing(bind(settings.host, settings.port)) as listener, logging_to_stderr():
         with data_directory_errors():
             store = Store(settings.data, settings.disk_floor_bytes)
@@ -118,16 +115,6 @@ def server_of(app: FastAPI, settings: ServiceSettings, announce: Callable[[str],
         proxy_headers=bool(settings.forwarded_allow), forwarded_allow_ips=settings.forwarded_allow,
     )  # fmt: skip
     return AnnouncingServer(config, app, announce)
-
-
-def print_address(address: str) -> None:
-    """Print where the server listens, for people."""
-    print(f"listening on {address}", flush=True)
-
-
-def print_json(address: str, data: Path) -> None:
-    """Print the address and the data directory as JSON, for programs."""
-    print(json.dumps({"address": address, "data": str(data.absolute())}), flush=True)
 
 
 def settings_of(options: argparse.Namespace) -> ServiceSettings:
