@@ -62,11 +62,7 @@ class Ending(NamedTuple):
 
 
 class Child:
-    """A child process, from the server's side: it leads a group. Any thread may `end` it.
-
-    Args:
-        module: that it runs. arguments: of it, behind the lifeline. environment: beside the server's.
-    """
+    """A child process, from the server's side: it leads a group. Any thread may `end` it."""
 
     def __init__(self, module: str, *arguments: str, **environment: str) -> None:
         lifeline, self._lifeline = os.pipe()
@@ -113,14 +109,7 @@ class Child:
 
     @contextlib.contextmanager
     def watched(self, why_end: Callable[[], str]) -> Iterator[list[str]]:
-        """End it during the block for a reason, or if it stays stopped.
-
-        Args:
-            why_end: called a few times a second; returns a reason, or an empty text.
-
-        Yields:
-            A list that gets the reason.
-        """
+        """End it in the block once there is a reason, or it stays stopped; yield a list that gets the reason."""
         reasons, is_done, stopped_since = list[str](), threading.Event(), math.inf
 
         def watch() -> None:
@@ -200,14 +189,9 @@ class Children:
         self, order: Message, seconds: float, take: Callable[[Message], None] = lambda _: None,
         why_end: Callable[[], str] = lambda: "", *, reusable: bool = False,
     ) -> Ending:  # fmt: skip
-        """Run an order to its end, and return that.
+        """Run an order, `take` its messages, and return how it ended: by itself, a limit of seconds, or a reason.
 
-        Args:
-            order: with its ``task``, a function of `TASKS`.
-            seconds: of wall time that it may take.
-            take: called with each message before the last.
-            why_end: called a few times a second; a reason ends the child.
-            reusable: True if the child may take other orders afterwards, else its group is ended.
+        A child that is not reusable is ended with its group.
         """
         child, last = self._take(), None
         if not reusable:
@@ -307,12 +291,7 @@ class Children:
 
 
 def arm(lifeline: int, group: int) -> None:
-    """Let the kernel end a process group when the other end of a pipe closes, even within a call that blocks.
-
-    Args:
-        lifeline: the file number of the pipe's reading end, in any process; nothing is ever written to it.
-        group: the process that leads it.
-    """
+    """Let the kernel end a process group when the writing end of a pipe closes, even within a call that blocks."""
     fcntl.fcntl(lifeline, fcntl.F_SETOWN, -group)
     fcntl.fcntl(lifeline, fcntl.F_SETSIG, signal.SIGKILL)
     fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | os.O_ASYNC)

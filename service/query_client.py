@@ -27,11 +27,8 @@ log = logging.getLogger(__name__)
 class QueryClient:
     """Process that answers queries, one at a time; any thread may call any method.
 
-    A request is a JSON line, and so is its answer, with the content behind it (`service.query_worker`).
-
-    Args:
-        encoder: specification of the text encoder that is loaded at the start.
-        seconds: from a call to its answer, with the time in the queue.
+    A request is a JSON line, and so is its answer, with the content behind it (`service.query_worker`). The seconds
+    are from a call to its answer, with the time in the queue.
     """
 
     def __init__(self, encoder: str, seconds: float) -> None:

@@ -38,12 +38,7 @@ def find_lift_file(store: Store, owner: Owner, sha256: str) -> Lift | None:
 
 
 def add_lift(store: Store, owner: Owner, draft: Path, content: dict[str, Any], cameras: str | None = None) -> Lift:
-    """Store a checked lift file, as the result of a job that never ran.
-
-    Args:
-        content: ``sha256``, ``count``, ``channels`` and ``metadata``, as its check returned them.
-        cameras: an asset with the same poses, in place of the cameras that the lift names.
-    """
+    """Store a checked lift file, as the result of a job that never ran, with its own or other cameras."""
     metadata = content["metadata"]
     files = (metadata["splats"], metadata["cameras"], *metadata["features"])
     splats_id, own_cameras, *packs = [f"sha256:{file['sha256']}" for file in files]

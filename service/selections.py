@@ -15,7 +15,7 @@ from service.errors import Conflict, InvalidRequest, VersionMismatch
 from service.models import ObjectLabel, Selection, SelectionDetail, SelectionStep
 from service.store import Owner, Store
 
-MOST_SELECTIONS, MOST_STEPS, MOST_LABELS = 200, 100, 10_000  # of a lift, of a selection's history, of a lift
+MOST_SELECTIONS, MOST_STEPS = 200, 100  # of a lift, of a selection's history
 CURRENT = (
     "SELECT selections.*, count, box,"
     " (SELECT min(number) FROM steps WHERE selection = selections.id) AS first,"
@@ -40,11 +40,7 @@ def list_selections(store: Store, lift: str) -> list[Selection]:
 
 
 def get_selection(store: Store, lift: str, selection: str, versions: frozenset[int] | None = None) -> Selection:
-    """Return the selection of that id.
-
-    Args:
-        versions: of which it must have one; None for any.
-    """
+    """Return the selection of that id, which must have one of the versions; None for any."""
     rows = store.rows(f"{CURRENT} AND selections.id = :id", lift=lift, id=selection)
     if not rows:
         hint = "GET /lifts/{lift}/selections lists them"
@@ -145,8 +141,6 @@ def change_object_label(
     """Set the ``name`` of an object (None: its own), or ``hidden``."""
     with store.write() as connection:
         store.lift(owner, lift)
-        if len(object_labels(store, lift)) >= MOST_LABELS:
-            raise Conflict("object", expected=f"at most {MOST_LABELS} changed objects of a lift", got="more")
         connection.execute("INSERT OR IGNORE INTO objects (lift, id) VALUES (?, ?)", (lift, object_id))
         for column in changes.keys() & {"name", "hidden"}:
             update = f"UPDATE objects SET {column} = ? WHERE lift = ? AND id = ?"

@@ -122,11 +122,7 @@ EXTRA_CHECKS: dict[str, Callable[[Path], dict[str, Any]]] = {
 
 
 def check_lift(path: Path, cameras: str | None) -> dict[str, Any]:
-    """Read every number of a lift, and limit its metadata; its names of views must be valid in queries.
-
-    Args:
-        cameras: a file that stands for the cameras that it was made with: they must see what these saw.
-    """
+    """Read every number of a lift, and limit its metadata; cameras that replace its own must see what those saw."""
     lift = load_lift(path)
     arrays, parsed = lift.arrays(), lift.metadata
     metadata = finite(json.loads(parsed.model_dump_json()))
@@ -235,11 +231,7 @@ def _as_clients_know(lift: LiftResult, names: Mapping[str, str]) -> LiftResult:
 
 
 def tradeoff(order: Order, report: Reporter) -> dict[str, Any]:
-    """Compare, and draw the chart to ``output``. Each run is a process of this group, with this environment.
-
-    Returns:
-        ``document`` and ``page``.
-    """
+    """Compare, and draw the chart to ``output``. Each run is a process of this group, with this environment."""
     from liftcore.evaluate import SceneFiles, compare_speeds  # imports matplotlib, which lifts do not need
 
     os.nice(NICENESS)

@@ -87,11 +87,7 @@ def cache_headers(etag: str) -> dict[str, str]:
 
 
 def unchanged(request: Request, etag: str, *, exists: bool = True) -> Response | None:
-    """Return 304 if the client already has this entity, else None.
-
-    Args:
-        exists: True if the entity is known to exist; ``*`` matches any that does.
-    """
+    """Return 304 if the client already has this entity, else None; ``*`` matches any that is known to exist."""
     tags = {tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")}
     is_same = etag in tags or (exists and "*" in tags)
     return Response(status_code=304, headers={"ETag": etag}) if is_same else None
