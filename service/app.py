@@ -25,7 +25,7 @@ from liftcore import __version__
 from liftcore.files import PhotoIndexes
 from service import errors
 from service.auth import Auth
-from service.errors import PROBLEM, REQUEST_ID, answer_to
+from service.errors import METHODS, PROBLEM, REQUEST_ID, answer_to
 from service.models import BODY_BYTES
 from service.process import Children
 from service.query_client import QueryClient
@@ -44,7 +44,6 @@ SAFE_HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",  # other sites must not embed renders and photos
     "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
 }
-METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE"})  # as labels; all others are `other`
 
 access = logging.getLogger("service.access")
 
@@ -120,6 +119,11 @@ class Recorder:
             await self._app(scope, receive, send)
             return
         start, status, sent_bytes, is_replaced = time.monotonic(), 0, 0, False
+        scope["headers"] = [  # an unknown unit means the whole (RFC 9110), and starlette refuses it
+            (name, value)
+            for name, value in scope["headers"]
+            if name != b"range" or value.lower().startswith(b"bytes=")
+        ]
         values = [value for name, value in scope["headers"] if name == b"x-request-id"]
         is_sane = len(values) == 1 and SANE_ID.fullmatch(values[0])
         request_id = values[0].decode("ascii") if is_sane else secrets.token_hex(16)
@@ -158,7 +162,7 @@ class Recorder:
             await answer_to(error, scope["path"][:200])(scope, receive, send_marked)
         finally:
             seconds, route = time.monotonic() - start, getattr(scope.get("route"), "path", "(no route)")
-            method = scope["method"] if scope["method"] in METHODS else "other"
+            method = scope["method"] if scope["method"] in METHODS else "other"  # as labels
             self._requests.labels(method, route, status).inc()
             self._seconds.labels(method, route).observe(seconds)
             key = scope.get("state", {}).get("key")

@@ -17,7 +17,7 @@ import anyio
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from service.errors import Forbidden, InvalidRequest, Misdirected, TooLarge, Unauthorized
+from service.errors import Forbidden, Misdirected, TooLarge, Unauthorized, UnclearEnd
 from service.models import BODY_BYTES, Key
 from service.settings import ServiceSettings
 from service.store import SERVICE, Owner, Store, admit
@@ -38,7 +38,7 @@ class Auth:
     """ASGI middleware: put the `Owner` and the `Key` into the scope's state, or raise a refusal."""
 
     def __init__(self, app: ASGIApp, store: Store, settings: ServiceSettings) -> None:
-        self._app, self._store = app, store
+        self._app, self._store, self._upload_bytes = app, store, settings.upload_bytes
         self._allowed_hosts = frozenset(name.lower() for name in settings.allowed_hosts)
         self._hosts = LOOPBACK | {settings.host.lower()} | self._allowed_hosts
         is_any = is_address(settings.host) and ipaddress.ip_address(settings.host).is_unspecified
@@ -49,9 +49,10 @@ class Auth:
         """Check a request and pass it on; `service.app.Recorder` answers refusals."""
         if scope["type"] == "http":
             headers, line = Headers(scope=scope), f"{scope['method']} {scope['path']}"
+            require_clear_end(headers, line)
             self._require_host(scope["method"], headers)
             owner, key = await self._caller(headers, line)
-            require_length(headers, line)
+            require_length(headers, self._upload_bytes if UPLOAD.fullmatch(line) else BODY_BYTES)
             scope.setdefault("state", {}).update(owner=owner, key=key)
         await self._app(scope, receive, send)
 
@@ -102,13 +103,20 @@ def require_scope(key: Key, line: str) -> None:
         raise Forbidden("Authorization", expected=expected, got=got)
 
 
-def require_length(headers: Headers, line: str) -> None:
-    """Require that the head of a request announces no more than may come."""
+def require_clear_end(headers: Headers, line: str) -> None:
+    """Require that a proxy sees the same end of a request (RFC 9112): what it takes for the rest is not answered."""
+    if line.startswith("CONNECT "):
+        raise UnclearEnd("method", expected="a method of a route", got="CONNECT")
+    if "transfer-encoding" in headers and "content-length" in headers:
+        raise UnclearEnd("Content-Length", expected="either it or Transfer-Encoding", got="both")
+
+
+def require_length(headers: Headers, limit: int) -> None:
+    """Require that the head of a request announces no more than may come, before a client is told to go on."""
     length = headers.get("content-length", "0")
-    if "transfer-encoding" in headers and "content-length" in headers:  # a proxy may see another end (RFC 9112)
-        raise InvalidRequest("Content-Length", expected="either it or Transfer-Encoding", got="both")
-    if not UPLOAD.fullmatch(line) and length.isdigit() and int(length[:20]) > BODY_BYTES:
-        raise TooLarge("body", expected=f"at most {BODY_BYTES} bytes", got="more")
+    if length.isdigit() and int(length[:20]) > limit:
+        hint = "several feature packs may make one lift, so features can be cut" if limit > BODY_BYTES else ""
+        raise TooLarge("body", expected=f"at most {limit} bytes", got="more", hint=hint)
 
 
 def host_name(host: str) -> str | None:

@@ -52,6 +52,12 @@ class UnreadableBody(ServiceError):
     kind, status, title = "malformed-request", 400, "The request is malformed"
 
 
+class UnclearEnd(UnreadableBody):
+    """A request whose end a proxy may see elsewhere: the connection ends with it."""
+
+    headers: ClassVar = {"Connection": "close"}
+
+
 class KeyReused(ServiceError):
     """An Idempotency-Key that was used with another order."""
 

@@ -64,37 +64,25 @@ async def in_thread(deps: Parts, call: Any, *arguments: Any) -> Any:
 
 
 @asynccontextmanager
-async def open_scratch(deps: Parts) -> AsyncIterator[Path]:
-    """Yield a folder for drafts, which is removed at the end of the block."""
-    scratch = deps.store.scratch()
-    folder = await in_thread(deps, scratch.__enter__)
-    try:
-        yield folder
-    finally:
-        with anyio.CancelScope(shield=True):  # removing gigabytes takes long
-            await in_thread(deps, scratch.__exit__, None, None, None)
-
-
-@asynccontextmanager
 async def receive_upload(request: Request, deps: Parts, sha256: str | None) -> AsyncIterator[tuple[Path, str]]:
     """Receive a body into a draft; yield that and its sha256 in hex. The draft is removed at the end of the block."""
     require_file(request)
     limit, digest, count, batch = deps.settings.upload_bytes, hashlib.sha256(), 0, bytearray()
-    length = request.headers.get("content-length", "")
-    require_size(int(length[:20]) if length.isascii() and length.isdigit() else 0, limit)  # before 100 Continue
-    async with open_scratch(deps) as folder:
-        draft = folder / "upload"
+    scratch = deps.store.scratch()
+    draft = await in_thread(deps, scratch.__enter__) / "upload"
 
-        def write(content: bytes) -> None:
-            deps.store.require_room(len(content))
-            digest.update(content)
-            with draft.open("ab") as file:
-                file.write(content)
+    def write(content: bytes) -> None:
+        deps.store.require_room(len(content))
+        digest.update(content)
+        with draft.open("ab") as file:
+            file.write(content)
 
+    try:
         async for chunk in request.stream():
             batch += chunk
             count += len(chunk)
-            require_size(count, limit)
+            if count > limit:
+                raise TooLarge("body", expected=f"at most {limit} bytes", got="more")
             if len(batch) >= BATCH:
                 await in_thread(deps, write, bytes(batch))
                 batch.clear()
@@ -103,13 +91,9 @@ async def receive_upload(request: Request, deps: Parts, sha256: str | None) -> A
             hint = "upload the file again"
             raise InvalidRequest("sha256", expected=sha256, got=digest.hexdigest(), hint=hint)
         yield draft, digest.hexdigest()
-
-
-def require_size(count: int, limit: int) -> None:
-    """Require that an upload is not too large."""
-    if count > limit:
-        hint = "several feature packs may make one lift, so features can be cut"
-        raise TooLarge("body", expected=f"at most {limit} bytes", got="more", hint=hint)
+    finally:
+        with anyio.CancelScope(shield=True):  # removing gigabytes takes long
+            await in_thread(deps, scratch.__exit__, None, None, None)
 
 
 def require_file(request: Request) -> None:

@@ -6,14 +6,14 @@ import json
 import re
 import shutil
 import socket
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 
-from tests.server import Server, refused_start, run_command, until
+from tests.server import PATIENCE_SECONDS, Server, refused_start, run_command, until
 from tests.tiny_scene import TinyScene
 
 from .over_http import assert_problem, delete_lift, operations_of, upload_scene
@@ -215,3 +215,22 @@ def test_setting_that_cannot_be_is_refused_at_the_start(options: list[str], tmp_
 
 def test_data_directory_is_for_its_user_alone(server: Server) -> None:
     assert server.data.stat().st_mode & 0o077 == 0
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        "POST /query HTTP/1.1\r\nContent-Length: 5\r\nTransfer-Encoding: chunked",
+        "POST /query HTTP/1.1\r\nContent-Length: 5\r\nTransfer-Encoding:\tchunked",
+        "CONNECT localhost:80 HTTP/1.1\r\nAccept: */*",
+    ],
+)
+def test_what_hides_behind_an_unclear_end_is_not_answered(client: httpx.Client, head: str) -> None:
+    answer = b""
+    with socket.create_connection((client.base_url.host, client.base_url.port or 80), PATIENCE_SECONDS) as connection:
+        hidden = "0\r\n\r\nGET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"
+        connection.sendall(f"{head}\r\nHost: localhost\r\n\r\n{hidden}".encode())
+        with suppress(ConnectionResetError):  # the server does not read the rest
+            while content := connection.recv(1 << 16):
+                answer += content
+    assert answer.startswith(b"HTTP/1.1 400 ") and answer.count(b"HTTP/1.1 ") == 1

@@ -179,6 +179,11 @@ def test_part_of_a_file_is_the_bytes_of_its_range(
     assert (other.status_code, other.content) == (200, tiny.splats)
 
 
+def test_range_of_an_unknown_unit_is_the_whole(client: httpx.Client, order: dict[str, Any], tiny: TinyScene) -> None:
+    reply = client.get(f"/assets/{order['splats']}/content", headers={"Range": "items=0-5"})
+    assert (reply.status_code, reply.content) == (200, tiny.splats)
+
+
 def test_range_beyond_the_file_is_416(client: httpx.Client, order: dict[str, Any], tiny: TinyScene) -> None:
     reply = client.get(f"/assets/{order['splats']}/content", headers={"Range": "bytes=999999-"})
     assert reply.status_code == 416
