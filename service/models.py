@@ -20,6 +20,7 @@ from liftcore.models import (
     ListedObjects,
     NoBoolean,
     Notation,
+    OwnCamera,
     SceneTree,
     SelectionSummary,
     SuggestedWords,
@@ -289,19 +290,11 @@ class LiftChange(Body):
     )
 
 
-class View(BaseModel):
+class View(OwnCamera):
     """A camera of a lift's scene, in gsplat's conventions: OpenCV axes, pixel centres at +0.5."""
 
-    name: str
-    lifted: bool = Field(description="true if its features were lifted")
-    photo: bool = Field(description="true if the lift's photos include it")
-    width: int = Field(description="pixels")
-    height: int
-    fx: float = Field(description="pixels, like fy, cx and cy")
-    fy: float
-    cx: float
-    cy: float
-    viewmat: list[list[float]] = Field(description="[4, 4], world to camera")
+    lifted: bool = Field(description="true if its features were lifted")  # pyright: ignore[reportIncompatibleVariableOverride]
+    photo: bool = Field(description="true if the lift's photos include it")  # pyright: ignore[reportIncompatibleVariableOverride]
 
 
 class Views(BaseModel):
