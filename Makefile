@@ -14,7 +14,7 @@ CUDA_TORCH_PIP ?=
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 export PIP_ROOT_USER_ACTION = ignore
 
-.PHONY: demo test check kernels gpu wheel lint format serve web docs setup clean
+.PHONY: demo test check kernels gpu wheel lint format serve docs setup clean
 
 demo: $(READY)  ## the whole job through the real service; SCENE=DIR takes a scene of your own, ASK=TEXT a question
 	$(BIN)/splatlift demo --out "$(OUT)" $(if $(SCENE),--scene "$(SCENE)") $(if $(ASK),--ask "$(ASK)")
@@ -75,12 +75,6 @@ format: $(READY)
 
 serve: $(READY)
 	$(BIN)/splatlift serve
-
-# Needs Node.js with npm; what it builds is committed, so that nobody else does.
-web: $(READY)  ## the page, from service/web/src into service/web/built
-	$(BIN)/python -m liftcore.io.kinds > service/web/src/kinds.json
-	$(BIN)/python -m liftcore.query.question > service/web/src/question.json
-	cd service/web && npm ci --silent && node build.mjs
 
 # The site's tools are no part of the lock: they have an environment of their own, and read docstrings from .venv.
 docs: $(READY)  ## the docs site in build/site; a broken link or reference fails

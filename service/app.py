@@ -19,6 +19,7 @@ from fastapi import FastAPI
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
+from starlette.middleware.gzip import GZipMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from liftcore import __version__
@@ -44,6 +45,7 @@ SAFE_HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",  # other sites must not embed renders and photos
     "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
 }
+COMPRESSED = re.compile(r"/|/web/.*|/lifts/[^/]+/splats")
 
 access = logging.getLogger("service.access")
 
@@ -79,11 +81,13 @@ def create_app(settings: ServiceSettings, store: Store) -> FastAPI:
         generate_unique_id_function=lambda route: route.name,  # clients name their functions by it
     )
     app.state.registry = CollectorRegistry()
+    app.add_middleware(Compression)
     app.add_middleware(Auth, store=store, settings=settings)
     app.add_middleware(Recorder, registry=app.state.registry)  # the last one is outside of the others
     errors.install(app)
     for module in (operations, assets, jobs, selections, lifts, queries):
         app.include_router(module.router, max_body_size=BODY_BYTES)
+    app.mount("/web", operations.PageFiles(directory=operations.WEB))
     return app
 
 
@@ -101,6 +105,19 @@ class Application(FastAPI):
                     operation["summary"] = re.split(r"\.\s", operation["description"])[0].rstrip(".")
             self.openapi_schema = document
         return self.openapi_schema
+
+
+class Compression:
+    """ASGI middleware: compress the page and the splats that it draws; pictures and arrays gain little by it."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app, self._compressing = app, GZipMiddleware(app, compresslevel=1)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on; a range of an answer stays as it is."""
+        is_whole = scope["type"] == "http" and "range" not in Headers(scope=scope)
+        is_compressed = is_whole and COMPRESSED.fullmatch(scope["path"])
+        await (self._compressing if is_compressed else self._app)(scope, receive, send)
 
 
 class Recorder:

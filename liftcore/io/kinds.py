@@ -578,6 +578,3 @@ __all__ = [
     "CONVERT", "EXPORT_PLY", "PICKLED", "SPLATS_SENT", "SUFFIX", "TRAINED", "FileKind", "SplatFormat", "identify",
     "keys_of", "page_table", "wrong_kind",
 ]  # fmt: skip
-
-if __name__ == "__main__":  # run by `make web` to build the page
-    print(json.dumps(page_table(), indent=1, sort_keys=True))

@@ -7,7 +7,6 @@ Nothing here imports numpy or torch, which help and the HTTP process do not need
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Mapping
 from functools import cached_property
@@ -615,7 +614,3 @@ def page_fields() -> dict[str, Any]:
     """Return the JSON schema of each field that decides the answer, for the page."""
     fields = Query.model_json_schema()["properties"]
     return {name: fields[name] for name in Query.deciding()}
-
-
-if __name__ == "__main__":  # `make web` builds the page with it
-    print(json.dumps(page_fields(), indent=1))

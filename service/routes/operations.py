@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import os
 import re
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import zstandard
 from fastapi import APIRouter, Request, Response
 from fastapi import Path as PathParameter
 from fastapi.openapi.docs import get_swagger_ui_html
 from fastapi.responses import FileResponse, HTMLResponse, JSONResponse
+from fastapi.staticfiles import StaticFiles
 from prometheus_client import generate_latest
 
 from liftcore import __version__
+from liftcore.io.kinds import page_table
+from liftcore.query.question import page_fields
 from service.auth import with_keys
 from service.errors import Busy
 from service.models import Status
@@ -24,13 +28,13 @@ from service.routes import BINARY, Deps
 from service.store import admit
 
 EXAMPLE = Path(__file__).parents[1] / "commands" / "tabletop"
-WEB = Path(__file__).parents[1] / "web" / "built"  # built by `make web`
+WEB = Path(__file__).parents[1] / "web"
+PAGE = WEB / "src" / "index.html"
 SWAGGER = Path(str(files("fastapi_offline"))) / "static"  # shipped with the package: the machine may be offline
 METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-PAGE_FILES = {"page.js": "text/javascript", "page.css": "text/css", "LICENSES.txt": "text/plain; charset=utf-8"}
 SWAGGER_FILES = {"swagger-ui-bundle.js": "text/javascript", "swagger-ui.css": "text/css"}
 EXAMPLE_FILES = ("point_cloud.spz", "cameras.json", "features.safetensors")
-IMMUTABLE = {"Cache-Control": "public, max-age=31536000, immutable"}  # addresses of scripts contain their digest
+IMMUTABLE = "public, max-age=31536000, immutable"  # addresses of libraries contain their version
 
 router = APIRouter(tags=["operations"])
 
@@ -44,10 +48,36 @@ def policy(scripts: str, styles: str, rest: str) -> dict[str, str]:
     return {"Content-Security-Policy": text, "Cache-Control": "no-cache"}
 
 
+def own_scripts(html: str) -> str:
+    """Return the sources of a page's scripts: this service, and the digest of each script in the page."""
+    inline = re.findall(r"<script(?: type=\"importmap\")?>(.*?)</script>", html, re.DOTALL)
+    digests = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in inline)
+    return " ".join(("'self'", *(f"'sha256-{digest}'" for digest in digests)))
+
+
 # The page calls this service, and sorts and unpacks splats in WebAssembly, in workers.
 PAGE_HEADERS = policy(
-    "'self' 'wasm-unsafe-eval'", "'self'", "form-action 'none'; worker-src blob:; font-src data:"
+    f"{own_scripts(PAGE.read_text())} 'wasm-unsafe-eval'", "'self'",
+    "form-action 'none'; worker-src blob:; font-src 'self'",
 )  # fmt: skip
+
+
+class PageFiles(StaticFiles):
+    """The files of the page; its libraries are stored compressed, as they were published."""
+
+    def lookup_path(self, path: str) -> tuple[str, os.stat_result | None]:
+        """Return a file, or the compressed one."""
+        plain = super().lookup_path(path)
+        return plain if plain[1] else super().lookup_path(f"{path}.gz")
+
+    def file_response(self, full_path: Any, *arguments: Any, **options: Any) -> Response:
+        """Return the answer with a file; browsers compare those that change with their own."""
+        answer = super().file_response(full_path, *arguments, **options)
+        is_library = Path(full_path).is_relative_to(WEB / "libraries")
+        answer.headers["Cache-Control"] = IMMUTABLE if is_library else "no-cache"
+        if Path(full_path).suffix == ".gz":
+            answer.headers["Content-Encoding"] = "gzip"
+        return answer
 
 
 @router.get("/healthz")
@@ -85,13 +115,19 @@ def metrics(request: Request) -> Response:
 @router.get("/", response_class=HTMLResponse, include_in_schema=False)
 def page() -> FileResponse:
     """Get the page. It and its files need no key."""
-    return FileResponse(WEB / "page.html", headers=PAGE_HEADERS, media_type="text/html")
+    return FileResponse(PAGE, headers=PAGE_HEADERS, media_type="text/html")
 
 
-@router.get("/web/{name}", include_in_schema=False)
-def page_file(name: Annotated[str, PathParameter(pattern="|".join(PAGE_FILES))]) -> FileResponse:
-    """Get a file of the page."""
-    return FileResponse(WEB / name, headers=IMMUTABLE, media_type=PAGE_FILES[name])
+@router.get("/web/kinds.json", include_in_schema=False)
+def kinds() -> dict[str, Any]:
+    """Get the suffixes of files that the page sends, and what others are."""
+    return page_table()
+
+
+@router.get("/web/question.json", include_in_schema=False)
+def question_fields() -> dict[str, Any]:
+    """Get the JSON schema of each field of a question."""
+    return page_fields()
 
 
 @router.get("/web/example/{name}", include_in_schema=False)
@@ -121,11 +157,8 @@ def docs() -> HTMLResponse:
         swagger_favicon_url="data:,",  # else the page loads one from another host
     )
     html = bytes(page.body).decode()
-    inline = re.findall("<script>(.*?)</script>", html, re.DOTALL)
-    digests = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in inline)
-    scripts = " ".join(("'self'", *(f"'sha256-{digest}'" for digest in digests)))
     styles = "'self' 'unsafe-inline'"  # Swagger UI sets styles while it runs
-    return HTMLResponse(html, headers=policy(scripts, styles, "form-action 'self'"))
+    return HTMLResponse(html, headers=policy(own_scripts(html), styles, "form-action 'self'"))
 
 
 @router.get("/docs/{name}", include_in_schema=False)

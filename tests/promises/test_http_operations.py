@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import json
 import re
 import shutil
@@ -59,6 +61,23 @@ def test_page_and_documents_load_nothing_of_other_hosts(client: httpx.Client) ->
             if not address.startswith("data:"):
                 assert client.get(f"/{address.lstrip('/')}").status_code == 200, address
     assert "splatlift" in client.get("/").text
+
+
+def test_page_serves_the_libraries_that_it_names_compressed(client: httpx.Client, lift: dict[str, Any]) -> None:
+    page = client.get("/").text
+    libraries = json.loads(page.partition('<script type="importmap">')[2].partition("</script>")[0])
+    assert set(libraries["imports"].values()) <= set(libraries["integrity"])
+    for address, digest in libraries["integrity"].items():
+        library = client.get(address.removeprefix("."))
+        assert library.headers["content-encoding"] == "gzip" and "immutable" in library.headers["cache-control"]
+        assert base64.b64encode(hashlib.sha256(library.content).digest()).decode() == digest.removeprefix("sha256-")
+    script = "/web/src/main.js"
+    for address in ("/", script, "/web/src/page.css", f"/lifts/{lift['id']}/splats"):
+        reply = client.get(address)
+        assert reply.headers["content-encoding"] == "gzip" and "immutable" not in reply.headers["cache-control"]
+    part = client.get(script, headers={"Range": "bytes=0-31"})
+    assert part.status_code == 206 and "content-encoding" not in part.headers
+    assert part.content == client.get(script).content[:32]
 
 
 @pytest.mark.parametrize("host", ["example.org", "example.org:80", "localhost.example.org", "", "127.0.0.1.nip.io"])

@@ -1,7 +1,7 @@
 // The kind of a file by its name and content, which is known before anything is sent.
 import { unzip, Zip, ZipPassThrough } from "fflate";
 import { colmapViews } from "./colmap.js";
-import kindTable from "./kinds.json"; // of liftcore.io.kinds: suffixes that are sent, and descriptions of others
+import kindTable from "../kinds.json" with { type: "json" }; // of liftcore.io.kinds: suffixes that are sent, and descriptions of others
 
 const MAX_HEADER_BYTES = 32 << 20; // bytes of a safetensors header that are read here
 const ZIP_TAIL_BYTES = 1 << 20; // bytes at the end of a ZIP, where its list of names is

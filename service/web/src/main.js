@@ -13,7 +13,7 @@ import { fetchBytes, fetchJson, storedKey, onAvailability, onUnauthorized, fetch
 import { SharePanel } from "./share.js";
 import { ExportPanel } from "./exports.js";
 import { ObjectList } from "./objects.js";
-import { MAX_SPLATS, Viewer, webgl } from "./viewer.js";
+import { MAX_SPLATS, ROW_BYTES, Viewer, webgl } from "./viewer.js";
 
 const PAGE_SIZE = 100; // lifts to choose from
 const MAX_PREVIEW_BYTES = 800e6; // bytes of a splat file that is drawn before it is uploaded
@@ -277,11 +277,11 @@ async function open(id, fresh = false) {
     viewer?.clear();
     byId("stage").classList.remove("ready");
     byId("poster").hidden = true;
-    let poster = null;
-    const [content] = await Promise.all([
-      layers.fallback ? null : fetchBytes(`/lifts/${id}/splats`, { progress: (received, total) => request === openRequest && showLoading(`Loading ${formatBytes(received)}${total ? ` of ${formatBytes(total)}` : ""}`, total ? received / total : null) }),
-      layers.setLift(lift, parameters.get("view")).then(() => { poster = request === openRequest ? showPoster(parameters, request) : null; }),
-    ]);
+    await layers.setLift(lift, parameters.get("view"));
+    if (request !== openRequest) return;
+    const poster = showPoster(parameters, request); // asked for first, as it is shown first
+    const progress = received => request === openRequest && showLoading(`Loading ${formatBytes(received)} of ${formatBytes(ROW_BYTES * lift.count)}`, received / ROW_BYTES / lift.count);
+    const content = layers.fallback ? null : await fetchBytes(`/lifts/${id}/splats`, { progress });
     // The first frame of the splats may block the page for seconds, so the poster has to be shown before.
     await Promise.race([poster, new Promise(resolve => setTimeout(resolve, POSTER_WAIT))]);
     if (request !== openRequest) return;

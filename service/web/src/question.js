@@ -1,5 +1,5 @@
 // The fields of a question, as liftcore declares them: new questions, links, requests and code lines are made of them.
-import fields from "./question.json"; // of liftcore.query.question: the JSON schema of each field
+import fields from "../question.json" with { type: "json" }; // of liftcore.query.question: the JSON schema of each field
 
 const FIELDS = Object.entries(fields);
 const isList = field => field.type === "array";

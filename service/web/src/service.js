@@ -64,25 +64,19 @@ export async function fetchPicture(path, body) {
   return image;
 }
 
-// Fetch all bytes of a reply. progress(received, total): total is 0 if unknown.
+// Fetch all bytes of a reply. progress(received): called with their number, as they come.
 export async function fetchBytes(path, { body, progress = () => {} } = {}) {
   const reply = await call(path, body && { method: "POST", body });
-  const total = Number(reply.headers.get("Content-Length")) || 0;
-  let content = new Uint8Array(total || 1 << 20);
+  const parts = [];
   let received = 0;
   for (const reader = reply.body.getReader(); ;) {
     const { done, value } = await reader.read();
     if (done) break;
-    if (received + value.length > content.length) { // a compressed reply is longer than its Content-Length
-      const larger = new Uint8Array(2 * (received + value.length));
-      larger.set(content);
-      content = larger;
-    }
-    content.set(value, received);
+    parts.push(value);
     received += value.length;
-    progress(received, total);
+    progress(received);
   }
-  return content.subarray(0, received);
+  return new Uint8Array(await new Blob(parts).arrayBuffer());
 }
 
 // The values of a NumPy array (.npy, version 1) in their order in the file.

@@ -5,7 +5,7 @@ import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 import { prefersStill } from "./dom.js";
 import { Painter } from "./painter.js";
 
-const ROW_BYTES = 32; // bytes of a splat in a .splat file
+export const ROW_BYTES = 32; // bytes of a splat in a .splat file
 export const MAX_SPLATS = 2_000_000; // drawn splats; of a larger scene every n-th splat is drawn
 const FLIGHT_TIME = 700; // ms of a camera flight
 const UNPACK_TIMEOUT = 60_000; // ms after which the unpacking of a scene is an error

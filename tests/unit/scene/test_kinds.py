@@ -19,7 +19,7 @@ from liftcore.errors import InvalidCameras, InvalidInput, InvalidSplats
 from liftcore.evaluate.inspect import inspect_file
 from liftcore.io.cameras import read_cameras
 from liftcore.io.files import MAX_DIRECTORY_BYTES, open_zip
-from liftcore.io.kinds import SplatFormat, identify, page_table, wrong_kind
+from liftcore.io.kinds import SplatFormat, identify, wrong_kind
 from liftcore.io.splats import read_splats, splat_files, write_splats
 from liftcore.query.result import load_lift
 from liftcore.text import open_encoder
@@ -218,11 +218,6 @@ def test_the_order_is_blamed_only_where_it_is_wrong(tmp_path: Path, capsys: pyte
         assert "the order is" not in plan_errors(*files)
     assert "point_cloud.ply" in plan_errors(archive, cameras, cameras)
     assert "the order is SPLATS CAMERAS FEATURES" in plan_errors(cameras, ply, cameras)
-
-
-def test_the_page_has_the_table_of_this_version() -> None:
-    page_file = Path(__file__).parents[3] / "service" / "web" / "src" / "kinds.json"
-    assert json.loads(page_file.read_text()) == page_table(), "make web"
 
 
 def test_a_file_in_the_place_of_another_kind_is_named_for_what_it_is_everywhere(tmp_path: Path) -> None:
