@@ -22,9 +22,8 @@ def main(splats_path: str, cameras_path: str, features_path: str, word: str, out
     print(answer.threshold.explanation)
 
     masks = Path(out, "masks")
-    # Share of each ray's weight on selected splats.
-    shares = lc.render(splats, cameras, answer.selected, normalise=True)
-    for view, share in shares.items():
+    for view, camera in cameras.items():
+        share = lc.render(splats, camera, answer.selected, normalise=True)  # of each ray's weight, on selected splats
         picture = np.asarray(share > 0.5, dtype=np.uint8) * 255
         path = masks / f"{view}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
