@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import logging
 import re
 import secrets
 import sys
+import threading
 import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
@@ -25,7 +27,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from liftcore import __version__
 from liftcore.files import PhotoIndexes
 from service import errors
-from service.auth import Auth
+from service.auth import Auth, with_keys
 from service.errors import METHODS, PROBLEM, REQUEST_ID, answer_to
 from service.models import BODY_BYTES
 from service.process import Children
@@ -64,6 +66,7 @@ def create_app(settings: ServiceSettings, store: Store) -> FastAPI:
         )
         add_gauges(app.state.registry, parts)
         runner.start()
+        gc.freeze()  # what the start made is no garbage: a search through it would stop all answers for .1 s
         try:
             yield
         finally:
@@ -93,6 +96,18 @@ def create_app(settings: ServiceSettings, store: Store) -> FastAPI:
 
 class Application(FastAPI):
     """The application, whose OpenAPI document names the problem of errors."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._documents, self._turn = dict[bool, bytes](), threading.Lock()
+
+    def document(self, *, asks_for_keys: bool) -> bytes:
+        """Return the document as JSON. It is made once, as that takes a second of computation."""
+        with self._turn:
+            if asks_for_keys not in self._documents:
+                document = with_keys(self.openapi()) if asks_for_keys else self.openapi()
+                self._documents[asks_for_keys] = json.dumps(document).encode()
+        return self._documents[asks_for_keys]
 
     def openapi(self) -> dict[str, Any]:
         """Return the document; the first sentence of each description is the summary."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import logging
 import re
+import reprlib
 import sqlite3
 from collections.abc import Mapping
 from contextvars import ContextVar
@@ -23,7 +24,8 @@ from liftcore.errors import NotFound, SplatliftError
 
 MEDIA_TYPE = "application/problem+json"
 FULL = (errno.ENOSPC, errno.EDQUOT)
-VALUE_CHARACTERS = 120  # of a value of a request, in an answer
+SHORT = reprlib.Repr()  # of a value of a request, in an answer
+SHORT.maxstring = SHORT.maxother = 120
 METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE")
 FIELDS = ("argument", "expected", "got", "hint", "nearest")
 # Words of pydantic around the expected value
@@ -256,7 +258,7 @@ def _refusal(error: RequestValidationError) -> SplatliftError:
     if place == ["body"] and isinstance(first.get("input"), bytes):  # curl declares a form by default
         hint = "send the header Content-Type: application/json with the body"
         return UnsupportedMedia("Content-Type", expected="application/json", got="another, or none", hint=hint)
-    got = "nothing" if kind == "missing" else _short(first.get("input"))
+    got = "nothing" if kind == "missing" else SHORT.repr(first.get("input"))
     if kind == "unknown_field":  # reported for the object that holds it
         place.append(context["field"])
         got = repr(context["field"])
@@ -270,11 +272,6 @@ def _refusal(error: RequestValidationError) -> SplatliftError:
     return InvalidRequest(
         ".".join(place[1:]) or place[0], expected=expected[:1].lower() + expected[1:], got=got, hint=hint
     )
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= VALUE_CHARACTERS else f"{text[:VALUE_CHARACTERS]}..."
 
 
 def install(app: FastAPI) -> None:
@@ -291,7 +288,10 @@ def install(app: FastAPI) -> None:
                 if any(route.matches(scope)[0] is Match.FULL for route in app.routes)
             ]
             error.headers = {"Allow": ", ".join(allowed_methods)}
-        return answer_to(error, f"{request.method[:20]} {request.url.path[:200]}")
+        reply = answer_to(error, f"{request.method[:20]} {request.url.path[:200]}")
+        # Else it holds the frames that raised it, and these hold it, with the body, up to a full garbage collection.
+        error.__cause__ = error.__context__ = error.__traceback__ = None
+        return reply
 
     errors = (SplatliftError, Fault, RequestValidationError, HTTPException, ClientDisconnect, OSError, sqlite3.Error)
     for kind in errors:

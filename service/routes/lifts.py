@@ -72,8 +72,10 @@ async def create_lift(
         if lift is not None:
             response.status_code = 200
         else:
-            asset = cameras and await in_thread(deps, deps.store.asset, owner, cameras, "cameras")
-            content = await check_upload(deps, "lift", draft, asset)
+            others = None
+            if cameras is not None:
+                others = await in_thread(deps, deps.store.asset, owner, cameras, "cameras")
+            content = await check_upload(deps, "lift", draft, others)
             lift = await in_thread(deps, results.add_lift, deps.store, owner, draft, content, cameras)
     response.headers["Location"] = f"/lifts/{lift.id}"
     return lift

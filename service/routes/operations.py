@@ -6,6 +6,7 @@ import base64
 import hashlib
 import os
 import re
+from collections.abc import AsyncIterator
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,14 +15,13 @@ import zstandard
 from fastapi import APIRouter, Request, Response
 from fastapi import Path as PathParameter
 from fastapi.openapi.docs import get_swagger_ui_html
-from fastapi.responses import FileResponse, HTMLResponse, JSONResponse
+from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, StreamingResponse
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import generate_latest
 
 from liftcore import __version__
 from liftcore.io.kinds import page_table
 from liftcore.query.question import page_fields
-from service.auth import with_keys
 from service.errors import Busy
 from service.models import Status
 from service.routes import BINARY, Deps
@@ -31,6 +31,7 @@ EXAMPLE = Path(__file__).parents[1] / "commands" / "tabletop"
 WEB = Path(__file__).parents[1] / "web"
 PAGE = WEB / "src" / "index.html"
 SWAGGER = Path(str(files("fastapi_offline"))) / "static"  # shipped with the package: the machine may be offline
+BLOCK_BYTES = 1 << 16
 METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 SWAGGER_FILES = {"swagger-ui-bundle.js": "text/javascript", "swagger-ui.css": "text/css"}
 EXAMPLE_FILES = ("point_cloud.spz", "cameras.json", "features.safetensors")
@@ -140,10 +141,15 @@ def example_file(name: Annotated[str, PathParameter(pattern="|".join(EXAMPLE_FIL
 
 
 @router.get("/openapi.json", include_in_schema=False)
-def document(request: Request, deps: Deps) -> JSONResponse:
+def document(request: Request, deps: Deps) -> StreamingResponse:
     """Get the OpenAPI document, which asks for keys once there are any."""
-    document = request.app.openapi()
-    return JSONResponse(with_keys(document) if admit(deps.store, None)[0] else document)
+    content = request.app.document(asks_for_keys=admit(deps.store, None)[0])
+
+    async def blocks() -> AsyncIterator[bytes]:  # of which a slow client holds one
+        for first in range(0, len(content), BLOCK_BYTES):
+            yield content[first : first + BLOCK_BYTES]
+
+    return StreamingResponse(blocks(), media_type="application/json")
 
 
 @router.get("/docs", response_class=HTMLResponse, include_in_schema=False)

@@ -8,6 +8,7 @@ import json
 import re
 import shutil
 import socket
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any
@@ -253,3 +254,16 @@ def test_what_hides_behind_an_unclear_end_is_not_answered(client: httpx.Client, 
             while content := connection.recv(1 << 16):
                 answer += content
     assert answer.startswith(b"HTTP/1.1 400 ") and answer.count(b"HTTP/1.1 ") == 1
+
+
+def test_bodies_that_cannot_be_read_leave_no_memory(client: httpx.Client, server: Server) -> None:
+    def send(content: bytes) -> None:
+        reply = client.post("/query", content=content, headers={"Content-Type": "application/json"})
+        assert_problem(reply, 400)
+
+    bodies = (b"\xff" * 1_000_000, b"[" * 900_000)
+    with ThreadPoolExecutor(8) as clients:
+        list(clients.map(send, bodies * 4))
+        before = server.usage()["resident_kb"]
+        list(clients.map(send, bodies * 40))
+    assert server.usage()["resident_kb"] - before < 40_000
