@@ -11,7 +11,7 @@ from fastapi import Path as PathParameter
 
 from liftcore.errors import NotFound
 from service import models, selections
-from service.errors import Conflict, InvalidRequest, VersionMismatch
+from service.errors import InvalidRequest
 from service.models import Lift, Selection, SelectionDetail
 from service.routes import Caller, Deps, Parts, cache_headers
 from service.routes.queries import NO_ENCODER, bits_text, query_request, scene_request
@@ -69,17 +69,11 @@ def edit_selection(
     match: IfMatch = None,
 ) -> SelectionDetail:  # fmt: skip
     """Add, take away, grow, shrink or set: a step of its history, which PATCH goes back."""
-    record, versions = deps.store.lift(owner, lift), _versions(match)
-    before = selections.get_selection(deps.store, record.id, selection, versions)
+    record = deps.store.lift(owner, lift)
+    before = selections.get_selection(deps.store, record.id, selection, _versions(match))
     splats = _edit(edit, record, deps, owner, selections.bits_of_selection(deps.store, before))
-    try:  # the change is of the version that was read: one stored meanwhile is not overwritten
-        after = selections.extend_selection(deps.store, before, splats)
-    except VersionMismatch as error:
-        if versions is not None:
-            raise
-        got, hint = "one that another edit changed", "send the edit again"
-        raise Conflict("selection", expected=error.expected, got=got, hint=hint) from None
-    return _answer(after, response, deps)
+    # The change is of the version that was read: one stored meanwhile is not overwritten.
+    return _answer(selections.extend_selection(deps.store, before, splats), response, deps)
 
 
 @router.patch(PATH)
