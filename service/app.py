@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import json
 import logging
 import re
@@ -18,6 +17,7 @@ from typing import Any
 
 import anyio
 from fastapi import FastAPI
+from h11 import LocalProtocolError
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
@@ -66,7 +66,6 @@ def create_app(settings: ServiceSettings, store: Store) -> FastAPI:
         )
         add_gauges(app.state.registry, parts)
         runner.start()
-        gc.freeze()  # what the start made is no garbage: a search through it would stop all answers for .1 s
         try:
             yield
         finally:
@@ -156,9 +155,7 @@ class Recorder:
             for name, value in scope["headers"]
             if name != b"range" or value.lower().startswith(b"bytes=")
         ]
-        values = [value for name, value in scope["headers"] if name == b"x-request-id"]
-        is_sane = len(values) == 1 and SANE_ID.fullmatch(values[0])
-        request_id = values[0].decode("ascii") if is_sane else secrets.token_hex(16)
+        request_id = request_id_of(scope)
 
         async def send_marked(message: Message) -> None:
             nonlocal status, sent_bytes
@@ -187,11 +184,15 @@ class Recorder:
 
         token = REQUEST_ID.set(request_id)
         try:
-            await self._app(scope, receive, send_problem)
-        except Exception as error:
-            if status:  # the answer has begun: the connection is closed
-                raise
-            await answer_to(error, scope["path"][:200])(scope, receive, send_marked)
+            try:
+                await self._app(scope, receive, send_problem)
+            except Exception as error:
+                if status:  # the answer has begun: the connection is closed
+                    raise
+                await answer_to(error, scope["path"][:200])(scope, receive, send_marked)
+        except LocalProtocolError:
+            if sent_bytes:
+                raise  # else uvicorn has refused the rest of the request, and ended the connection
         finally:
             seconds, route = time.monotonic() - start, getattr(scope.get("route"), "path", "(no route)")
             method = scope["method"] if scope["method"] in METHODS else "other"  # as labels
@@ -205,6 +206,13 @@ class Recorder:
             }  # fmt: skip
             access.info("%s %s %d", method, route, status, extra={"fields": fields})
             REQUEST_ID.reset(token)
+
+
+def request_id_of(scope: Scope) -> str:
+    """Return the X-Request-ID of a request if it is safe in any log, else a new one."""
+    values = [value for name, value in scope["headers"] if name == b"x-request-id"]
+    is_sane = len(values) == 1 and SANE_ID.fullmatch(values[0])
+    return values[0].decode("ascii") if is_sane else secrets.token_hex(16)
 
 
 def add_gauges(registry: CollectorRegistry, parts: Parts) -> None:

@@ -15,7 +15,7 @@ from service.errors import REQUEST_ID, Busy, NoSpace, ProcessDied, fault_of
 from service.models import FINAL_STATES, Job
 from service.process import Children, Message
 from service.settings import ServiceSettings
-from service.store import MAX_ATTEMPTS, SERVICE, Store, assets_of
+from service.store import MAX_ATTEMPTS, SERVICE, Owner, Store, assets_of
 
 IDLE_SECONDS = 5.0  # the longest delay after a missed wake-up
 RETRY_SECONDS = 1.0  # between attempts to write to the database, or to find free disk
@@ -117,10 +117,17 @@ class Runner:
                 return ""
 
         try:
-            order = self._order(job, scratch, draft)
+            order = work_of(dict(job), store, SERVICE, self._settings)
         except SplatliftError as error:
             fault = fault_of(error)
             return lambda: store.end(job, fault)
+        work, settings = str(store.work(job.id)), self._settings
+        order["names"][work] = "the job's folder"
+        order |= {
+            "task": job.kind, "kind": job.kind, "scratch": str(scratch), "output": str(draft), "work": work,
+            "parameters": job.parameters, "threads": settings.job_threads,
+            "checkpoint_seconds": settings.checkpoint_seconds,
+        }  # fmt: skip
         last, reason, _ = self._children.run(order, self._settings.job_seconds, take, why_end)
         if last is not None and "result" in last:
             return lambda: store.finish(job, last["result"], draft)
@@ -147,23 +154,20 @@ class Runner:
                 if self._children.stopping.wait(RETRY_SECONDS):
                     return None
 
-    def _order(self, job: Job, scratch: Path, draft: Path) -> dict[str, Any]:
-        store, settings = self._store, self._settings
-        records = [store.asset(SERVICE, *asset) for asset in assets_of(dict(job))]
-        splats, cameras = records[0], records[1]
-        inputs = records[: 2 + len(job.features)]
-        return {
-            "task": job.kind, "kind": job.kind, "scratch": str(scratch), "output": str(draft),
-            "splats": str(splats.file), "kernel": splats.kernel(job.settings), "cameras": str(cameras.file),
-            "features": [str(pack.file) for pack in inputs[2:]],
-            "labels": {item.kind: str(item.file) for item in records[len(inputs):]},
-            "settings": job.settings, "parameters": job.parameters, "threads": settings.job_threads,
-            "work": str(store.work(job.id)), "checkpoint_seconds": settings.checkpoint_seconds,
-            "engine": settings.engine, "ray_address": settings.ray_address,
-            "file_names": {str(item.file): item.download_name for item in inputs},
-            "names": {str(item.file): item.client_name for item in records}
-            | {str(store.work(job.id)): "the job's folder"},
-        }  # fmt: skip
+
+def work_of(order: dict[str, Any], store: Store, owner: Owner, settings: ServiceSettings) -> dict[str, Any]:
+    """Return what a child needs of an order: its files, and what clients call them."""
+    records = [store.asset(owner, *asset) for asset in assets_of(order)]
+    end = 2 + len(order["features"])
+    splats, cameras, *packs = records[:end]
+    return {
+        "splats": str(splats.file), "kernel": splats.kernel(order["settings"]), "cameras": str(cameras.file),
+        "features": [str(pack.file) for pack in packs],
+        "labels": {item.kind: str(item.file) for item in records[end:]},
+        "settings": order["settings"], "engine": settings.engine, "ray_address": settings.ray_address,
+        "file_names": {str(item.file): item.download_name for item in records[:end]},
+        "names": {str(item.file): item.client_name for item in records},
+    }  # fmt: skip
 
 
 class StagePace:

@@ -12,7 +12,8 @@ from fastapi.sse import EventSourceResponse, format_sse_event
 from liftcore.errors import SplatliftError
 from service.models import FINAL_STATES, Job, LiftRequest, Plan, TradeoffRequest
 from service.routes import Caller, Deps, Parts, add_list
-from service.store import Owner, assets_of
+from service.runner import work_of
+from service.store import Owner
 
 POLL_SECONDS = 0.25  # between polls for new events
 QUIET_POLLS = 60  # then a comment keeps the connection open
@@ -70,16 +71,10 @@ async def plan_lift(order: LiftRequest, deps: Deps, owner: Caller) -> Plan:
 
 
 def _plan(order: dict[str, Any], deps: Parts, owner: Owner) -> dict[str, Any]:
-    splats, cameras, *rest = [deps.store.asset(owner, *asset) for asset in assets_of(order)]
-    packs, settings = rest[: len(order["features"])], deps.settings
+    work = work_of(order, deps.store, owner, deps.settings)
     with deps.store.scratch() as scratch:
-        work = {
-            "task": "plan", "kind": "plan", "scratch": str(scratch), "memory": settings.check_memory_bytes,
-            "splats": str(splats.file), "cameras": str(cameras.file), "features": [str(pack.file) for pack in packs],
-            "settings": order["settings"], "engine": settings.engine,
-            "names": {str(item.file): item.client_name for item in (splats, cameras, *packs)},
-        }  # fmt: skip
-        return deps.children.check(work, settings.check_seconds, "plan")
+        work |= {"task": "plan", "kind": "plan", "scratch": str(scratch), "memory": deps.settings.check_memory_bytes}
+        return deps.children.check(work, deps.settings.check_seconds, "plan")
 
 
 @router.get("/jobs/{job}")

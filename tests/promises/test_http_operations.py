@@ -267,3 +267,12 @@ def test_bodies_that_cannot_be_read_leave_no_memory(client: httpx.Client, server
         before = server.usage()["resident_kb"]
         list(clients.map(send, bodies * 40))
     assert server.usage()["resident_kb"] - before < 40_000
+
+
+def test_refusal_that_nobody_awaits_is_no_error(client: httpx.Client, server: Server) -> None:
+    with socket.create_connection((client.base_url.host, client.base_url.port or 80), PATIENCE_SECONDS) as connection:
+        head = "POST /query HTTP/1.1\r\nHost: elsewhere\r\nTransfer-Encoding: chunked\r\n\r\n"
+        connection.sendall(f"{head}no chunk\r\n".encode())
+        assert connection.recv(1 << 16).startswith(b"HTTP/1.1 4")
+    assert client.get("/healthz").status_code == 200
+    assert "Exception in ASGI application" not in server.log.read_text()
