@@ -242,7 +242,6 @@ class Lift(BaseModel):
     words: list[str] = Field([], description="from its packs, for queries without an encoder; few enough to show")
     views: list[str] = Field([], description="the views that were lifted; very many are at /lifts/{lift}/views alone")
     view_count: int = Field(description="number of these")
-    first_view: str | None = Field(None, exclude=True)
     origin: list[float] = Field(
         [0.0, 0.0, 0.0],
         description="of the positions of its `.splat` and `.spz`; zeros except for scenes in map coordinates",
@@ -348,7 +347,7 @@ AnExample = Annotated[Notation | Numbers, takes(f"{NOTATIONS}, or a vector of 1 
 Examples = Annotated[list[AnExample], Field(max_length=MAX_TEXTS, fail_fast=True)]
 Notations = Annotated[list[Notation], Field(max_length=MAX_TEXTS, fail_fast=True)]
 EncoderName = Annotated[str, Field(max_length=200)]
-THE_LIFT = "the lift; may be left out when there is exactly one"
+THE_LIFT = "the lift; the newest one if left out"
 
 
 class LiftQuestion(BaseModel):

@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
+from urllib.parse import urlencode
 
 from liftcore import (
     Answer,
@@ -53,6 +54,7 @@ MASK_PIXELS = 1 << 26  # of all views of an export: a minute, as for the largest
 # Files of an answer and of many words, by operation: what `Scene.blocks_of` calls them
 WORD_FILES = {"labels": "splat_labels", "map": "labels", "picture": "picture"}
 SPLATS_FILES = {"object": "object", "scores": "coloured"}
+VIEW_LINKS = ("render", "mask", "attention")  # links of an answer that end with a view
 Request = dict[str, Any]
 
 
@@ -219,9 +221,16 @@ class Answers:
         scene, answer = self._scene(request), self._answer(request)
         if request["view"] is not None:
             scene.cameras[request["view"]]  # refuse an unknown view now rather than at its picture
+        view = request["view"] or scene.best_view(answer)
+        of_view = {} if view is None else {"view": view}
         needs_splats = () if answer.count else ("objects", "object")
-        links = {name: link for name, link in request["links"].items() if name not in needs_splats}
-        return scene.locate(answer, request["top"]).model_dump(mode="json") | {"links": links}
+        links = {
+            name: f"{link}&{urlencode(of_view)}" if name in VIEW_LINKS else link
+            for name, link in request["links"].items()
+            if name not in needs_splats and (of_view or name not in VIEW_LINKS)
+        }
+        document = scene.locate(answer, request["top"]).model_dump(mode="json")
+        return document | {"view": view, "links": links}
 
     def _objects(self, request: Request) -> dict[str, Any]:
         document = self._answer(request).model_dump(mode="json", include=set(SelectionSummary.model_fields))

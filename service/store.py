@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from liftcore.errors import NotFound
-from service.errors import REQUEST_ID, Busy, Conflict, InvalidRequest, KeyReused, Misconfigured, NoSpace
+from service.errors import REQUEST_ID, Busy, Conflict, KeyReused, Misconfigured, NoSpace
 from service.models import FINAL_STATES, Asset, Job, Key, Lift
 
 DATABASE = "service.sqlite"
@@ -515,19 +515,15 @@ class Store:
     # Lifts
 
     def lift(self, owner: Owner, lift: str | None) -> Lift:
-        """Return the lift of that id; the only one without an id."""
-        select = f"{LIFTS} WHERE {VISIBLE} AND id = coalesce(:id, id) LIMIT 2"
+        """Return the lift of that id; the newest one without an id."""
+        select = f"{LIFTS} WHERE {VISIBLE} AND id = coalesce(:id, id) ORDER BY created DESC, id LIMIT 1"
         rows = self.rows(select, id=lift, **vars(owner))
-        if len(rows) == 1:
-            return Lift.of_row(rows[0])
-        hint = "GET /lifts lists them; a lift has the id of its job"
         if rows:
-            expected = "the id of a lift, as there are several"
-            raise InvalidRequest("lift", expected=expected, got="nothing", hint=hint)
-        expected = "at least one lift" if lift is None else "the id of a lift"
-        raise NotFound(
-            "lift", expected=expected, got=(lift or "none")[:80], hint=hint if lift else "POST /lift first"
-        )
+            return Lift.of_row(rows[0])
+        expected, hint = "the id of a lift", "GET /lifts lists them; a lift has the id of its job"
+        if lift is None:
+            expected, hint = "at least one lift", "POST /lift first"
+        raise NotFound("lift", expected=expected, got=(lift or "none")[:80], hint=hint)
 
 
 def assets_of(order: dict[str, Any]) -> list[tuple[str, str]]:

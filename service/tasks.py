@@ -156,7 +156,7 @@ def lift_content(path: Path, shape: Sequence[int], metadata: dict[str, Any]) -> 
     if (count := len(json.dumps(metadata))) > SHOWN_BYTES:
         expected = f"at most {SHOWN_BYTES} bytes of metadata beside the names of views and the words"
         raise InvalidLift("lift", expected=expected, got=f"{count}")
-    metadata |= {"view_count": len(views), "first_view": views[0] if views else None}
+    metadata["view_count"] = len(views)
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     return {"sha256": digest, "count": shape[0], "channels": shape[1], "metadata": metadata}

@@ -266,6 +266,15 @@ def locate(scene: OpenedLift, answer: Answer, count: int | None = None) -> Answe
     return answer.model_copy(update={"top": top, "box": Box(*map(_point, ends)) if ends else None})
 
 
+def best_view(scene: OpenedLift, answer: Answer) -> str | None:
+    """Return the view that shows most of the object with the most selected splats, or else the first view."""
+    views, objects = scene.metadata.views, scene.object
+    if scene.object_views is not None and objects is not None and (answer.selected & (objects >= 0)).any():
+        largest = np.bincount(objects[answer.selected & (objects >= 0)]).argmax()
+        return views[max(int(scene.object_views[largest, 0]), 0)]
+    return views[0] if views else None
+
+
 def _similarities(scene: OpenedLift, requests: Sequence[ResolvedQuery]) -> list[np.ndarray]:
     """Compute for each query the cosines of every splat to each of its terms, [P, n] f32."""
     features, norms = scene.features, scene.norms

@@ -63,6 +63,15 @@ class Scene(OpenedLift):
     selections: dict[str, Selection]
     """selections by their names (`select`)"""
 
+    selections: dict[str, Selection]
+    """selections by their names (`select`)"""
+
+    selections: dict[str, Selection]
+    """selections by their names (`select`)"""
+
+    selections: dict[str, Selection]
+    """selections by their names (`select`)"""
+
     def __repr__(self) -> str:
         objects = "" if self.object_views is None else f", {len(self.object_views)} objects"
         return f"Scene({len(self.features)} splats, {self.channels} channels{objects})"
@@ -115,6 +124,12 @@ class Scene(OpenedLift):
         from liftcore.query.ask import locate
 
         return locate(self, answer, count)
+
+    def best_view(self, answer: Answer) -> str | None:
+        """Return the view that shows most of the object with the most selected splats, or else the first view."""
+        from liftcore.query.ask import best_view
+
+        return best_view(self, answer)
 
     def view_mask(
         self,

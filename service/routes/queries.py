@@ -209,25 +209,21 @@ def query(question: Question, request: Request, deps: Deps, owner: Caller) -> Re
     lift = deps.store.lift(owner, question.lift)
     work = query_request("query", question, lift, deps, owner) | {"view": question.view, "top": question.top}
     encoder = None if work["encoder"] is None else encoder_label(work["encoder"])
-    view = question.view or lift.first_view
-    work["head"] = {"lift": lift.id, "view": view, "text_space": lift.text_space, "encoder": encoder}
-    return respond(request, deps, work | {"links": _links(question, lift.id, view)})
+    work["head"] = {"lift": lift.id, "text_space": lift.text_space, "encoder": encoder}
+    return respond(request, deps, work | {"links": _links(question, lift.id)})
 
 
-def _links(question: Question, lift: str, view: str | None) -> dict[str, str]:
-    """Return the addresses of the outputs of a question; vectors do not fit in one, so POST them again."""
+def _links(question: Question, lift: str) -> dict[str, str]:
+    """Return the addresses of the outputs of a question, without a view; vectors do not fit, so POST them again."""
     fields: dict[str, Any] = {}
     if all(isinstance(example, str) for example in (*question.like, *question.unlike)):
         names = (*Query.deciding(), "encoder", "table")
         fields = question.model_dump(mode="json", include=set(names), exclude_defaults=True)
         fields["threshold"] = question.threshold
-    links = {"lift": f"/lifts/{lift}"}
-    outputs = {"scores": "scores", "objects": "objects", "object": "splats", "coloured": "splats"}
-    if view is not None:
-        links["render"] = f"/render?{urlencode({'lift': lift, 'view': view})}"
-        outputs |= {"mask": "mask", "attention": "attention"}
-    for name, output in outputs.items():
-        more = {"what": "scores"} if name == "coloured" else {"view": view} if output in PICTURES else {}
+    links = {"lift": f"/lifts/{lift}", "render": f"/render?lift={lift}"}
+    names = ("scores", "objects", "mask", "attention")
+    for name, output in {**dict(zip(names, names, strict=True)), "object": "splats", "coloured": "splats"}.items():
+        more = {"what": "scores"} if name == "coloured" else {}
         links[name] = f"/query/{output}?{urlencode(fields | more | {'lift': lift}, doseq=True)}"
     return links
 

@@ -68,6 +68,11 @@ def test_page_serves_the_libraries_that_it_names_compressed(client: httpx.Client
     page = client.get("/").text
     libraries = json.loads(page.partition('<script type="importmap">')[2].partition("</script>")[0])
     assert set(libraries["imports"].values()) <= set(libraries["integrity"])
+    preloaded = dict(re.findall('rel="modulepreload" href="([^"]+)" integrity="([^"]+)"', page))
+    assert (
+        preloaded.items()
+        <= {name.removeprefix("./"): value for name, value in libraries["integrity"].items()}.items()
+    )
     for address, digest in libraries["integrity"].items():
         library = client.get(address.removeprefix("."))
         assert library.headers["content-encoding"] == "gzip" and "immutable" in library.headers["cache-control"]

@@ -145,14 +145,17 @@ def test_negatives_and_thresholds_change_the_selection(client: httpx.Client, lif
     assert len(ask(client, lift, text="lamp", top=3)["top"]) == 3
 
 
-def test_only_lift_may_be_left_out_and_several_are_named(
-    client: httpx.Client, lift: dict[str, Any], order: dict[str, Any]
-) -> None:
-    assert client.get("/query", params={"text": "lamp"}).json() == ask(client, lift, text="lamp")
-    other = lift_of(client, order)
-    assert_problem(client.get("/query", params={"text": "lamp"}))
-    assert is_of(ask(client, other, text="lamp"), "lamp")
-    delete_lift(client, other["id"])
+def test_newest_lift_answers_where_none_is_named(client: httpx.Client, order: dict[str, Any]) -> None:
+    newest = lift_of(client, order | {"settings": {"objects": True}})
+    answer = client.get("/query", params={"text": "lamp"}).json()
+    assert answer["lift"] == newest["id"] and is_of(answer, "lamp")
+    assert array(client.get(answer["links"]["scores"]).content).shape == (60,)
+    views = [view["name"] for view in client.get(f"/lifts/{newest['id']}/views").json()["views"]]
+    masks = {view: client.get("/query/mask", params={"text": "lamp", "view": view}).content for view in views}
+    areas = {view: (picture(mask) > 0).sum() for view, mask in masks.items()}
+    mask = picture(client.get(answer["links"]["mask"]).content)  # of the view that shows most of it
+    assert (mask > 0).sum() == areas[answer["view"]] == max(areas.values()) > 0
+    delete_lift(client, newest["id"])
 
 
 def test_nothing_selected_is_said_and_has_no_splats(client: httpx.Client, lift: dict[str, Any]) -> None:
