@@ -17,7 +17,7 @@ from liftcore.errors import InvalidLift, InvalidQuery
 from liftcore.io.labels import FORMAT, Labels
 from liftcore.query.catalogue import Catalogue
 from liftcore.query.colours import cluster_colours
-from liftcore.query.objects import LEAST_OBJECT_WEIGHT, objects, trimmed_box
+from liftcore.query.objects import LEAST_OBJECT_WEIGHT, is_outlier, objects, trimmed_box
 from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.question import Answer, SceneNode, SceneObject, SceneTree
 from liftcore.runtime.version import __version__
@@ -230,7 +230,8 @@ def _facts(scene: OpenedLift, rows: np.ndarray, scores: np.ndarray | None) -> di
         facts["score"] = float(np.average(scores[rows], weights=weights))
     if scene.confidence is not None:
         facts["confidence"] = float(np.average(as_numpy(scene.confidence)[rows], weights=weights))
-    boxes = _boxes(scene.splats.positions(rows).astype(np.float64), weights)
+    inside = ~is_outlier(scene.splats, rows, weights)
+    boxes = _boxes(scene.splats.positions(rows[inside]).astype(np.float64), weights[inside])
     return facts | boxes | {"size": [scene.world.length(2 * half) for half in boxes["oriented_box"]["half_sizes"]]}
 
 

@@ -124,20 +124,24 @@ def _set_numbers(scene: OpenedLift, sets: Sequence[SplatSet]) -> np.ndarray:
 
 
 def object_box(splats: "Splats", rows: np.ndarray, weights: np.ndarray) -> Box:
-    """Compute the box of one object without outliers: `trimmed_box` of its large groups of touching splats.
+    """Compute the box of one object: `trimmed_box` of its splats without `is_outlier`."""
+    inside = ~is_outlier(splats, rows, weights)
+    return trimmed_box(splats.positions(rows[inside]), weights[inside])
+
+
+def is_outlier(splats: "Splats", rows: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the splats of an object that are apart from its large groups of touching splats, [n] bool.
 
     A group is large with a quarter of the weight of the largest one, such as each of two objects that were merged.
 
     Args:
-        splats: the scene. rows: [n] i64, at least one; above MOST_SPLATS of all of them. weights: [n].
+        splats: the scene. rows: [n] i64, at least one; above MOST_SPLATS none is apart. weights: [n].
     """
-    means = splats.positions(rows)
     if len(rows) > MOST_SPLATS:
-        return trimmed_box(means, weights)
+        return np.zeros(len(rows), np.bool_)
     groups = touching(splats, rows)
     sums = np.bincount(groups, weights)
-    inside = (sums >= LEAST_OF_FRAGMENT * sums.max())[groups]
-    return trimmed_box(means[inside], weights[inside])
+    return (sums < LEAST_OF_FRAGMENT * sums.max())[groups]
 
 
 def trimmed_box(means: np.ndarray, weights: np.ndarray) -> Box:
