@@ -39,19 +39,6 @@ def test_a_part_that_is_nearly_all_of_its_whole_is_not_offered_beside_it(scene: 
     assert candidates_of(subject, f"splat:{int(rows[0])}") == [(4, "part"), (0, "object")]
 
 
-def test_a_pixel_means_what_weighs_most_on_its_ray_and_its_set_is_asked_alone(nested: Scene) -> None:
-    view = nested.metadata.views[0]
-    camera = nested.cameras[view]
-    place = nested.splats.means.numpy()[nested.members(1)].mean(axis=0)
-    x, y, z = camera.K @ (camera.viewmat[:3, :3] @ place + camera.viewmat[:3, 3])
-    answer = nested.ask(Query(like=[f"{view}:{int(x / z)},{int(y / z)}"]))
-    (candidate,) = answer.candidates
-    assert (candidate.id, candidate.set) == (1, "object:1") and candidate.share > 0.5
-    assert candidate.splats == int(nested.members(1).sum())
-    by_set = nested.ask(Query(sets=[candidate.set]))
-    np.testing.assert_array_equal(by_set.selected, nested.members(1))
-
-
 def test_a_part_that_no_word_stands_for_may_be_any_part_of_its_thing(nested: Scene) -> None:
     row = np.flatnonzero(nested.members(3))[0]
     words = np.stack([nested.features[row], -nested.features[row]]).astype(np.float32)

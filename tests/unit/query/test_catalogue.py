@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.errors import InvalidLift, InvalidQuery, NotFound
+from liftcore.errors import InvalidLift, NotFound
 from liftcore.query.catalogue import catalogue, table_csv
 from liftcore.query.result import LiftResult, load_lift
 from liftcore.query.scene import Scene
@@ -97,19 +97,17 @@ def test_rows_of_a_lift_keep_their_part_of_the_tree(scene: Scene) -> None:
         {"node_parents": torch.tensor([-1, -1, -1, 0, 9]).int()},
         {"node_confidence": torch.ones(4)},
         {"node_views": None},
+        {"cluster": torch.full((60,), 3).int(), "cluster_features": torch.zeros(3, CHANNELS).half()},
+        {"cluster": torch.zeros(59).int(), "cluster_features": torch.zeros(3, CHANNELS).half()},
     ],
-    ids=["a circle", "no such node", "too few", "one of them"],
+    ids=["a circle", "no such node", "too few", "one of them", "no such cluster", "too few rows"],
 )
-def test_a_tree_that_is_none_is_refused(scene: Scene, tmp_path: Path, change: dict[str, torch.Tensor]) -> None:
+def test_a_tree_or_clusters_that_are_none_are_refused(
+    scene: Scene, tmp_path: Path, change: dict[str, torch.Tensor]
+) -> None:
     save_lift(replace(with_parts(scene), **change), tmp_path / "wrong.lift")
-    with pytest.raises(InvalidLift, match="tree"):
+    with pytest.raises(InvalidLift, match=r"tree|cluster"):
         load_lift(tmp_path / "wrong.lift")
-
-
-@pytest.mark.parametrize("vectors", [None, EYE[:2], np.zeros((3, CHANNELS)), np.ones((3, CHANNELS + 1))])
-def test_words_without_directions_are_refused(scene: Scene, vectors: np.ndarray | None) -> None:
-    with pytest.raises(InvalidQuery, match="words: expected"):
-        catalogue(scene, WORDS, vectors)
 
 
 def test_objects_without_splats_are_left_out(scene: Scene, tmp_path: Path) -> None:

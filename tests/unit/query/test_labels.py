@@ -101,21 +101,6 @@ def test_files_of_a_tree_come_back_with_paths_and_the_smallest_nodes(
         assert list(tree_node["path"]) == [tree_node["instance_id"]]
 
 
-def test_masks_of_a_tree_have_its_parts(tree_scene: Scene, tmp_path: Path) -> None:
-    tree = tree_scene.tree()
-    tree_scene.export(tmp_path / "m.json", tree)
-    document = json.loads((tmp_path / "m.json").read_text(encoding="utf-8"))
-    assert document["categories"] == [{"id": 0, "name": "object"}]
-    views = {record["image_id"] for record in document["annotations"]}
-    assert len(views) == len(tree_scene.metadata.views)
-    for view in views:
-        areas = {
-            tuple(record["path"]): record["area"] for record in document["annotations"] if record["image_id"] == view
-        }
-        assert set(areas) == {(1,), (2,), (3,), (1, 4), (1, 5)}
-        assert areas[1, 4] + areas[1, 5] == pytest.approx(areas[1,], abs=0.1 * areas[1,])
-
-
 def test_rows_of_labels_keep_the_nodes_that_hold_theirs(tree_scene: Scene) -> None:
     labels = tree_scene.labels(tree_scene.tree())
     subset = labels.subset(labels.columns["node_id"] == 4)
@@ -126,13 +111,3 @@ def test_run_lengths_are_columns_and_begin_with_zeros() -> None:
     assert run_lengths(np.array([[1, 0], [1, 0], [0, 1]])) == {1: [0, 2, 3, 1]}
     assert run_lengths(np.array([[0, 7], [2, 7]])) == {2: [1, 1, 2], 7: [2, 2]}
     assert run_lengths(np.zeros((2, 2))) == {}
-
-
-def test_answers_that_were_added_are_labelled_too(scene: Scene) -> None:
-    answers = {
-        name: scene.ask(Query.of((Region("left", 0, row),), threshold=0.5)) for row, name in ((1, "a"), (2, "b"))
-    }
-    subset = dict(list(answers.items())[:1])
-    assert [entry["name"] for entry in scene.labels(subset).document["classes"]] == ["a"]
-    subset["b"] = answers["b"]
-    assert [entry["name"] for entry in scene.labels(subset).document["classes"]] == ["a", "b"]

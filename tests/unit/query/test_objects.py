@@ -156,13 +156,6 @@ def test_tails_of_a_thousandth_are_not_in_the_box() -> None:
     assert module.trimmed_box(means[:1], np.ones(1))[0] == (0, 0, 0)
 
 
-def test_more_splats_than_are_grouped_are_refused(scene: Scene, monkeypatch) -> None:
-    monkeypatch.setattr(module, "MOST_SPLATS", SPLATS_A_CLUSTER)
-    assert objects(scene, of(scene, 0)).objects
-    with pytest.raises(InvalidQuery, match=r"threshold: expected at most 20 splats.*got 21; name a higher"):
-        objects(scene, of(scene, 0, rows=(2 * SPLATS_A_CLUSTER,)))
-
-
 def test_a_twentieth_of_the_weight_of_the_largest_makes_an_object(scene: Scene) -> None:
     rows = len(scene.features)
     for share, count in ((0.049, 1), (0.051, 2), (1.0, 2)):

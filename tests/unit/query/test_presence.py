@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -51,22 +50,6 @@ def clip(scene: Scene, table: TableEncoder) -> Scene:
     values = {"total_weight": ones, "has_feature": ones > 0}
     lifted = replace(scene.lift, features=torch.from_numpy(rows.astype(np.float32)), **values)
     return Scene(lifted, scene.splats, scene.cameras)
-
-
-def test_comparison_has_the_numbers_of_the_reason(clip: Scene, table: TableEncoder) -> None:
-    other_words = [word for word in table.words if word not in PRESENT_WORDS]
-    for word in [*PRESENT_WORDS, *np.random.default_rng(1).choice(other_words, 60, replace=False).tolist()]:
-        answer = ask(clip, word, table)
-        comparison = answer.comparison
-        assert (comparison is None) == (answer.present is True)
-        if comparison is None:
-            continue
-        numbers = f"{comparison.nearer} of {comparison.count} other words, first of all to {comparison.nearest!r}"
-        assert (comparison.nearer > comparison.limit) == (numbers in answer.reason)
-        assert answer.present is None or comparison.nearer > comparison.limit
-    several = ask(clip, Query.of(("sofa", "armchair")), table)
-    assert several.present is False and several.comparison is None
-    assert ask(clip, Query.of((SplatTerm(0), "sofa")), table).comparison is None  # the example may be there
 
 
 def test_absent_object_is_not_rendered_unless_kept(clip: Scene, table: TableEncoder) -> None:
@@ -169,33 +152,6 @@ def test_vectors_of_words_are_present_or_absent_too(clip: Scene, table: TableEnc
     for wrong in (table.embeddings[:9], table.embeddings[:, :9], np.zeros((300, 512))):
         with pytest.raises(InvalidQuery, match="references"):
             LiftResult.of(clip.lift).query(sofa, references=wrong)
-
-
-def test_texts_are_asked_as_their_vectors_are(
-    clip: Scene, table: TableEncoder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lift = LiftResult.of(clip.lift)
-    cat = lift.query(table.encode(["cat"]), table.encode(["pizza"]))
-    spaces: list[str] = []
-
-    def encoder_of_space(space: str, hint: str, *, stand_in: bool) -> TableEncoder:
-        spaces.append(space)
-        return table
-
-    monkeypatch.setattr("liftcore.text.encoder_of_space", encoder_of_space)
-    for encoder in (table, "lvis", LVIS_TABLE, None):
-        answer = lift.query("cat", ["pizza"], encoder=encoder)
-        assert np.array_equal(answer.scores, cat.scores) and np.array_equal(answer.selected, cat.selected)
-        assert (answer.present, answer.presence) == (cat.present, cat.presence)
-        assert answer.reason.startswith("'cat' is there")
-    assert spaces == [lift.metadata.text_space]
-    wrong: Any
-    for wrong in (7, "no such encoder", TableEncoder):
-        with pytest.raises(InvalidQuery, match="encoder: expected"):
-            lift.query("cat", encoder=wrong)
-    for wrong in (["cat", 3], np.array(["cat", "dog"]), {"cat"}, None):
-        with pytest.raises(InvalidQuery, match=r"query: expected a text|vector"):
-            lift.query(wrong)
 
 
 def test_many_words_follow_the_same_rule(clip: Scene, table: TableEncoder) -> None:

@@ -10,19 +10,14 @@ import pytest
 import torch
 from PIL import Image
 
-from liftcore.errors import InvalidQuery, NotFound
-from liftcore.query import objects as grouping
+from liftcore.errors import InvalidQuery
 from liftcore.query import opened as scenes
-from liftcore.query import render as module
 from liftcore.query.ask import ask
 from liftcore.query.colours import NO_CLUSTER_COLOUR, cluster_colours
 from liftcore.query.objects import objects
 from liftcore.query.question import Answer, Query
 from liftcore.query.render import (
-    attention_png,
     expected_depth,
-    mask_png,
-    overlay,
     render,
     render_png,
     shown_depth,
@@ -76,15 +71,6 @@ def mostly(scene: Scene, members: np.ndarray) -> np.ndarray:
     return ((row_sums >= 0.5) & (weights >= 0.5 * row_sums)).numpy()
 
 
-def test_attention_is_the_scores_rendered_with_the_lifts_gain(scene: Scene) -> None:
-    answer, camera = of(scene, 0), scene.cameras["middle"]
-    in_view = view_mask(scene, answer, "middle")
-    scores = torch.from_numpy(np.where(answer.has_feature, answer.scores, np.float32(0)))[:, None]
-    assert np.array_equal(in_view.attention, scene.raster.render(camera, scores, scene.compositing)[:, :, 0])
-    np.testing.assert_allclose(in_view.row_sums, scene.raster.row_sums(camera, scene.compositing), rtol=1e-6)
-    assert scene.compositing.opacity_logit_scale == scene.metadata.settings.gain == 1.2
-
-
 def test_a_mask_is_where_objects_have_most_of_a_ray(scene: Scene) -> None:
     answer = of(scene, 0, 2)
     in_view = view_mask(scene, answer, "middle")
@@ -112,38 +98,6 @@ def test_unassigned_splats_are_not_in_a_mask(scene: Scene) -> None:
     assert "1 object that was found" in in_view.explanation
 
 
-def test_of_very_many_splats_unassigned_ones_stay(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    answer = of(scene, 0, rows=(OUTLIER,))
-    monkeypatch.setattr(module, "MOST_GROUPED", answer.count)
-    assert "1 object" in view_mask(scene, answer, "middle").explanation
-    monkeypatch.setattr(module, "MOST_GROUPED", answer.count - 1)
-    in_view = view_mask(scene, answer, "middle")
-    assert np.array_equal(in_view.mask, mostly(scene, answer.selected))
-    assert f"all {answer.count} selected splats" in in_view.explanation
-    largest = answer_with(answer, keep="largest")
-    assert "1 object" in view_mask(scene, largest, "middle").explanation
-    monkeypatch.setattr(grouping, "MOST_SPLATS", answer.count - 1)
-    assert view_mask(scene, answer, "middle").mask.any()
-    with pytest.raises(InvalidQuery, match="at most"):
-        view_mask(scene, largest, "middle")
-
-
-def test_cached_objects_are_not_grouped_again_and_none_for_no_view(scene: Scene) -> None:
-    answer, calls = of(scene, 0, 1), []
-    cached_objects = objects(scene, of(scene, 1))
-
-    def group(*args: object) -> grouping.Objects:
-        calls.append(args)
-        return cached_objects
-
-    with pytest.raises(NotFound, match="middle"):
-        view_mask(scene, answer, "midle", group=group)
-    assert calls == []
-    in_view = view_mask(scene, answer, "middle", group=group)
-    assert np.array_equal(in_view.mask, mostly(scene, of(scene, 1).selected))
-    assert calls == [(scene, answer)]
-
-
 def test_clusters_have_their_colours_and_the_rest_is_grey(scene: Scene) -> None:
     with pytest.raises(InvalidQuery, match="aggregation"):
         render_png(scene, "middle", "cluster")
@@ -157,19 +111,6 @@ def test_clusters_have_their_colours_and_the_rest_is_grey(scene: Scene) -> None:
     for label, colour in zip((0, 1, -1), cluster_colours(2), strict=True):
         assert (image[hit & (labels == label)] == colour).all()
     assert not image[~hit].any()
-
-
-def test_pictures_have_the_size_and_the_mode_they_promise(scene: Scene) -> None:
-    in_view = view_mask(scene, of(scene, 0), "middle")
-    assert overlay(render(scene, "middle"), in_view.mask).shape == (HEIGHT, WIDTH, 3)
-    by_mode = {"L": [mask_png(in_view.mask)], "RGB": [attention_png(in_view), render_png(scene, "middle"),
-                                          render_png(scene, "middle", "pca")]}  # fmt: skip
-    for mode, pictures in by_mode.items():
-        for content in pictures:
-            with Image.open(io.BytesIO(content)) as picture:
-                assert (picture.size, picture.mode) == ((WIDTH, HEIGHT), mode)
-    with Image.open(io.BytesIO(mask_png(in_view.mask))) as picture:
-        assert np.array_equal(np.asarray(picture) > 0, in_view.mask)
 
 
 def test_pictures_have_a_limit(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -305,19 +246,6 @@ def test_a_depth_picture_has_its_range_and_can_be_decoded(two: Scene) -> None:
     assert (near, far) == shown_depth(two, "front").span
     decoded = far + (levels[hit] - 1.0) / 254 * (near - far)
     np.testing.assert_allclose(decoded, depths[hit].clip(near, far), atol=0.51 * (far - near) / 254)
-
-
-def test_a_flat_scene_is_bright_and_an_empty_view_says_nothing(two: Scene) -> None:
-    splats, camera = two.splats, two.cameras["front"]
-    near_splat = Splats(splats.means[:1], splats.quats[:1], splats.log_scales[:1], splats.opacity_logits[:1])
-    flat = shown_depth(scene_of(two, near_splat, camera), "front")
-    assert set(np.unique(flat.levels)) == {0, 255}
-    behind = np.eye(4)
-    behind[2, 3] = -100.0
-    away = scene_of(two, near_splat, Camera.pinhole("front", 48, 24, 24.0, 24.0, 24.0, 12.0, behind))
-    assert shown_depth(away, "front").span is None
-    with Image.open(io.BytesIO(render_png(away, "front", "depth"))) as picture:
-        assert not np.asarray(picture).any() and "depth-near" not in picture.info
 
 
 BARREL = Brown(k1=-0.25, k2=0.04, p1=0.002, p2=-0.001)

@@ -19,16 +19,6 @@ if TYPE_CHECKING:
 AXES = TableEncoder("axes", ("x", "y", "z"), np.eye(3, CHANNELS, dtype=np.float32))
 
 
-def test_file_and_values_give_the_same_answer(tiny_lift: Path, scene: Scene) -> None:
-    result = lc.load_lift(tiny_lift)
-    expected = scene.ask("x", encoder=AXES)
-    for variant in (lc.Scene(result), lc.Scene(str(tiny_lift), scene.splat_file), lc.Scene(result, scene.splats)):
-        answer = variant.ask(lc.Query(text=["x"]), encoder=AXES)
-        assert answer == expected and np.array_equal(answer.selected, expected.selected)
-        assert answer.box is not None and len(answer.top) == 10
-    assert scene.ask("x", encoder=AXES, places=False).top == ()
-
-
 def test_result_keeps_its_scene_while_its_splats_are_the_same(tiny_lift: Path, scene: Scene) -> None:
     result = lc.load_lift(tiny_lift)
     first_scene = result.scene(scene.splats)
@@ -48,13 +38,3 @@ def test_files_are_those_of_the_answer_and_no_others(scene: Scene, tmp_path: Pat
         with pytest.raises(lc.InvalidQuery, match=message):
             scene.export(tmp_path / "none.png", answer, content)
     assert not (tmp_path / "none.png").exists()
-
-
-def test_view_of_a_question_is_a_name_or_a_camera(scene: Scene) -> None:
-    by_name = scene.view_mask(lc.Query(text=["x"], view="middle"), encoder=AXES)
-    camera = scene.cameras["middle"]
-    for query, view in ((lc.Query.of("x", camera=camera), None), ("x", camera), ("x", "middle")):
-        assert np.array_equal(scene.mask(query, view, encoder=AXES), by_name.mask)
-    assert np.array_equal(scene.attention("x", "middle", encoder=AXES), by_name.attention)
-    assert scene.render("middle").shape == (*by_name.mask.shape, 3)
-    assert (scene.render("middle", "depth") > 0).any()

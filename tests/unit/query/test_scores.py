@@ -12,25 +12,6 @@ from liftcore.errors import InvalidQuery
 from liftcore.query.scores import combine, cosines, cosines_about, mean_direction, norms_of, relevancy
 
 
-@given(
-    count=st.integers(1, 900),
-    channels=st.sampled_from([1, 64, 512]),
-    dtype=st.sampled_from([torch.float16, torch.float32]),
-    seed=st.integers(0, 99),
-)
-@settings(max_examples=25, deadline=None)
-def test_cosine_equals_its_definition(count: int, channels: int, dtype: torch.dtype, seed: int) -> None:
-    generator = torch.Generator().manual_seed(seed)
-    features = torch.randn(count, channels, generator=generator).to(dtype)
-    text = torch.randn(channels, generator=generator)
-    wide = features.double()
-    expected = (wide @ text.double()) / (wide.norm(dim=1) * text.double().norm()).clamp_min(1e-300)
-    actual = torch.from_numpy(cosines(features.numpy(), norms_of(features.numpy()), text[None].numpy())[:, 0])
-    torch.testing.assert_close(
-        actual.double()[wide.norm(dim=1) > 0], expected[wide.norm(dim=1) > 0], atol=1e-5, rtol=0
-    )
-
-
 def test_texts_in_one_pass_equal_one_by_one_and_no_feature_scores_the_minimum() -> None:
     features = torch.randn(3000, 96).half().numpy()
     features[7] = 0
@@ -48,15 +29,6 @@ def test_relevancy_is_the_least_softmax_over_negatives() -> None:
     similarities = torch.rand(100, 5, dtype=torch.float64) - 0.5
     pairs = [torch.softmax(10 * similarities[:, [0, n]], dim=1)[:, 0] for n in range(1, 5)]
     np.testing.assert_allclose(relevancy(similarities.numpy(), 1), torch.stack(pairs).amin(dim=0).numpy(), rtol=1e-6)
-
-
-def test_negatives_take_away_from_what_is_found_and_add_nothing() -> None:
-    apple, table, wall = [0.9, 0.1], [0.1, 0.9], [0.0, -0.6]  # cosines to an apple and to a table
-    scores = combine(np.array([apple, table, wall]), 1)
-    assert scores[0] > 0.89 and scores[1] < 0.01 and scores[2] == 0.0
-    assert relevancy(np.array([wall]), 1) > 0.99  # which alone would find the wall
-    similarities = np.random.default_rng(0).random((100, 5), np.float32)
-    assert (combine(similarities, 2) <= combine(similarities[:, :2], 2)).all()
 
 
 @given(
@@ -80,14 +52,6 @@ def test_cosines_about_the_mean_equal_their_definition(seed: int, cone: float, d
     expected = torch.nn.functional.cosine_similarity((unit - mean)[:, None], (unit[:3] - mean)[None], dim=2)
     about = cosines_about(rows, norms, actual, examples.numpy())
     np.testing.assert_allclose(about[norms > 0], expected.numpy()[norms > 0], atol=3e-3)
-
-
-def test_a_scene_of_one_feature_is_all_alike() -> None:
-    features, ones = np.ones((5, 4), np.float32), np.ones(5, np.float32)
-    norms = norms_of(features)
-    mean = mean_direction(features, norms, ones)
-    assert cosines_about(features, norms, mean, features[:1] / 2).tolist() == [[0.0]] * 5
-    assert mean_direction(features, norms, 0 * ones).tolist() == [0.0] * 4
 
 
 def test_several_positives_are_as_good_as_the_nearest_one() -> None:

