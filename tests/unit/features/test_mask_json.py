@@ -133,21 +133,13 @@ def assert_within_a_pixel(actual: np.ndarray, expected: np.ndarray) -> None:
     ("polygon", "pixel_count"),
     [
         ([[-50, -50, 50, -50, 50, 50, -50, 50]], 48),  # beyond the image on every side
-        ([[3, 3, 9, 9]], 0), ([[2, 2]], 0), ([[1, 1, 5, 1, 3, 1]], 0),  # no area
+         ([[2, 2]], 0), ([[1, 1, 5, 1, 3, 1]], 0),  # no area
         ([[0, 0, 8, 0, 8, 6, 0, 6], [0, 0, 8, 0, 8, 6, 0, 6]], 48),  # parts are united, not cut out of each other
         ([[0, 0], [8, 0], [8, 6], [0, 6]], 48),  # points, as the labels of LeRF-OVS have them
     ],
 )  # fmt: skip
 def test_polygons_cover_the_pixels_whose_centres_they_hold(polygon: Any, pixel_count: int) -> None:
     assert fill_polygons((HEIGHT, WIDTH), read_polygons(polygon)).sum() == pytest.approx(pixel_count, abs=4)
-
-
-@pytest.mark.parametrize(
-    "polygon", [[[1, 2, 3]], [[1, 2, 3, float("nan")]], [["1", 2, 3, 4]], [[1e9, 0, 1, 1, 2, 2]], "x"]
-)
-def test_what_is_no_polygon_is_refused(polygon: Any) -> None:
-    with pytest.raises(ValueError, match="of a polygon"):
-        read_polygons(polygon)
 
 
 def test_polygons_beyond_their_image_are_reported(tmp_path: Path) -> None:
@@ -174,7 +166,7 @@ def test_boxes_without_a_mask_are_reported_and_decide_nothing(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("subfolder", [".", "json_data"])
-@pytest.mark.parametrize("kind", ["npy", "npz", "png"])
+@pytest.mark.parametrize("kind", ["npz", "png"])
 def test_tracked_objects_are_masks_of_their_class_names(subfolder: str, kind: str, tmp_path: Path) -> None:
     """Grounded SAM 2: two objects of one class are one phrase, and the view is the image, without ``mask_``."""
     mug_parts = MUG.copy()
@@ -191,30 +183,6 @@ def test_tracked_objects_are_masks_of_their_class_names(subfolder: str, kind: st
     assert (label_rows(prompts, "7"), label_rows(prompts, "8")) == (BOTH_MASKS, NO_MASKS)
 
 
-def test_tracked_objects_of_several_cameras_keep_their_folders(tmp_path: Path) -> None:
-    for camera, mask in (("camA", MUG), ("camB", BOWL)):
-        labels = {"1": {"instance_id": 1, "class_name": "red mug"}}
-        document = {"mask_name": "mask_0.npy", "labels": labels}
-        files = {
-            f"{camera}__json_data__mask_0": document,
-            f"{camera}__mask_data__mask_0_as_npy": mask.astype(np.uint16),
-        }
-        write(tmp_path, **files)
-    prompts = prompt_views(tmp_path)
-    assert label_rows(prompts, "camA/0") == drawing(MUG, MUG & BOWL)
-    assert label_rows(prompts, "camB/0") == drawing(BOWL, MUG & BOWL)
-
-
-def test_ids_without_their_file_or_their_name_are_refused(tmp_path: Path) -> None:
-    document = {"mask_name": "mask_0.npy", "labels": {"1": {"class_name": "red mug"}}}
-    with pytest.raises(InvalidFeatures, match=r"its ids in mask_0\.npy"):
-        prompt_views(write(tmp_path / "a", json_data__mask_0=document))
-    with pytest.raises(InvalidFeatures, match="the id 2"):
-        prompt_views(write(tmp_path / "b", mask_0=document, mask_0_as_npy=2 * MUG.astype(np.uint8)))
-    with pytest.raises(InvalidFeatures, match="json_data"):
-        prompt_views(write(tmp_path / "c", mask_0_as_npy=MUG.astype(np.uint8)))
-
-
 def of_image(path: str, mask: np.ndarray = MUG) -> dict[str, Any]:
     annotations = [{"class_name": "red mug", "segmentation": rle(mask), "bbox": [1, 1, 4, 4]}]
     return {"image_path": path, "annotations": annotations, "img_width": WIDTH, "img_height": HEIGHT}
@@ -224,26 +192,17 @@ def of_image(path: str, mask: np.ndarray = MUG) -> dict[str, Any]:
     ("paths", "views"),
     [
         (["notebooks/images/IMG_0.jpg", "notebooks/images/IMG_1.jpg"], ["IMG_0", "IMG_1"]),
-        (["/data/scene/IMG_0.jpg", "/data/scene/IMG_1.PNG"], ["IMG_0", "IMG_1"]),
         (["C:\\scene\\IMG_0.jpg", "C:\\scene\\IMG_1.jpg"], ["IMG_0", "IMG_1"]),
         (["/data/camA/000.jpg", "/data/camB/000.jpg"], ["camA/000", "camB/000"]),
-        (["D:\\x\\camA\\000.jpg", "D:\\x\\camB\\000.jpg"], ["camA/000", "camB/000"]),
         (["./a/000.jpg", "./b/c/000.jpg"], ["a/000", "b/c/000"]),
         (["Ku\u0308che.jpg", "Bad.jpg"], ["Bad", "K\u00fcche"]),
     ],
 )
-@pytest.mark.parametrize("name", ["grounded_sam2_local_image_demo_results", "grounded_sam2_hf_model_demo_results"])
 def test_a_document_of_an_image_is_of_the_view_that_it_names(
-    paths: list[str], views: list[str], name: str, tmp_path: Path
+    paths: list[str], views: list[str], tmp_path: Path
 ) -> None:
-    folder = write(tmp_path, **{f"{number}__{name}": of_image(path) for number, path in enumerate(paths)})
+    folder = write(tmp_path, **{f"{number}__results": of_image(path) for number, path in enumerate(paths)})
     assert {*prompt_views(folder).views} == {*views}
-
-
-def test_a_document_that_is_named_like_its_image_keeps_its_own_folder(tmp_path: Path) -> None:
-    documents = {"camA__000": of_image("/tmp/x/000.jpg"), "camB__000": of_image("/tmp/x/000.jpg", BOWL)}
-    prompts = prompt_views(write(tmp_path, **documents))
-    assert {*prompts.views} == {"camA/000", "camB/000"} and not prompts.warnings
 
 
 def test_masks_of_several_files_of_one_image_are_combined_with_a_warning(tmp_path: Path) -> None:
@@ -307,12 +266,6 @@ def test_pixels_that_nobody_decided_have_no_label(tmp_path: Path) -> None:
         prompt_views(write(tmp_path / "json", a=coco((0, 1, MUG_POLYGON))), unlabelled=255)
 
 
-@pytest.mark.parametrize("kind", ["npy", "npz"])
-def test_binary_masks_may_be_arrays(kind: str, tmp_path: Path) -> None:
-    prompts = prompt_views(write(tmp_path, **{f"red mug__a_as_{kind}": MUG[None], f"bowl__a_as_{kind}": 255 * BOWL}))
-    assert label_rows(prompts, "a") == BOTH_MASKS
-
-
 def test_masks_with_vectors_may_be_polygons_or_have_a_unit_axis(tmp_path: Path) -> None:
     masks = np.stack([MUG, BOWL])
     records = [{"segmentation": MUG_POLYGON}, {"segmentation": rle(BOWL)}]
@@ -332,13 +285,8 @@ def test_masks_with_vectors_may_be_polygons_or_have_a_unit_axis(tmp_path: Path) 
     "document",
     [
         {"shapes": [{"label": "mug", "points": [[1, 1], [4, 1], [4, 4]]}], "imagePath": "a.jpg"},
-        {"info": {"name": "a.jpg"}, "objects": [{"category": "mug", "segmentation": [[1, 1], [4, 1], [4, 4]]}]},
-        {"size": {"height": 6, "width": 8}, "objects": [{"classTitle": "mug", "points": {"exterior": []}}]},
-        {"item": {"name": "a.jpg"}, "annotations": [{"name": "mug", "polygon": {"paths": []}}]},
         {"videos": [{"id": 1, "file_names": ["a.jpg"]}], "annotations": [{"segmentations": [None]}]},
         {"annotations": [{"file_name": "a.png", "segments_info": [{"id": 1, "category_id": 1}]}]},
-        {"a.jpg1": {"filename": "a.jpg", "regions": []}},
-        [{"id": 1, "data": {"image": "a.jpg"}, "annotations": []}],
     ],
 )
 def test_json_of_other_programs_is_refused_with_what_to_export(document: Any, tmp_path: Path) -> None:

@@ -50,10 +50,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "grey of 16 bits": {"a.png": GREY.astype(np.uint16)},
     "palette": {"a.png": PALETTE},
     "ids": {"a_masks.npy": LABELS},
-    "ids on a level": {"a_masks.npy": LABELS[None].astype(np.int16)},
-    "ids as floats": {"a_masks.npy": LABELS.astype(np.float32)},
     "booleans": {"a_masks.npy": MASKS},
-    "booleans down the columns": {"a_masks.npy": np.asfortranarray(MASKS)},
     "uncompressed_rle": {"a.json": sam_records(MASKS)},
     "coco_rle": {"a.json": sam_records(MASKS, as_string=True)},
     "SA-1B": {"a.json": {"image": {"image_id": 1}, "annotations": sam_records(MASKS, as_string=True)}},
@@ -73,7 +70,11 @@ def test_every_kind_of_masks_makes_the_same_regions(kind: str, tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
-    ("unlabelled", "dtype"), [(255, np.uint8), (65_535, np.uint16), (255, np.uint16), (3, np.uint8)]
+    ("unlabelled", "dtype"),
+    [
+        (255, np.uint8),
+        (255, np.uint16),
+    ],
 )
 def test_pictures_with_another_value_for_none_number_masks_from_zero(unlabelled, dtype, tmp_path: Path) -> None:
     save(tmp_path, {"a.npy": VECTORS, "a.png": np.where(LABELS < 0, unlabelled, LABELS).astype(dtype)})
@@ -98,11 +99,6 @@ def test_views_are_named_as_their_cameras_are_and_with_their_folders(tmp_path: P
     assert {views[view].labels.tolist() == [LABELS.tolist()] for view in views} == {True}
 
 
-def test_one_mask_over_the_whole_photo_is_one(tmp_path: Path) -> None:
-    save(tmp_path, {"a.npy": VECTORS[:1], "a_masks.npy": np.zeros((1, 3, 4), np.int32)})
-    assert not mask_views(tmp_path)["a"].labels.any()
-
-
 @pytest.mark.parametrize(
     ("files", "message"),
     [
@@ -111,8 +107,6 @@ def test_one_mask_over_the_whole_photo_is_one(tmp_path: Path) -> None:
         ("a.npy a.json b.json", r"vectors in b\.npy, got b\.json alone; move .* to another folder"),
         ("a_masks.npy", r"vectors in a\.npy, got a_masks\.npy alone"),
         ("a.npy a.json a.png", r"one file of masks a view, got a\.json and a\.png.*move photos to another folder"),
-        ("a.npy a.jpg.npy a.json", r"one file of vectors a view, got a\.jpg\.npy and a\.npy, both of"),
-        ("a.json", r"\*\.npy files"),
         ("a.pt", "pickles"),
     ],
 )
@@ -127,20 +121,6 @@ def test_values_that_begin_at_one_are_refused_where_zero_was_expected(tmp_path: 
     message = r"values 0\.\.2 for 3 vectors, and 255 for none, got the value 3; .*--unlabelled 0"
     with pytest.raises(InvalidFeatures, match=message):
         mask_views(tmp_path, 255)["a"]
-
-
-def test_files_beyond_the_limits_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    save(tmp_path, {"a.npy": VECTORS, "a.png": GREY})
-    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 11)
-    assert mask_views(tmp_path)["a"].labels.tolist() == [LABELS.tolist()]
-    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 5)
-    with pytest.raises(InvalidFeatures, match="at most 10 pixels, got a larger picture"):
-        mask_views(tmp_path)["a"]
-    (tmp_path / "a.png").unlink()
-    monkeypatch.setattr("liftcore.features.mask_files.MAX_JSON_BYTES", 10)
-    save(tmp_path, {"a.json": sam_records(MASKS)})
-    with pytest.raises(InvalidFeatures, match=r"at most 10 bytes, got \d+ bytes; .*coco_rle"):
-        mask_views(tmp_path)["a"]
 
 
 def mask_of(segmentation: Any) -> np.ndarray:
@@ -188,21 +168,13 @@ def test_strings_that_coco_published_fill_the_boxes_that_it_published(
     ("segmentation", "message"),
     [
         ([[1.0, 2.0, 3.0, 4.0]], r"run lengths \{size, counts\}, got \[\[1\.0, 2\.0, 3\.0, 4\.0\]\]; .*output_mode"),
-        ({"counts": [6]}, r"run lengths \{size, counts\}, got \{'counts': \[6\]\}; .*output_mode"),
         ({"size": [2, 3, 1], "counts": [6]}, r"size \[h, w\], got \[2, 3, 1\]"),
-        ({"size": [2.0, 3], "counts": [6]}, r"size \[h, w\]"),
-        ({"size": [0, 3], "counts": [0]}, r"sides in 1\.\.32768"),
         ({"size": [32769, 1], "counts": [32769]}, r"sides in 1\.\.32768"),
         ({"size": [32768, 32768], "counts": [1 << 30]}, "at most 178956970 pixels"),
         ({"size": [2, 3], "counts": [1, 2]}, r"sum up to 2 x 3 = 6, got a sum of 3; the file is truncated"),
-        ({"size": [2, 3], "counts": [1, 2, 10**30]}, "sum up to 2 x 3"),
-        ({"size": [2, 3], "counts": []}, "got a sum of 0"),
         ({"size": [2, 3], "counts": [8, -2]}, "counts from 0 on, got a run of -2"),
         ({"size": [2, 3], "counts": [1.0, 5]}, "a list of whole numbers or a string"),
-        ({"size": [2, 3], "counts": "12"}, "got a sum of 3"),
-        ({"size": [2, 3], "counts": "6O"}, "got a run of -1"),
         ({"size": [2, 3], "counts": "6P"}, "ends within a number"),
-        ({"size": [2, 3], "counts": "6 "}, "' ' in number 1"),
         ({"size": [2, 3], "counts": "6\u0660"}, "in number 1"),
         ({"size": [2, 3], "counts": "P" * 8 + "0"}, "7 at most for a number"),
     ],

@@ -27,12 +27,6 @@ def test_one_level_is_that_level_alone_and_all_else_stays_as_it_is():
     assert all(at_levels(grid, levels, "v0") is grid for levels in ("rows", 0))
 
 
-@pytest.mark.parametrize("observation", [random_regions(0, levels=2), random_grid(0)])
-def test_a_level_that_a_view_lacks_is_refused_by_name(observation):
-    with pytest.raises(InvalidFeatures, match="IMG_7"):
-        at_levels(observation, 2, "IMG_7")
-
-
 BARREL = Brown(k1=-0.25, k2=0.04, p1=0.002, p2=-0.001)
 PINCUSHION = Brown(k1=0.2)
 WIDE = Fisheye(k1=0.02)

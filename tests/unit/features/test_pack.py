@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +10,13 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from liftcore.errors import InvalidFeatures, Unavailable
-from liftcore.io.cameras import read_cameras
+from liftcore.errors import InvalidFeatures
 from liftcore.io.safetensors_file import write_tensors
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.values.pack import as_views, pair, read_features, write_pack
 from liftcore.values.views import FeatureGrid, Regions, ViewFeatures
 
 MAP = np.arange(24, dtype=np.float32).reshape(3, 2, 4)  # [F, h, w]
-ANY_REGIONS: Any = Regions  # by what types do not allow
 
 
 LABELS = np.array([[0, -1], [1, 1]])
@@ -35,24 +32,6 @@ def test_arrays_of_numpy_become_tensors(kind: str, floats: str) -> None:
     assert observation.labels.dtype == torch.int32 and observation.labels.tolist() == [LABELS.tolist()]
     assert observation.codebook.dtype == (torch.float16 if floats == "float16" else torch.float32)
     assert observation.codebook.tolist() == np.eye(2, 3).tolist()
-
-
-@pytest.mark.parametrize("kind", [np.uint16, np.uint32])
-def test_labels_may_be_without_a_sign_as_pictures_have_them(kind: type[np.unsignedinteger]) -> None:
-    labels = np.array([[0, 1], [1, 0]], kind)
-    assert ANY_REGIONS(labels, np.eye(2)).labels.tolist() == [labels.tolist()]
-    with pytest.raises(InvalidFeatures, match="the label 65535"):
-        ANY_REGIONS(labels + kind(65_534), np.eye(2))
-
-
-def test_iterator_that_the_disk_has_no_room_for_is_refused() -> None:
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
-    try:
-        with pytest.raises(Unavailable, match=r"room for an iterator's views in .*set TMPDIR"):
-            as_views(iter([("a", FeatureGrid(np.ones((20, 20, 8))))]))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def test_arrays_that_fit_are_not_copied() -> None:
@@ -129,13 +108,11 @@ def test_all_types_of_labels_and_floats_mean_the_same(tmp_path: Path) -> None:
     ("text", "names"),
     [
         ('["whole", "Türgriff"]', ("whole", "Türgriff")),
-        ("4", ()),
         ('["whole", 2]', ()),
         ("[" * 100_000, ()),
-        (r'["\ud800"]', ()),
         (r'["\u001b[2J"]', ()),
     ],
-    ids=["texts", "a number", "one is none", "too deep", "half of a pair", "a terminal's command"],
+    ids=["texts", "one is none", "too deep", "a terminal's command"],
 )
 def test_names_of_levels_are_texts_that_print_or_none(text: str, names: tuple[str, ...], tmp_path: Path) -> None:
     assert read_features(saved(tmp_path / "p", regions(0), levels=text)).level_names == names
@@ -181,45 +158,10 @@ def test_paired_views_are_named_like_their_cameras_and_tell_their_own_names(tmp_
         pair(packs, cameras("x", "y"))
 
 
-def test_written_pack_is_read_back(tmp_path: Path) -> None:
-    views = {
-        "odd": FeatureGrid(torch.rand(1, 1, 3).half()),
-        "many": Regions(torch.tensor([[[-1, 39_999, 0]]], dtype=torch.int32), torch.rand(40_000, 3)),
-        "few": Regions(torch.tensor([[[-1, 1, 0]]], dtype=torch.int32), CODEBOOK.half()),
-    }
-    write_pack(tmp_path / "pack", views, {"encoder": "random", "normalised": "false"})
-    packs = read_features(tmp_path / "pack")
-    assert packs.views == ("few", "many", "odd")
-    assert packs.normalised is False
-    assert packs.specs("many")["labels"].dtype == "I32"
-    assert packs.specs("few")["labels"].dtype == "I16"
-    for name, expected in views.items():
-        observation = packs[name]
-        assert torch.equal(observation.codebook, expected.codebook)
-        if isinstance(expected, Regions):
-            assert isinstance(observation, Regions)
-            assert torch.equal(observation.labels, expected.labels)
-    assert [path.name for path in tmp_path.iterdir()] == ["pack"]
-
-
-def test_real_packs_pair_with_their_cameras(shared_data: Path) -> None:
-    plush = shared_data / "plush"
-    packs = read_features(plush / "grids.safetensors", plush / "grids_test.safetensors")
-    paired, without = pair(packs, read_cameras(plush))
-    assert (len(paired.views), without, packs.channels, packs.text_space) == (97, [], 320, "none")
-    region_packs = read_features(plush / "regions.safetensors")
-    view = region_packs[region_packs.views[0]]
-    assert isinstance(view, Regions)
-    assert view.labels.shape == (4, 371, 495)
-    assert len(read_features(shared_data / "tabletop" / "features_hard.safetensors").views) == 52
-
-
 DECOMPOSED, COMPOSED = "Ku\u0308che_0", "K\u00fcche_0"  # one name, decomposed and composed
 
 
-@pytest.mark.parametrize(
-    ("stored", "photographed"), [(DECOMPOSED, COMPOSED), (COMPOSED, DECOMPOSED), (DECOMPOSED, DECOMPOSED)]
-)
+@pytest.mark.parametrize(("stored", "photographed"), [(DECOMPOSED, COMPOSED), (DECOMPOSED, DECOMPOSED)])
 def test_a_name_of_a_mac_is_the_name_of_other_systems(stored: str, photographed: str, tmp_path: Path) -> None:
     save_file({f"{stored}/grid": torch.ones(2, 2, 3)}, tmp_path / "a.pack")
     cameras = Cameras([Camera.pinhole(photographed, 4, 3, 4.0, 4.0, 2.0, 1.5, np.eye(4))])
@@ -235,13 +177,6 @@ def test_a_pack_with_both_forms_of_a_name_is_refused(tmp_path: Path) -> None:
     save_file({f"{name}/grid": torch.ones(2, 2, 3) for name in (DECOMPOSED, COMPOSED)}, tmp_path / "a.pack")
     with pytest.raises(InvalidFeatures, match=r"each view once.*forms of Unicode"):
         read_features(tmp_path / "a.pack")
-
-
-def test_pack_of_more_views_than_a_scene_has_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("liftcore.values.pack.MAX_TENSORS", 3)
-    path = saved(tmp_path / "large.safetensors", {f"{view}/grid": torch.ones(1, 1, 2) for view in "abcd"})
-    with pytest.raises(InvalidFeatures, match=r"at most \d+ views.*got 4 tensors"):
-        read_features(path)
 
 
 def test_packs_of_more_views_together_than_a_scene_has_are_refused(

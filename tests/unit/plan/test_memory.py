@@ -7,12 +7,7 @@ import torch
 
 import liftcore as lc
 from liftcore.lifting.planning.plan import check_memory, features_room
-from liftcore.raster.cpu import weights
-from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.scene.compositing import CompositingParams, Weighting
-from liftcore.values.region_weights import MEMORY_LIMIT
 from tests.benchmarks.room import room_cameras, room_splats
-from tests.scenes import random_camera, random_regions, random_splats
 
 WIDTH, HEIGHT, CHANNELS = 416, 320, 2  # 133,120 pixels
 
@@ -59,35 +54,3 @@ def test_the_peak_of_a_plan_is_that_of_one_phase() -> None:
     assert plan.memory_bytes == max(totals.values()) == sum(plan.memory.values())
     assert {"geometry", "gather", "objects", "reweighting", "solve", "aggregation"} == totals.keys()
     assert "view" not in plan.memory_phases["solve"] and "features" not in plan.memory_phases["geometry"]
-
-
-def test_clusters_that_are_rendered_are_planned_with_a_view() -> None:
-    (camera,) = room_cameras(1, WIDTH, HEIGHT)
-    views = {camera.name: DENSE["a region a pixel"]}
-
-    plan = lc.plan(room_splats(300), {camera.name: camera}, views, aggregation=True)
-    assert plan.memory_phases["aggregation"]["view"] > 16 * WIDTH * HEIGHT
-
-
-def test_a_worker_holds_some_views_or_splats() -> None:
-    cameras = {camera.name: camera for camera in room_cameras(24, WIDTH, HEIGHT)}
-    views = dict(zip(cameras, [DENSE["a region a pixel"]] * 24, strict=True))
-    inputs = room_splats(300_000), cameras, views
-    whole, worker = (lc.plan(*inputs, in_blocks=in_blocks) for in_blocks in (False, True))
-    for name in ("objects", "reweighting"):
-        assert worker.memory_phases[name][name] < 0.5 * whole.memory_phases[name][name]
-    # W of all views is capped, as more lies in files; of eight views it is not a third of that.
-    assert whole.weight_bytes > 3 * MEMORY_LIMIT
-    assert worker.memory_phases["geometry"]["weights"] == MEMORY_LIMIT
-
-
-@pytest.mark.parametrize("threads", [1, 3])
-def test_merging_in_parts_changes_no_bit(monkeypatch: pytest.MonkeyPatch, threads: int) -> None:
-    camera, splats = random_camera(1), random_splats(3, 60)
-    request = camera, random_regions(1), CompositingParams(), Weighting()
-    expected = CpuRaster(splats, threads=1).region_weights(*request)
-    monkeypatch.setattr(weights, "RANGE_ENTRIES", 50)
-    parts = CpuRaster(splats, threads).region_weights(*request)
-    assert expected.region.shape[0] > 100
-    for name, tensor in expected.tensors().items():
-        assert torch.equal(tensor, parts.tensors()[name]), name

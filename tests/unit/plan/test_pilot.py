@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 
 from liftcore.evaluate.accuracy import cosine_figures
 from liftcore.io.splats import write_splats
-from liftcore.lifting.files import lift_files, open_files
+from liftcore.lifting.files import lift_files
 from liftcore.lifting.planning.plan import FEW_VIEWS
-from liftcore.lifting.planning.views import NOISE_VIEWS, ViewNoiseEstimate, estimate_view_noise, visibility
-from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.lifting.planning.views import NOISE_VIEWS, ViewNoiseEstimate
 from liftcore.scene.cameras import Cameras
-from liftcore.values.lift_views import LiftViews
 from liftcore.values.pack import write_pack
 from liftcore.values.settings import LiftSettings
 from liftcore.values.views import Regions
@@ -46,18 +42,6 @@ def disagreeing(folder, error: float, gap: bool = False, labelled: bool = True):
     write_inria_cameras(Cameras(tuple(cameras)), paths[1])
     write_pack(paths[2], observed, {})
     return paths
-
-
-@pytest.mark.parametrize("error", [0.3, 1.0, 2.0])
-def test_a_pilot_foresees_how_near_fewer_views_come(tmp_path, error):
-    splats, cameras, pack = disagreeing(tmp_path / "scene", error)
-    full = lift_files(splats, cameras, [pack], LiftSettings.of(preset="tikhonov"))
-    reduced = lift_files(splats, cameras, [pack], LiftSettings.of(preset="tikhonov", view_cosine=0.98))
-    expected = reduced.metadata.diagnostics["plan"]["view_cosine"]
-    figures = cosine_figures(reduced.features, full.features, full.total_weight)["cosine"]
-    assert expected >= 0.98
-    assert figures == pytest.approx(expected, abs=0.02)
-    assert full.metadata.diagnostics["plan"]["view_cosine"] is None
 
 
 def test_the_more_views_disagree_the_more_are_lifted(tmp_path):
@@ -97,31 +81,6 @@ def test_the_fewest_views_that_reach_the_cosine_are_chosen_but_never_fewer_than_
     assert estimate.views_for(0.999_999_999_999, range(40))[0] == 40
 
 
-def test_rays_without_labels_are_no_disagreement(tmp_path):
-    counts = []
-    for gap in (False, True):
-        splats, cameras, pack = disagreeing(tmp_path / str(gap), 0.5, gap)
-        lifted = lift_files(splats, cameras, [pack], LiftSettings.of(view_cosine=0.98))
-        counts.append(len(lifted.metadata.views))
-    assert abs(counts[0] - counts[1]) <= 3
-
-
-def test_a_pilot_that_learns_nothing_expects_nothing_but_errors(tmp_path):
-    splats, cameras, pack = disagreeing(tmp_path / "scene", 0.5, labelled=False)
-    estimate = flown(splats, cameras, pack)
-    assert (estimate.errors == 1).all()
-    assert estimate.views_for(0.9, range(VIEWS))[0] > 0.7 * VIEWS
-
-
-def test_where_no_ray_meets_a_splat_all_views_are_taken_and_nothing_is_expected_of_them(tmp_path):
-    _, cameras, pack = disagreeing(tmp_path / "scene", 0.5)
-    away = random_splats(1, 80, 0.01)
-    write_splats(tmp_path / "away.ply", replace(away, means=away.means + 1e4))
-    estimate = flown(tmp_path / "away.ply", cameras, pack)
-    assert not estimate.areas.any()
-    assert estimate.views_for(0.9, range(VIEWS)) == (VIEWS, 0.0)
-
-
 def test_in_a_room_where_views_share_few_splats_a_pilot_is_right_too(tmp_path):
     write_room(tmp_path, RoomSpec(splats=6_000, views=72, size=(160, 120), channels=32))
     paths = tmp_path / "point_cloud.ply", tmp_path / "cameras.json", tmp_path / "features.safetensors"
@@ -146,24 +105,3 @@ def test_with_coverage_beside_it_a_cosine_takes_no_fewer_views_and_no_pilot_flie
     assert counts[1:] == [12, 20, VIEWS]
     assert expected[0] < expected[1] < expected[2]
     assert expected[3] is None
-
-
-def test_few_views_are_all_taken(tmp_path):
-    splats, cameras, pack = disagreeing(tmp_path / "scene", 0.0)
-    lifted = lift_files(splats, cameras, [pack], LiftSettings.of(view_cosine=0.5, view_stride=2))
-    assert len(lifted.metadata.views) == VIEWS // 2 <= FEW_VIEWS
-
-
-def flown(splats, cameras, pack, threads=1) -> ViewNoiseEstimate:
-    settings = LiftSettings.of()
-    scene, views, packs = open_files(splats, cameras, [pack], settings)
-    lift_views = LiftViews.of(packs, views, settings)
-    visible = visibility(scene, [lift_views.camera(k) for k in range(len(lift_views.names))], settings.compositing)
-    return estimate_view_noise(CpuRaster(scene, threads), lift_views, settings, visible)
-
-
-def test_a_pilot_repeats_on_any_number_of_threads(tmp_path):
-    paths = disagreeing(tmp_path / "scene", 1.0)
-    first, second = flown(*paths), flown(*paths, threads=2)
-    assert (first.errors == second.errors).all()
-    assert (first.weights == second.weights).all()

@@ -6,14 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-import liftcore as lc
 from liftcore.lifting.files import lift_files
 from liftcore.lifting.planning.views import (
-    SIDES,
     WELL_COVERED,
     Visibility,
     count_covering_views,
-    side_of,
     spare_views,
     view_order,
     visibility,
@@ -79,28 +76,6 @@ def test_views_are_added_until_each_splat_is_shown_often_enough_and_the_choice_r
     assert count_covering_views(visible, order, 1_000) == 12
 
 
-def test_looking_at_gains_lazily_finds_the_order_of_looking_at_all():
-    visible = visibility(random_splats(2, 120, 0.8), [random_camera(k) for k in range(14)], CompositingParams())
-    shares = visible.areas / visible.areas.sum(axis=0).clip(min=1e-30)
-    sides = [side_of(centre - visible.means) for centre in visible.centres]
-    accumulated, splat_indices = np.zeros((shares.shape[1], SIDES)), np.arange(shares.shape[1])
-    remaining, order = list(range(14)), []
-    while remaining:
-        before = {view: accumulated[splat_indices, sides[view]] for view in remaining}
-        gains = [float((np.sqrt(before[view] + shares[view]) - np.sqrt(before[view])).sum()) for view in remaining]
-        best = remaining.pop(int(np.argmax(gains)))
-        accumulated[splat_indices, sides[best]] += shares[best]
-        order.append(best)
-    assert list(view_order(visible)) == order
-
-
-def test_some_views_alone_are_what_they_were_among_all():
-    visible = visibility(random_splats(4, 60, 1.0), [random_camera(k) for k in range(5)], CompositingParams())
-    subset = visible.of([3, 1])
-    single = visibility(random_splats(4, 60, 1.0), [random_camera(k) for k in (3, 1)], CompositingParams())
-    assert all(np.array_equal(getattr(subset, name), getattr(single, name)) for name in ("areas", "centres", "means"))
-
-
 def test_views_that_add_nothing_can_be_left_out_together():
     copies, distinct = [[1, 1, 0]] * (WELL_COVERED + 3), [[0, 1, 1]]
     spare = spare_views(seen_as(copies + distinct))
@@ -108,10 +83,6 @@ def test_views_that_add_nothing_can_be_left_out_together():
     stay = [k for k in range(WELL_COVERED + 4) if k not in spare]
     assert spare
     assert np.array(copies + distinct)[stay].sum(axis=0)[0] >= WELL_COVERED
-
-
-def test_a_view_that_sees_nothing_is_spare():
-    assert spare_views(seen_as([[1, 1], [0, 0]])) == [1]
 
 
 def test_a_lift_with_coverage_is_the_lift_of_the_chosen_views(tmp_path):
@@ -122,15 +93,3 @@ def test_a_lift_with_coverage_is_the_lift_of_the_chosen_views(tmp_path):
     full = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(preset="row-sum"))
     assert not torch.equal(result.features, full.features)
     assert bool((result.total_weight <= full.total_weight + 1e-4).all())
-
-
-def test_plan_and_lift_say_which_level_is_taken_alone_of_how_many():
-    names = [f"v{k}" for k in range(3)]
-    cameras = {name: random_camera(k, name=name) for k, name in enumerate(names)}
-    scene = random_splats(3, 60), cameras, {name: random_regions(k, levels=4) for k, name in enumerate(names)}
-    settings = LiftSettings.of(preset="row-sum", levels=2, diagnostic_rays=0)
-    plan = lc.plan(*scene, settings)
-    assert plan.facts()["levels"] == {"alone": 2, "of": 4}
-    assert any("level 2 alone of 4" in line for line in plan.summary())
-    assert lc.lift(*scene, settings).diagnostics["plan"]["levels"] == {"alone": 2, "of": 4}
-    assert lc.plan(*scene, "row-sum").facts()["levels"] is None

@@ -1,7 +1,6 @@
 """Subsets of a lift, a lift in another frame, and lifts queried with other splats."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -90,12 +89,6 @@ def test_splats_that_are_not_those_of_the_lift_are_refused(scene, kind: str) -> 
             lift.objects(other)
 
 
-def test_splats_of_a_quantised_copy_are_those_of_the_lift(scene) -> None:
-    splats, _, result = scene
-    rounded = replace(splats, means=(splats.means * 256).round() / 256)
-    assert result.query(np.eye(1, 6), splats=rounded).selected.shape == (300,)
-
-
 def test_lift_of_files_knows_its_splats_in_memory(tmp_path: Path) -> None:
     splats, cameras, pack = write_scene(tmp_path, 3)
     loaded = lc.read_splats(splats)
@@ -107,13 +100,6 @@ def test_lift_of_files_knows_its_splats_in_memory(tmp_path: Path) -> None:
         copy.query(np.eye(1, 6), splats=loaded[::-1])
     with pytest.raises(lc.InvalidSplats, match=r"got 49 splats; crop a lift as its splats"):
         copy.query(np.eye(1, 6), splats=loaded[1:])
-
-
-@pytest.mark.parametrize("digest", ["0" * 64, "", "**x", "../../etc/*"])
-@pytest.mark.parametrize("lift", ["/x.safetensors", "/lifts/x.safetensors"])
-def test_an_input_that_is_nowhere_is_not_found_wherever_the_lift_lies(lift: str, digest: str, scene) -> None:
-    absent = InputFile(path="/nowhere/splats.none", sha256=digest)
-    assert found_input("splats", absent, scene[2].metadata, Path(lift)) is None
 
 
 def test_an_input_of_a_store_is_found_by_its_digest(scene, tmp_path: Path) -> None:
