@@ -95,28 +95,6 @@ def test_words_that_the_encoder_lacks_and_views_without_cameras_are_named(
     assert any("'frame_00009' have labels but no camera" in warning for warning in document["warnings"])
 
 
-@pytest.mark.parametrize(
-    ("files", "options", "message"),
-    [
-        ((LIFT, "nothing.safetensors"), [], "nothing.safetensors"),
-        ((LIFT, "words.safetensors"), [], "words.safetensors"),
-        (("words.safetensors", "labels.safetensors"), [], "lift"),
-        ((LIFT, "labels.safetensors"), ["--threshold", "soon"], "threshold"),
-        ((LIFT, "labels.safetensors"), ["--negative", "dragon"], "dragon"),
-        ((LIFT, "labels.safetensors"), ["--table", "other.table"], "channels"),
-    ],
-    ids=lambda value: " ".join(value) if not isinstance(value, str) else value,
-)
-def test_what_cannot_be_evaluated_exits_2_with_one_line(
-    files: tuple[str, str], options: list[str], message: str, folder: Path, capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    monkeypatch.chdir(folder)
-    status, out, err = run(capsys, "evaluate", *files, *options)
-    assert (status, out) == (2, "")
-    assert message in err and err.count("\n") == 1
-
-
 def test_labels_without_phrases_or_of_other_views_are_refused(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(lc.InvalidInput, match="views named like"):
         evaluate_lift(folder / LIFT, write_labels(tmp_path, {"other": 0}))

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import save_file
 
 from liftcore.evaluate.accuracy import centred_cosines, class_ious, cosine_figures, shared_pixels
 from liftcore.evaluate.ranking import accuracy_of, choose
@@ -147,21 +146,3 @@ def test_a_run_is_judged_by_views_that_it_did_not_lift(tmp_path):
     assert draft_run["cosine"] < 1
     full_run = measure_run(replace(order, lifted=("v0", "v1", "v2"), settings={}, exact=False))
     assert full_run["accuracies"]["centred_cosine"] > exact["accuracies"]["centred_cosine"]  # the view was lifted
-
-
-def test_masks_are_judged_by_the_words_of_their_classes(tmp_path):
-    vectors = torch.nn.functional.normalize(torch.randn(2, 6, generator=torch.Generator().manual_seed(0)), dim=1)
-    save_file({"embeddings": vectors}, tmp_path / "t", metadata={"words": '["cat", "dog"]'})
-    masks = {"v2/mask": torch.zeros(7, 9, dtype=torch.int16), "other": torch.zeros(1)}
-    save_file(masks, tmp_path / "m")
-    files = {"labels": tmp_path / "m", "table": tmp_path / "t"}
-    figures = []
-    for classes in (("cat", "dog"), ("dog", "cat")):
-        order = order_of(tmp_path, classes=classes, **files)
-        accuracies = measure_run(replace(order, labelled=("v2",)))["accuracies"]
-        figures.append(accuracy_of(accuracies)["mask_iou"])
-        assert [0 <= iou <= 1 for iou in accuracies["phrase_iou"]] == [
-            True
-        ]  # of the class that is shown, in its view
-    # A mask of zeros: the share of its pixels called "cat" over all, then "dog"; the other class has an IoU of zero.
-    assert figures[0] + figures[1] == pytest.approx(0.5, abs=0.01)

@@ -41,15 +41,6 @@ def test_features_equal_their_definition(channels):
     torch.testing.assert_close(halves.float(), solution, rtol=2**-10, atol=2**-24)
 
 
-def test_neither_threads_nor_order_nor_files_change_a_bit():
-    views, books = scene()
-    expected = solved(views, books, threads=1)
-    means = torch.rand(SPLATS, 3, generator=torch.manual_seed(0))
-    assert torch.equal(expected, solved(views, books, threads=5))
-    assert torch.equal(expected, solved(views, books, threads=2, means=means, memory=0))
-    assert torch.equal(expected, solved([view.in_files() for view in views], books, means=means))
-
-
 @pytest.mark.parametrize("size", [1e5, 1e-9, 3e38])
 def test_what_float16_cannot_hold_is_float32(size):
     views, books = scene(4)
@@ -61,16 +52,6 @@ def test_what_float16_cannot_hold_is_float32(size):
     torch.testing.assert_close(solution / size, expected, rtol=1e-5, atol=1e-6)
 
 
-def test_slices_of_channels_are_put_together(monkeypatch):
-    views, books = scene(37)
-    expected = solved(views, books)
-    monkeypatch.setattr("liftcore.solve.codebook.TABLE_BYTES", 1)
-    calls = []
-    cut = solved(views, books, progress=lambda *step: calls.append(step))
-    assert torch.equal(cut, expected)
-    assert calls[-1] == ("solve", 5, 5, "slices")
-
-
 def test_sums_of_a_million_entries_and_of_many_views_keep_their_digits():
     books = [torch.full((1_000_000, 1), 0.7)]
     long = [of_dense(np.full((1, 1_000_000), 0.3))]
@@ -79,14 +60,6 @@ def test_sums_of_a_million_entries_and_of_many_views_keep_their_digits():
         solution = solve(stacked(views_of_case, 1), codebook_of(codebooks), torch.float32)
         # One by one: the third digit.
         assert abs(float(solution[0, 0]) / float(torch.tensor(0.7)) - 1) < 5e-6
-
-
-def test_no_view_no_region_and_codebooks_of_zeros_are_zeros():
-    no_weights = of_dense(np.zeros((SPLATS, 2)))
-    solution = solved([no_weights, no_weights], [torch.ones(2, 3)] * 2, torch.float16)
-    assert not solution.any()
-    zeros = solved([random_view(0, 4, SPLATS)], [torch.zeros(4, 3)], torch.float16)
-    assert not zeros.any()
 
 
 def test_tiny_and_huge_weights_give_means():

@@ -58,22 +58,6 @@ def test_tuples_give_what_rows_give(seed, levels, power, size):
     np.testing.assert_allclose(tuples / size, rows / size, atol=1e-5)
 
 
-def test_tuples_have_fewer_entries_and_the_same_total_weight():
-    maps = [region_map(view, 4) for view in range(2)]
-    (by_row, _), (by_tuple, _) = stacked_weights(maps, True), stacked_weights(maps, False)
-    assert by_tuple.region.numel() < by_row.region.numel()
-    assert torch.equal(by_tuple.total_weight, by_row.total_weight)
-
-
-def test_means_of_float16_rows_are_rounded_as_the_features_are():
-    regions = region_map(3, 4, kind=torch.float16)
-    rows, _ = solved([regions], by_rows=True)
-    for dtype, error in ((torch.float32, 1e-6), (torch.float16, 2e-3)):
-        tuples, _ = solved([regions], by_rows=False, dtype=dtype)
-        assert tuples.dtype == dtype
-        np.testing.assert_allclose(tuples, rows, atol=error)
-
-
 def test_a_map_is_left_as_it_is_where_tuples_save_nothing():
     noise = Regions(
         torch.randint(0, 7, (2, 30, 30), generator=torch.manual_seed(0), dtype=torch.int32), torch.ones(7, 3)
@@ -87,7 +71,7 @@ def test_a_map_is_left_as_it_is_where_tuples_save_nothing():
     assert as_regions(region_map(0, 3), by_rows=True)[1].tuples is None
 
 
-@pytest.mark.parametrize("levels", range(2, 20))
+@pytest.mark.parametrize("levels", [2, 3, 7])
 def test_the_mean_of_the_largest_numbers_is_one_of_them(levels):
     largest = torch.finfo(torch.float32).max
     codebook = ViewCodebook(torch.full((3, 2), largest), torch.ones(1, levels, dtype=torch.int32))

@@ -8,13 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.solve import consensus
 from liftcore.solve.consensus import OBSERVES, PRIOR, mask_consensus
 from liftcore.solve.membership import BELONGS, FAINT
 from liftcore.solve.reweight import SHARPNESS, reweighting_factors
-from liftcore.values.levels import region_levels
 from liftcore.values.region_weights import RegionWeights, stacked
-from liftcore.values.views import Regions
 from tests.unit.solve.sparse_views import codebook_of, dense, of_dense
 
 SPLATS = 60
@@ -130,14 +127,6 @@ def test_a_whole_beside_its_parts_is_no_mistake() -> None:
     np.testing.assert_allclose(consensus_of(W, levels), 1.0, rtol=1e-6)
 
 
-def test_threads_and_blocks_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    W, levels = random_scene(7, views=9)
-    expected = mask_consensus(W, levels, 1)
-    assert mask_consensus(W, levels, 2).tobytes() == expected.tobytes()
-    monkeypatch.setattr(consensus, "BLOCK_ENTRIES", 256)  # the memory that it takes beside an entry's own numbers
-    assert mask_consensus(W, levels, 2).tobytes() == expected.tobytes()
-
-
 def test_more_tuples_than_the_first_table_holds_are_distinguished() -> None:
     rng = np.random.default_rng(1)
     views, splats = 14, np.arange(SPLATS)
@@ -148,17 +137,6 @@ def test_more_tuples_than_the_first_table_holds_are_distinguished() -> None:
         parts.append(of_dense(view))
     W, levels = stacked(parts, SPLATS), np.tile(np.repeat([0, 1], 30), views).astype(np.int8)
     np.testing.assert_allclose(entries(W, mask_consensus(W, levels)), defined(W, levels), rtol=2e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize("splats", [0, SPLATS])
-def test_a_scene_without_entries_has_none(splats: int) -> None:
-    W = stacked([of_dense(np.zeros((splats, 3)))] * 2, splats)
-    assert consensus_of(W, np.zeros(6, np.int8)).shape == (0,)
-
-
-def test_the_level_of_a_region_is_where_it_is_labelled() -> None:
-    labels = torch.tensor([[[0, 1], [-1, 1]], [[2, 3], [2, -1]]], dtype=torch.int32)
-    assert region_levels(Regions(labels, torch.ones(5, 2))).tolist() == [0, 0, 1, 1, -1]
 
 
 # Region reliability and confidence, which come in with a step of `reweight`.

@@ -9,15 +9,13 @@ import pytest
 import torch
 
 from liftcore.evaluate.inspect import inspect_file
-from liftcore.io.cameras import read_cameras
 from liftcore.lifting.files import lift_files, open_files
 from liftcore.lifting.pipeline import plan
 from liftcore.scene.cameras import Camera
 from liftcore.solve.diagnostics import shape_warnings
-from liftcore.values.pack import pair, read_features, write_pack
+from liftcore.values.pack import read_features, write_pack
 from liftcore.values.settings import LiftSettings
 from liftcore.values.views import FeatureGrid, ViewFeatures
-from tests.benchmarks.base import cameras_of
 from tests.scenes import write_scene
 
 
@@ -65,20 +63,6 @@ def test_the_lift_and_its_plan_warn_of_a_crop(tmp_path: Path) -> None:
     assert planned_for.startswith("2 of 3 views have maps of another aspect than their images (v1: 23x23 for 37x27)")
     warnings = lift_files(splats, cameras, [pack], settings).metadata.diagnostics["warnings"]
     assert warnings.count(planned_for) == 1
-
-
-@pytest.mark.parametrize(
-    ("scene", "packs"),
-    [
-        ("plush", ("grids", "grids_test", "regions")),
-        ("tabletop", ("grids", "features", "features_clean", "features_hard")),
-    ],
-)
-def test_real_maps_give_no_warning(scene: str, packs: tuple[str, ...], shared_data: Path) -> None:
-    cameras = read_cameras(cameras_of(shared_data / scene))
-    for name in packs:
-        paired = pair(read_features(shared_data / scene / f"{name}.safetensors"), cameras)[0]
-        assert shape_warnings(paired, [cameras[view] for view in paired.views]) == []
 
 
 def test_the_pack_warns_of_channels_that_come_first(tmp_path: Path) -> None:

@@ -97,15 +97,6 @@ def test_merged_and_split_masks_do_not_change_the_objects() -> None:
     assert len(objects.views) == 4 and set(objects.views[0][objects.views[0] >= 0]) <= set(range(6))
 
 
-def test_parts_are_held_together_by_masks_of_the_whole() -> None:
-    rows = np.zeros((SPLATS, 4))  # level 0: two things; level 1: the first one in two parts
-    rows[:30, 0], rows[30:, 1], rows[:15, 2], rows[15:30, 3] = 1, 1, 1, 1
-    W = stacked([of_dense(rows)] * 4, SPLATS)
-    labels = objects_of(W, np.tile(np.array([0, 0, 1, 1], np.int8), 4), np.ones(SPLATS)).labels
-    assert [len(np.unique(labels[part])) for part in (slice(0, 30), slice(30, 60))] == [1, 1]
-    assert labels[0] != labels[-1]
-
-
 @pytest.mark.parametrize("swapped", [False, True])
 def test_a_splat_between_two_objects_has_the_one_of_its_first_region(swapped: bool) -> None:
     rows = np.zeros((SPLATS, 2))

@@ -7,16 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from liftcore.lifting.files import lift_files
 from liftcore.solve.directions import RegionDirections
 from liftcore.solve.reweight import NO_CONSENSUS, reweighting_factors, scale_weights
 from liftcore.solve.shared_rows import LONG, MOST_COMPARED
 from liftcore.values.region_weights import RegionWeights, stacked
-from liftcore.values.settings import LiftSettings
-from tests.scenes import write_scene
 from tests.unit.solve.sparse_views import codebook_of, dense, of_dense
 
 
@@ -79,33 +74,6 @@ def defined(scene: Scene, e: list[np.ndarray] | None = None) -> list[np.ndarray]
     return [np.where(gain > 0, w * gain, old) for w, old in zip(new, first, strict=True)]
 
 
-@st.composite
-def scenes(draw: st.DrawFn) -> Scene:
-    """Random sparse weights and codebooks: unseen splats, splats of one view, empty views, zero vectors, float16."""
-    rng = np.random.default_rng(draw(st.integers(0, 2**20)))
-    count, channels = draw(st.integers(1, 30)), draw(st.sampled_from([2, 5, 33, 200]))
-    dtype = draw(st.sampled_from([torch.float16, torch.float32]))
-    size = draw(st.sampled_from([1e-9, 1.0, 1e6]))
-    scene = Scene([], [])
-    for _ in range(draw(st.integers(1, 5))):
-        rows = draw(st.integers(1, 6))
-        mask = rng.random((count, rows)) < draw(st.sampled_from([0.0, 0.3, 0.9]))
-        scene.weights.append((rng.random((count, rows)) * mask * size).astype(np.float32))
-        book = rng.normal(0.5, 1, (rows, channels)) * rng.uniform(0.1, 9, (rows, 1)) * (rng.random((rows, 1)) < 0.9)
-        scene.books.append(torch.tensor(book, dtype=dtype))
-    return scene
-
-
-@settings(max_examples=30, deadline=None)
-@given(scene=scenes())
-def test_the_step_equals_its_definition_and_keeps_every_splats_sum(scene):
-    got, expected, D = scene.after(), defined(scene), scene.denominators
-    for actual, real in zip(got, expected, strict=True):
-        assert np.abs(over(actual - real, D[:, None])).max() < 2e-3
-    sums = np.sum([view.sum(axis=1, dtype=np.float64) for view in got], axis=0)
-    assert np.allclose(sums, D, rtol=1e-5)
-
-
 def levels_apart(scene: Scene, levels: np.ndarray) -> list[np.ndarray]:
     """The definition for each level by itself: regions [M] of others weigh nothing, and directions stay."""
     e, ends = defined_directions(scene)[1], np.cumsum([len(book) for book in scene.books])[:-1]
@@ -134,24 +102,6 @@ def random_scene(seed: int, count: int = 9_000, views: int = 4, rows: int = 7, c
     return Scene([view.astype(np.float32) for view in mask], books)
 
 
-def test_neither_threads_nor_files_nor_order_change_a_bit_and_the_first_weights_stay(monkeypatch):
-    scene = random_scene(0)
-    expected, means = scene.after(threads=1), torch.rand(9_000, 3, generator=torch.manual_seed(0))
-
-    def assert_same(**options) -> None:
-        assert all(np.array_equal(a, b) for a, b in zip(expected, scene.after(**options), strict=True))
-
-    assert_same(threads=5)
-    assert_same(threads=2, means=means)
-    monkeypatch.setattr("liftcore.solve.reweight.MEMORY_LIMIT", 0)
-    monkeypatch.setattr("liftcore.values.region_weights.MEMORY_LIMIT", 0)
-    assert_same(threads=2)
-    W = scene.stacked()
-    before = W.weight.clone()
-    reweighting_factors(W, codebook_of(scene.books))
-    assert torch.equal(W.weight, before)
-
-
 @pytest.mark.parametrize("channels", [600, 1_200])
 def test_principal_directions_have_the_cosines_of_all_channels(channels: int) -> None:
     rng = np.random.default_rng(1)
@@ -164,7 +114,7 @@ def test_principal_directions_have_the_cosines_of_all_channels(channels: int) ->
     np.testing.assert_allclose((principal @ principal.T).numpy(), e @ e.T, atol=2e-6)
 
 
-@pytest.mark.parametrize("views", [2, 4, 7])
+@pytest.mark.parametrize("views", [2, 7])
 def test_a_step_that_changes_much_equals_its_definition_to_the_last_digits(views):
     scene = random_scene(views, count=20, views=views, channels=33)
     scene.books[0][0] = 0
@@ -175,15 +125,6 @@ def test_a_step_that_changes_much_equals_its_definition_to_the_last_digits(views
         np.testing.assert_allclose(over(actual, D), over(real, D), atol=1e-5)
         largest_change = max(largest_change, np.abs(over(real - first, D)).max())
     assert largest_change > 0.05
-
-
-def test_slices_of_channels_are_compared_as_one_vector(monkeypatch):
-    scene = random_scene(3, count=500)
-    matrix = scene.after()
-    for module in ("codebook", "directions"):
-        monkeypatch.setattr(f"liftcore.solve.{module}.TABLE_BYTES", 1)
-    for sliced, expected in zip(scene.after(), matrix, strict=True):
-        np.testing.assert_allclose(sliced, expected, rtol=1e-4, atol=1e-5)
 
 
 def test_splats_of_few_and_of_many_views_in_one_group_equal_the_definition():
@@ -252,29 +193,3 @@ def test_a_view_that_holds_most_of_the_weight_is_not_outvoted():
     for view in scene.weights[1:]:
         view[0] = view[0, ::-1].copy()
     assert shares(scene.after(), 0)[0] > shares(scene.weights, 0)[0] > 0.8
-
-
-@pytest.mark.parametrize("value", [0.0, 1.0])
-def test_nothing_changes_where_no_vector_has_a_direction(value):
-    scene = random_scene(2, count=50)
-    constant = Scene(scene.weights, [torch.full_like(book, value) for book in scene.books])
-    assert all(np.array_equal(a, b) for a, b in zip(constant.after(), scene.weights, strict=True))
-
-
-def test_cells_of_grids_have_no_reliability(tmp_path):
-    paths = write_scene(tmp_path, 9, grids=True)
-    default = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of())
-    assert default.confidence is not None
-    assert "reliability_median" not in default.diagnostics["reweighting"]
-    assert default.diagnostics["reweighting"]["masks"] == 0
-
-
-def test_a_robust_lift_keeps_what_is_seen_and_how_much(tmp_path):
-    paths = write_scene(tmp_path, 9)
-    baseline, robust = (
-        lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(robust=robust, dtype="float32"))
-        for robust in (False, True)
-    )
-    assert torch.equal(baseline.has_feature, robust.has_feature)
-    assert torch.equal(baseline.total_weight, robust.total_weight)
-    assert not torch.equal(baseline.features, robust.features)

@@ -14,14 +14,12 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 import liftcore as lc
-from liftcore.cli.reply import smoothing_line
 from liftcore.lifting.files import lift_files
 from liftcore.scene.neighbours import SplatGraph
 from liftcore.scene.splats import Splats
 from liftcore.solve.smooth import STEPS, smooth
 from liftcore.values.settings import LiftSettings
 from tests.scenes import random_splats, write_scene
-from tests.unit.command_line import run
 from tests.unit.scene.test_neighbours import dense
 
 SEEDS = st.integers(0, 2**16)
@@ -100,22 +98,6 @@ def test_splats_that_no_neighbour_reaches_stay_as_they_are() -> None:
     assert (smoothed[:40] >= 1).all()
 
 
-def test_features_that_are_one_stay_as_they_are() -> None:
-    scene = Scene(2, 200, unseen=0.0)
-    X = torch.ones(200, 3)
-    smoothed, facts = smooth(
-        X.clone(), SplatGraph.of(scene.splats), scene.total_weight, scene.confidence, scene.solved, 4.0
-    )
-    assert torch.equal(smoothed, X)
-    assert facts["moved"] == facts["steps"] == 0
-    unchanged, facts = smooth(
-        0 * X, SplatGraph.of(scene.splats), scene.total_weight, scene.confidence, ~scene.solved, 4.0
-    )
-    assert not unchanged.any()
-    assert facts["moved"] is None
-    assert "not at all" in smoothing_line(facts)
-
-
 @pytest.mark.parametrize("dtype", ["float16", "float32"])
 def test_setting_smooths_what_the_lift_solved(dtype: str, tmp_path: Path) -> None:
     files = write_scene(tmp_path, 3)
@@ -129,19 +111,3 @@ def test_setting_smooths_what_the_lift_solved(dtype: str, tmp_path: Path) -> Non
     for name in ("total_weight", "confidence", "has_feature"):
         assert torch.equal(getattr(result, name), getattr(baseline, name)), name
     assert result.diagnostics["smoothing"] == facts and facts["colours"]
-
-
-def test_lift_in_blocks_refuses_smoothness() -> None:
-    settings = LiftSettings.of(smoothness=2)
-    with pytest.raises(lc.InvalidSettings, match=r"engine: .*got smoothness=2.*; set smoothness=0"):
-        settings.check_blocks()
-
-
-@pytest.mark.parametrize("smoothness", ["0", "4"])
-def test_lift_of_few_views_recommends_smoothness(
-    smoothness: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    files, out = write_scene(tmp_path, 3), tmp_path / "scene.lift.safetensors"
-    status, text, _ = run(capsys, "lift", *files, "-o", out, "--set", f"smoothness={smoothness}")
-    assert status == 0
-    assert ("3 views of masks: --set smoothness=4 draws" in text) == (smoothness == "0")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.errors import InvalidInput, Unavailable
+from liftcore.errors import Unavailable
 from liftcore.values import region_weights as weights
 from liftcore.values.region_weights import RegionWeights, stacked
 from tests.unit.solve.sparse_views import dense, of_dense, random_view
@@ -41,33 +41,12 @@ def test_stacked_views_are_their_matrices_side_by_side():
     np.testing.assert_allclose(W.row_sums().numpy(), dense(W, SPLATS).sum(axis=1), rtol=1e-12)
 
 
-def test_neither_threads_nor_files_nor_groups_of_views_change_a_bit(monkeypatch):
-    view_list = views()
-    expected = stacked(view_list, SPLATS, threads=1)
-    assert_same(expected, stacked(view_list, SPLATS, threads=5))
-    assert_same(expected, stacked([stacked(view_list[:2], SPLATS), *view_list[2:]], SPLATS))
-    assert_same(expected, stacked([view.in_files() for view in view_list], SPLATS))
-    monkeypatch.setattr(weights, "MEMORY_LIMIT", 0)
-    assert_same(expected, stacked(view_list, SPLATS))
-
-
 def test_no_view_and_views_without_splats_are_rows_without_entries():
     empty = of_dense(np.zeros((SPLATS, 3)))
     for view_list in ([], [empty, empty]):
         W = stacked(view_list, SPLATS)
         assert W.region.numel() == 0 and not W.row_sums().any()
         assert W.indptr.tolist() == [0] * (SPLATS + 1)
-
-
-def test_a_saved_file_is_mapped_as_it_was(tmp_path):
-    W = stacked([weights.replace(view, views=(f"v{k}",)) for k, view in enumerate(views())], SPLATS)
-    W.save(tmp_path / "w.safetensors")
-    assert_same(W, RegionWeights.load(tmp_path / "w.safetensors"))
-    assert W.views == ("v0", "v1", "v2", "v3", "v4")
-    (tmp_path / "w.safetensors").write_bytes(b"words")
-    for path in (tmp_path / "w.safetensors", tmp_path / "none.safetensors"):
-        with pytest.raises(InvalidInput, match="weights"):
-            RegionWeights.load(path)
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="open files are counted as Linux tells them")
@@ -85,9 +64,3 @@ def test_more_regions_than_four_bytes_number_are_refused():
     oversized = weights.replace(random_view(0, 3, 5), offsets=torch.tensor([0, 2**30]))
     with pytest.raises(Unavailable, match="regions"):
         stacked([oversized] * 3, 5)
-
-
-def test_a_full_disk_is_an_error_in_words(monkeypatch):
-    monkeypatch.setattr("liftcore.runtime.memory.lack_of_disk", lambda size: "0.0 GiB of disk")
-    with pytest.raises(Unavailable, match="GiB of memory for them, or of disk"):
-        views()[0].in_files()
