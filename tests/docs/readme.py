@@ -36,8 +36,3 @@ def shell_commands(name: str) -> list[str]:
     # Not the first of `run splatlift splatlift keys`, which names a service of the compose file.
     matches = [re.search(r"(?:^|[ (])(?:\.venv/bin/)?splatlift (?!splatlift )([^#()]+)", line) for line in lines]
     return [match[1].strip() for match in matches if match]
-
-
-def table_heads(name: str) -> list[str]:
-    """The first cell of every table row."""
-    return re.findall(r"^\| (.*?) \|", text(name), flags=re.MULTILINE)

@@ -10,7 +10,6 @@ import os
 import re
 import subprocess
 import sys
-from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from service.models import BODY_BYTES
 from service.settings import ServiceSettings
 from tests.server import Server
 
-from .readme import ROOT, text
+from .readme import text
 
 DEFAULTS = ServiceSettings.model_construct()
 
@@ -56,25 +55,6 @@ def test_the_proxy_has_the_limits_of_the_service() -> None:
 def health_check() -> list[str]:
     (check,) = arguments_of("HEALTHCHECK")
     return json.loads(check.partition(" CMD ")[2])
-
-
-def test_everything_that_is_copied_is_here_and_in_the_build_context() -> None:
-    exceptions = [line[1:] for line in text(".dockerignore").splitlines() if line.startswith("!")]
-    copied = [words.split() for words in arguments_of("COPY") if "--from=" not in words]
-    assert copied
-    for source in (source for words in copied for source in words[:-1]):
-        assert (ROOT / source).exists(), source
-        assert any(fnmatch(source, name) for name in exceptions), source
-    assert {source for words in copied for source in words[:-1]} == set(exceptions)
-
-
-FILES = ("docker/Dockerfile", "docker/compose.yaml")
-
-
-def test_every_variable_is_a_setting() -> None:
-    variables = set(re.findall(r"SPLATLIFT_[A-Z_]+", "".join(map(text, FILES))))
-    assert variables
-    assert {name.removeprefix("SPLATLIFT_").lower() for name in variables} <= ServiceSettings.model_fields.keys()
 
 
 def test_the_port_is_the_services_own_everywhere() -> None:

@@ -1,6 +1,5 @@
 """The scripts of ``examples/`` run, and do what they say."""
 
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -63,25 +62,6 @@ def test_where_is_it_tells_places_before_the_camera_that_asks(tiny: Path) -> Non
     arguments = (tiny / "lift.safetensors", "lamp", "--view", "middle", "--table", tiny / "table.safetensors")
     x, y, z = (float(word) for word in run("where_is_it.py", *arguments).split() if word[0] in "+-")
     assert np.allclose([x, y, z], [1.2, 0.0, tiny_scene.DISTANCE], atol=0.25)
-
-
-@pytest.mark.slow
-def test_nerfstudio_cameras_move_to_the_frame_of_its_splats(tiny: Path) -> None:
-    document, move, scale = tiny_scene.cameras_document(), np.array([1.0, 2.0, 3.0]), 0.5
-    for frame in document["frames"]:  # where the photos were taken, before the run centred and scaled them
-        pose = np.array(frame["transform_matrix"])
-        pose[:3, 3] = pose[:3, 3] / scale - move
-        frame["transform_matrix"] = pose.tolist()
-    for folder in ("data", "run"):
-        (tiny / folder).mkdir()
-    (tiny / "data" / "transforms.json").write_text(json.dumps(document), encoding="utf-8")
-    frame = {"transform": np.column_stack([np.eye(3), move]).tolist(), "scale": scale}
-    (tiny / "run" / "dataparser_transforms.json").write_text(json.dumps(frame), encoding="utf-8")
-    inputs = (tiny / "splats.ply", tiny / "data", tiny / "run", tiny / "features.safetensors")
-    output = run("nerfstudio_scene.py", *inputs, tiny / "out")
-    assert output == "3 cameras moved to the frame of the splats; 60 of 60 splats have a feature\n"
-    features, expected = (lc.load_lift(folder / "lift.safetensors").features for folder in (tiny / "out", tiny))
-    assert np.allclose(np.asarray(features.float()), np.asarray(expected.float()), atol=1e-3)
 
 
 @pytest.mark.slow

@@ -20,35 +20,15 @@ import pytest
 import torch
 from matplotlib import pyplot
 from PIL import Image
-from plyfile import PlyData
-from pydantic import BaseModel
-from safetensors.numpy import load_file
 from scipy.spatial.transform import Rotation
 
 import liftcore as lc
 from liftcore.cli import main
-from liftcore.features.encoders import Pixels
-from liftcore.features.encoders.crops import CropEncoder
 from liftcore.io.cameras import read_cameras
-from liftcore.io.splats import read_splats, write_splats
-from liftcore.text.table import TableEncoder
-from liftcore.values.pack import read_features, write_pack
-from service import models
 from service.commands.demo import find_scene
-from service.errors import Problem
-from tests.inria_file import write_inria_cameras
-from tests.run_lengths import sam_records
 from tests.tiny_scene import HEIGHT, WIDTH, WORDS, cameras_document, codebook, colmap_zip, labels, make_scene
 
-from .readme import GUIDE, PYTHON, ROOT, SERVICE, SETTINGS, blocks, text
-
-SHAPES: dict[str, type[BaseModel]] = {  # a field that no other answer has -> the answer
-    "counts": models.Asset,
-    "attempt": models.Job,
-    "statistics": models.QueryAnswer,
-    "unassigned_splats": models.ObjectsAnswer,
-    "detail": Problem,
-}
+from .readme import GUIDE, PYTHON, ROOT, blocks, text
 
 
 @pytest.fixture
@@ -77,62 +57,6 @@ def test_python_example_of_files_finds_the_apple(page: str, scene_folder: Path) 
     assert names["apple"].box.high[0] < 0
 
 
-def test_sams_masks_make_a_lift_that_knows_the_words(scene_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (scene_folder / "photos").mkdir()
-    for view, clusters in labels().items():
-        Image.fromarray((80 * clusters[0] + 40).astype(np.uint8)).save(scene_folder / "photos" / f"{view}.jpg")
-    for name, module in stand_ins().items():
-        monkeypatch.setitem(sys.modules, name, module)
-    run_script("segment_photos.py", "photos", "masks")
-    table = TableEncoder.open(scene_folder / "words.safetensors")
-    (scene_folder / "words.safetensors").unlink()
-    monkeypatch.setattr("liftcore.open_encoder", lambda spec: table)  # whose weights are not here
-    run_example(GUIDE, "lc.open_encoder")
-    monkeypatch.undo()
-    monkeypatch.chdir(scene_folder)
-    monkeypatch.setattr(CropEncoder, "open", GreyEncoder)  # nor are these
-    commands = commands_between(GUIDE, "### From SAM's masks", "\n### ", scene_folder)
-    assert [command[0] for command in commands] == ["pack", "lift"]
-    assert "python examples/segment_photos.py photos masks" in text(GUIDE)
-    question = ["query", "scene.lift.safetensors", "apple", "--table", "words.safetensors", "--view", "middle"]
-    assert [main(command) for command in [*commands, [*question, "--mask", "apple.png"]]] == [0, 0, 0]
-    with Image.open(scene_folder / "apple.png") as mask:
-        columns = np.asarray(mask).nonzero()[1]
-    assert len(columns) > 0 and columns.max() < WIDTH // 2
-
-
-def test_langsplats_files_become_a_pack(scene_folder: Path) -> None:
-    (scene_folder / "language_features").mkdir()
-    for view, clusters in labels().items():
-        np.save(scene_folder / "language_features" / f"{view}_s.npy", clusters)
-        np.save(scene_folder / "language_features" / f"{view}_f.npy", codebook().astype(np.float16))
-    (command,) = commands_between(GUIDE, "### From LangSplat's folders", "\n### ", scene_folder)
-    assert main(command) == 0
-    packs = read_features(scene_folder / "features.safetensors")
-    assert packs.views == tuple(sorted(labels())) and packs.text_space == command[-1]
-
-
-def test_pack_of_ones_own_program_makes_a_lift_that_python_reads(
-    scene_folder: Path,
-) -> None:
-    for name in ("labels", "vectors"):
-        (scene_folder / name).mkdir()
-    for view, clusters in labels().items():
-        np.save(scene_folder / "labels" / f"{view}.npy", clusters[0])
-        np.save(scene_folder / "vectors" / f"{view}.npy", codebook())
-    (scene_folder / "features.safetensors").unlink()
-    run_script("write_pack.py", "labels", "vectors", "features.safetensors")
-    sources = [str(scene_folder / name) for name in ("scene.ply", "cameras.json", "features.safetensors")]
-    assert main(["lift", *sources, "-o", "scene.lift.safetensors"]) == 0
-    lift = load_file("scene.lift.safetensors")  # row j is row j of the PLY
-    vertices = PlyData.read("scene.ply")["vertex"]
-    positions = np.stack([vertices[axis] for axis in "xyz"], axis=1)
-    assert np.array_equal(positions, read_splats(scene_folder / "scene.ply").means.numpy())
-    mask = lift["has_feature"] & (lift["total_weight"] > 0.5)
-    clusters = np.digitize(positions[mask, 0], [-0.6, 0.6])  # 0 apple, 1 book, 2 lamp
-    assert len(set(clusters)) == 3 and np.array_equal(lift["features"][mask].argmax(axis=1), clusters)
-
-
 def commands_between(page: str, begin: str, end: str, folder: Path) -> list[list[str]]:
     """The commands of a part of a page, for a folder with a COLMAP model and without features."""
     with zipfile.ZipFile(io.BytesIO(colmap_zip())) as archive:
@@ -154,34 +78,6 @@ def run_example(page: str, start: str) -> dict[str, Any]:
 def run_script(name: str, *arguments: str) -> None:
     """Call the main function of an example in this process, where modules may be replaced."""
     runpy.run_path(str(ROOT / "examples" / name))["main"](*arguments)
-
-
-def stand_ins() -> dict[str, ModuleType]:
-    """segment-anything by the names that are used of it: masks are run lengths of what is of one grey."""
-
-    def generate(image: np.ndarray) -> list[dict[str, Any]]:
-        clusters = np.rint((image[..., 0].astype(float) - 40) / 80)
-        return sam_records(np.stack([clusters == k for k in range(3)]))
-
-    module, generator = ModuleType("segment_anything"), SimpleNamespace(generate=generate)
-    vars(module).update(
-        SamAutomaticMaskGenerator=lambda sam, output_mode: generator,
-        build_sam_vit_h=lambda checkpoint: SimpleNamespace(to=lambda device: None),
-    )
-    return {"segment_anything": module}
-
-
-class GreyEncoder:
-    """In place of an open_clip model: a crop's vector is the codebook's row of its brightest pixel's grey."""
-
-    pixels = Pixels(patch=8, shorter=8, mean=(0.0, 0.0, 0.0), std=(1.0, 1.0, 1.0), interpolation="nearest")
-
-    def __init__(self, spec: str, _: torch.device) -> None:
-        self.name = self.text_space = spec
-
-    def encode(self, images: torch.Tensor) -> torch.Tensor:
-        clusters = ((255 * images.flatten(1).amax(dim=1) - 40) / 80).round().long()
-        return torch.from_numpy(codebook()).float()[clusters]
 
 
 def test_the_way_from_own_maps_to_a_mask_leads_there(scene_folder: Path) -> None:
@@ -211,24 +107,6 @@ def test_questions_of_the_guide_are_answered(scene_folder: Path, capsys: pytest.
     output = capsys.readouterr().out
     assert "3 of 3 words found" in output and "middle:6,12: apple " in output
     assert all((scene_folder / name).is_file() for name in ("like.png", "words.png", "seen.png", "scores.ply"))
-
-
-def test_another_encoders_vectors_take_the_same_weights(scene_folder: Path) -> None:
-    for name in ("clip", "siglip"):
-        shutil.copy(scene_folder / "features.safetensors", scene_folder / f"{name}.safetensors")
-    commands = commands_between(SETTINGS, "## Another encoder", "\n## ", scene_folder)
-    assert [main(command) for command in commands] == [0, 0]
-    assert any((scene_folder / "weights").iterdir())
-
-
-def test_json_examples_show_fields_that_the_service_sends() -> None:
-    examples = [json.loads(block) for block in blocks(SERVICE, "json")]
-    documented_fields = set()
-    for example in examples:
-        model = next(model for field, model in SHAPES.items() if field in example)
-        assert example.keys() <= model.model_fields.keys() | model.model_computed_fields.keys()
-        documented_fields.add(model)
-    assert documented_fields == set(SHAPES.values())
 
 
 # Scenes of nerfstudio and gsplat
@@ -375,7 +253,7 @@ def loop() -> dict[str, Any]:
     return names | {"poses": poses, "photos": photos, "encode": encode, "width": WIDTH, "height": HEIGHT}
 
 
-def test_tensors_of_a_training_loop_lift_as_their_files_do(loop: dict[str, Any], tmp_path: Path) -> None:
+def test_five_lines_lift_the_tensors_of_a_training_loop(loop: dict[str, Any]) -> None:
     assert all(loop[name].requires_grad for name in ("means", "quats", "log_scales", "opacity_logits"))
     (example,) = (block for block in blocks(PYTHON, "python") if "lc.Splats(" in block)
     five = example.splitlines()[2:]
@@ -385,36 +263,6 @@ def test_tensors_of_a_training_loop_lift_as_their_files_do(loop: dict[str, Any],
     features = loop["result"].features.float()
     loop["text_vectors"] = features[loop["means"][:, 0].detach() < 0].mean(dim=0)
     exec(five[4], loop)
-
-    write_splats(tmp_path / "scene.ply", loop["splats"])
-    documented = [lc.Camera(viewmat, K, WIDTH, HEIGHT, name=name) for name, viewmat, K in loop["poses"]]
-    write_inria_cameras(lc.Cameras(tuple(documented)), tmp_path / "cameras.json")
-    grids = {name: lc.FeatureGrid(loop["encode"](photo)) for name, photo in loop["photos"]}
-    write_pack(tmp_path / "features.safetensors", grids, {})
-    filed = lc.lift(
-        lc.read_splats(tmp_path / "scene.ply"), lc.read_cameras(tmp_path / "cameras.json"),
-        lc.read_features(tmp_path / "features.safetensors"),
-    )  # fmt: skip
-    assert torch.allclose(filed.features.float(), features, atol=2e-3)  # packs and poses are rounded, values are not
-    assert torch.equal(filed.has_feature, loop["result"].has_feature)
-
     columns = np.nonzero(np.asarray(loop["mask"]))[1]
     assert len(columns) > 10 and columns.max() < WIDTH / 2  # the cloud on the left was asked for
     assert loop["means"].grad is None
-
-
-def test_tensors_of_gsplat_and_nerfstudio_are_taken_under_their_names(loop: dict[str, Any]) -> None:
-    (example,) = (block for block in blocks(PYTHON, "python") if "from_gsplat(" in block)
-    raw = {"means": loop["means"], "quats": loop["quats"]}
-    raw |= {"scales": loop["log_scales"], "opacities": loop["opacity_logits"]}
-    names = {"lc": lc, "colors": torch.rand(400, 3), "c2w": torch.eye(4), "K": loop["poses"][0][2]}
-    names |= {"trainer": SimpleNamespace(splats=raw), "model": SimpleNamespace(gauss_params=raw)}
-    names |= raw | {"scales": raw["scales"].exp(), "opacities": raw["opacities"].sigmoid()}
-    names |= {"width": WIDTH, "height": HEIGHT}
-    trained = lc.Splats(**{name: loop[name] for name in ("means", "quats", "log_scales", "opacity_logits")})
-    for line in example.splitlines():
-        exec(line, names)
-        splats: lc.Splats = names["splats"]
-        assert torch.allclose(splats.log_scales, trained.log_scales, atol=1e-5)
-        assert torch.allclose(splats.opacity_logits, trained.opacity_logits, atol=1e-4)
-    assert names["camera"].viewmat.diagonal().tolist() == [1, -1, -1, 1]

@@ -11,8 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from liftcore.errors import InvalidCameras, InvalidQuery
-from liftcore.io.cameras import read_cameras
+from liftcore.errors import InvalidQuery
 from liftcore.lifting.files import lift_files
 from liftcore.query.ask import ask
 from liftcore.query.question import Query
@@ -24,7 +23,6 @@ from liftcore.scene.cameras import Camera
 from liftcore.values.lift_file import save_lift
 from liftcore.values.settings import LiftSettings
 from tests.distorted_scene import (
-    BARREL,
     HEIGHT,
     LENSES,
     VIEWS,
@@ -102,37 +100,3 @@ def test_masks_lie_over_the_photo(lens: str, tmp_path: Path) -> None:
         picture = Image.open(io.BytesIO(render_png(scene, "left", channel)))
         assert picture.size == (WIDTH, HEIGHT)
         assert np.asarray(picture).max() > 0
-
-
-def test_a_pixel_at_the_rim_of_a_wide_photo_has_no_pinhole(tmp_path: Path) -> None:
-    document = {"w": 400, "h": 40, "fl_x": 100, "fl_y": 100, "camera_model": "OPENCV_FISHEYE"}
-    save_lift(lifted(tmp_path, "fisheye"), tmp_path / "made.safetensors")
-    scene = Scene(tmp_path / "made.safetensors")
-    frame = {"file_path": "wide.jpg", "transform_matrix": np.diag([1.0, -1.0, -1.0, 1.0]).tolist()}
-    (tmp_path / "wide.json").write_text(json.dumps({**document, "frames": [frame]}))
-    scene.__dict__["cameras"] = read_cameras(tmp_path / "wide.json")
-    assert len(ask(scene, Query.of((Pixel("wide", 200, 20),), threshold=0.5)).scores) == 3600
-    with pytest.raises(InvalidQuery, match=r"a pixel within the pinhole's image, got .*rim of a wide lens; pick"):
-        ask(scene, Query.of((Pixel("wide", 2, 20),)))
-
-
-def test_a_model_that_comes_later_changes_no_lift(tmp_path: Path) -> None:
-    scene = tmp_path / "scene"
-    splats, cameras, features = write_distorted_scene(scene, "barrel")
-    document = json.loads(cameras.read_text())
-    size = (document["fl_x"], document["fl_y"], document["cx"], document["cy"])
-    lines = ["\n".join(f"{i} 1 0 0 0 {-x} 0 0 1 {name}.jpg\n" for i, (name, x) in enumerate(VIEWS.items()))]
-    for place, model in (("sparse/0", ("OPENCV", *size, *BARREL.values())), ("dense/0/sparse", ("PINHOLE", *size))):
-        folder = scene / place
-        folder.mkdir(parents=True)
-        (folder / "cameras.txt").write_text(f"1 {model[0]} {WIDTH} {HEIGHT} {' '.join(map(str, model[1:]))}\n")
-        (folder / "images.txt").write_text(lines[0])
-        if place == "sparse/0":
-            save_lift(
-                lift_files(splats, folder, [features], LiftSettings.of(preset="row-sum")),
-                tmp_path / "made.safetensors",
-            )
-    with pytest.raises(InvalidCameras, match="one COLMAP model"):
-        read_cameras(scene)
-    lift_scene = Scene(tmp_path / "made.safetensors")
-    assert lift_scene.cameras.distorted == tuple(VIEWS)

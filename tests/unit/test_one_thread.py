@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from threading import Barrier, Event
@@ -111,27 +109,3 @@ def test_two_threads_within_it_at_once_leave_nothing_behind(first_fails: bool):
         assert futures[1].result() == (1, 1, 3)
         assert futures[0].result() == 3
     assert number_of_a_new_thread() == 3 and all_are(3)
-
-
-def test_libraries_that_are_loaded_within_it_are_limited_by_the_next_one():
-    code = """
-import numpy
-from threadpoolctl import ThreadpoolController
-from liftcore.runtime.one_thread import one_thread
-
-def numbers():
-    libraries = ThreadpoolController().select(user_api="blas").lib_controllers
-    return {library.filepath: library.num_threads for library in libraries}
-
-with one_thread():
-    before = numbers()
-    import scipy.linalg
-    after_import = numbers()
-    with one_thread():
-        within = numbers()
-assert set(before) < set(within) and set(within.values()) == {1}, within
-assert {path: threads for path, threads in numbers().items() if path not in before} == {
-    path: threads for path, threads in after_import.items() if path not in before
-}
-"""
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

@@ -1,24 +1,18 @@
 """``import liftcore as lc``: public names, imports, lifts of values in memory, and progress of a lift."""
 
 import ast
-import json
 import logging
-import subprocess
-import sys
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from importlib import import_module
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 import liftcore as lc
-from liftcore import models
 from liftcore.lifting.files import lift_files
 from tests.scenes import observed, random_splats, write_scene
 
@@ -75,14 +69,6 @@ def test_command_line_and_service_import_public_names_alone(path):
     assert not private
 
 
-def test_import_loads_neither_torch_nor_numba():
-    code = (
-        "import sys, json, liftcore; print(json.dumps([m for m in ('torch', 'numba', 'numpy') if m in sys.modules]))"
-    )
-    stdout = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert json.loads(stdout) == []
-
-
 def test_iterator_is_taken_one_view_at_a_time_and_once(scene):
     _, splats, cameras, views = scene
     read_names = []
@@ -96,28 +82,6 @@ def test_iterator_is_taken_one_view_at_a_time_and_once(scene):
     result = lc.lift(splats, cameras, each())
     assert read_names == list(views)
     assert result.diagnostics["views_without_camera"] == ["nobody"]
-
-
-def test_plan_chooses_what_the_lift_takes(scene):
-    _, splats, cameras, views = scene
-    plan = lc.plan(splats, cameras, views, coverage=1)
-    result = lc.lift(splats, cameras, views, coverage=1)
-    assert result.views == plan.views and len(plan.views) + len(plan.left_out) == 3
-    strided = lc.plan(splats, cameras, views, view_stride=2)
-    assert any("; 2 of 3 views" in line for line in strided.lines())
-
-
-def test_render_composites_numbers_of_splats(scene):
-    _, splats, cameras, _ = scene
-    camera = cameras["v0"]
-    ones = lc.render(splats, camera, np.ones(splats.count))
-    image = lc.render(splats, camera, torch.ones(splats.count, 2) * torch.tensor([1.0, 3.0]))
-    assert ones.shape == (camera.height, camera.width) and image.shape == (camera.height, camera.width, 2)
-    assert torch.allclose(image[:, :, 1], 3 * ones, atol=1e-6)
-    share = lc.render(splats, camera, torch.ones(splats.count), normalise=True)
-    assert torch.allclose(share[ones > 0], torch.ones(()), atol=1e-6)
-    with pytest.raises(lc.InvalidSettings, match="a row a splat"):
-        lc.render(splats, camera, torch.ones(splats.count + 1))
 
 
 def test_weights_at_pixels_are_their_renders(scene):
@@ -193,50 +157,6 @@ def test_settings_and_keywords_beside_them_are_one(scene):
     assert lc.lift(splats, cameras, views, lc.LiftSettings.of(), robust=False).confidence is None
 
 
-def test_answers_refuse_splats_of_another_scene(scene):
-    _, splats, cameras, views = scene
-    result = lc.lift(splats, cameras, views, preset="row-sum")
-    vectors = torch.eye(2, result.features.shape[1])
-    names = ("means", "quats", "log_scales", "opacity_logits")
-    cropped = lc.Splats(**{name: getattr(splats, name)[1:] for name in names})
-    invalid_values: list[Any] = [cropped, "scene.ply"]
-    for other in invalid_values:
-        for ask in (
-            lambda other=other: result.query(vectors, splats=other),
-            lambda other=other: result.segment(["a", "b"], vectors, other),
-            lambda other=other: result.objects(other),
-        ):
-            with pytest.raises(lc.InvalidSplats, match=f"the {splats.count} Splats that were lifted"):
-                ask()
-
-
-def test_what_is_no_engine_and_too_few_rows_are_refused(scene):
-    _, splats, cameras, views = scene
-    with pytest.raises(lc.InvalidSettings, match=r"engine: expected an engine, or None, got 'local'; LocalEngine"):
-        lc.lift(splats, cameras, views, engine="local")  # pyright: ignore[reportArgumentType]
-    strange: list[Any] = [5, ""]
-    for checkpoint in strange:
-        with pytest.raises(lc.InvalidSettings, match="checkpoint: expected the path of a folder"):
-            lc.lift(splats, cameras, views, checkpoint=checkpoint)
-    with pytest.raises(lc.InvalidInput, match="splats: expected"):
-        lc.region_weights(splats, cameras, views).matrix(1)
-
-
-def test_render_refuses_the_name_of_a_camera_and_an_unknown_device(scene):
-    _, splats, cameras, _ = scene
-    with pytest.raises(lc.InvalidSettings, match="device: expected 'auto', 'cpu' or 'cuda', got 'tpu'"):
-        lc.render(splats, cameras["v0"], torch.ones(splats.count), device="tpu")
-    for values in (None, "colours", [["x"]]):
-        with pytest.raises(lc.InvalidSettings, match="values: expected"):
-            lc.render(splats, cameras["v0"], values)  # pyright: ignore[reportCallIssue, reportArgumentType]
-    with pytest.raises(lc.InvalidSettings, match="params: expected CompositingParams"):
-        lc.render(splats, cameras["v0"], np.ones(splats.count), {})  # pyright: ignore[reportCallIssue, reportArgumentType]
-    swapped = np.arange(splats.count)[::-1].astype(">i4")
-    assert lc.render(splats, cameras["v0"], swapped).shape == (cameras["v0"].height, cameras["v0"].width)
-    with pytest.raises(lc.InvalidCameras, match=r"camera: expected a Camera, got 'v0'; cameras\[name\]"):
-        lc.render(splats, "v0", torch.ones(splats.count))  # pyright: ignore[reportCallIssue, reportArgumentType]
-
-
 def test_render_refuses_to_drop_a_gradient_that_is_recorded(scene):
     _, splats, cameras, _ = scene
     values = torch.ones(splats.count, 2, requires_grad=True)
@@ -272,38 +192,6 @@ def test_plan_warns_of_splats_with_activated_opacities_and_scales(scene):
     assert any("no logits" in text for text in warnings) and any("no logarithms" in text for text in warnings)
     assert plan.available_views == len(views)
     assert not any("as if they were no" in text for text in lc.plan(splats, cameras, views).input_warnings)
-
-
-def test_region_weights_of_a_label_a_pixel_are_the_weights_of_rays(scene):
-    _, splats, cameras, _ = scene
-    camera = cameras["v0"]
-    labels = np.arange(camera.height * camera.width).reshape(1, camera.height, camera.width)
-    W = lc.region_weights(splats, {"v0": camera}, {"v0": lc.Regions(labels, np.ones((labels.size, 1), np.float32))})
-    values = np.random.default_rng(0).normal(size=splats.count)
-    image = lc.render(splats, camera, values).numpy().ravel()
-    np.testing.assert_allclose(W.matrix(splats.count).T @ values, image, atol=1e-4)
-
-
-@pytest.mark.parametrize("engine", [None, lc.LocalEngine(1)])
-def test_checkpoint_is_a_folder_by_its_path_or_its_text(scene, engine, tmp_path):
-    _, splats, cameras, views = scene
-    results = [
-        lc.lift(splats, cameras, views, preset="row-sum", engine=engine, checkpoint=kind(tmp_path / "kept"))
-        for kind in (str, Path)
-    ]
-    assert torch.equal(results[0].features, results[1].features) and any((tmp_path / "kept").iterdir())
-
-
-def test_warnings_of_a_lift_are_logged_once_without_a_plan_callback(scene, caplog):
-    _, splats, cameras, views = scene
-    transposed = {name: lc.FeatureGrid(torch.ones(64, 4, 3)) for name in views}
-    result = lc.lift(splats, cameras, transposed, preset="row-sum")
-    assert any("check that they are [rows, columns]" in warning for warning in result.diagnostics["warnings"])
-    assert [record.getMessage() for record in caplog.records].count(result.diagnostics["warnings"][-1]) == 1
-    assert {record.getMessage() for record in caplog.records} >= set(result.diagnostics["warnings"])
-    caplog.clear()
-    lc.lift(splats, cameras, transposed, preset="row-sum", on_plan=lambda plan: None)
-    assert not caplog.records
 
 
 @contextmanager
@@ -356,66 +244,22 @@ def test_torch_modes_change_no_bit_and_hold_in_the_callers_iterator(scene, mode)
     assert all(torch.equal(a, b) for a, b in zip(expected, within, strict=True))
 
 
-def test_two_threads_lift_the_same_under_another_default_dtype(scene):
+def test_repr_of_public_values_is_one_line_with_their_size(scene):
     _, splats, cameras, views = scene
-    expected = lc.lift(splats, cameras, views).features
-    with default_dtype(torch.float64), ThreadPoolExecutor(2) as pool:
-        futures = [pool.submit(lc.lift, splats, cameras, views) for _ in range(4)]
-        assert all(torch.equal(future.result().features, expected) for future in futures)
-        assert torch.get_default_dtype() == torch.float64
-
-
-def test_repr_of_every_public_value_is_one_line_with_its_size(scene):
-    _, splats, cameras, views = scene
-    result = lc.lift(splats, cameras, views, aggregation=True, aggregation_cluster_size=2)
-    vectors = torch.eye(2, result.features.shape[1])
-    answer, words = result.query(vectors, splats=splats, threshold=0.1), ["a" * 90, "b"]
+    result = lc.lift(splats, cameras, views, preset="row-sum")
+    vectors, words = torch.eye(2, result.features.shape[1]), ["a" * 90, "b"]
     segmentation, catalogue = result.segment(words, vectors, splats), result.objects(splats, words, vectors)
-    sized = [splats, result, lc.region_weights(splats, cameras, views), segmentation]
-    sized += [lc.plan(splats, cameras, views)]
-    long = lc.LiftSettings.of(**dict(lc.LiftSettings.of(quality="fast")))
-    unsized = [cameras, cameras["v0"].replace(name="x" * 300), *views.values(), long, lc.LiftSettings.of()]
-    unsized += [
-        answer,
-        *segmentation.named_words,
-        catalogue,
-        *catalogue.objects,
-    ]
-    unsized += [lc.CompositingParams(), lc.CompositingParams(stride=3), lc.LocalEngine(), lc.open_encoder("lvis")]
-    lift_scene, box = result.scene(splats, cameras), ((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
-    query = lc.Query(text=["a" * 99], like=["splat:1", (1.0,) * result.features.shape[1]], absent="keep")
-    example_answer = lift_scene.ask(lc.Query(like=["splat:1"]))
-    summary = {"splats": 1, "share": 0.5, "score": 0.5, "box": box}
-    unsized += [
-        lift_scene,
-        query,
-        example_answer,
-        lift_scene.objects(example_answer),
-        lift_scene.view_mask(example_answer, "v0"),
-    ]
-    unsized += [lc.FeatureGrid(np.ones((3, 4, 5))), lc.Picture(camera=cameras["v0"])]
-    unsized += [models.OwnCamera.of(cameras["v0"])]
-    sized_summary: dict[str, Any] = summary | {"centre": box[0], "size": box[1]}
-    unsized += [
-        lc.SelectedObject(**sized_summary),
-        lift_scene.world,
-        lc.WorldFrame(up=(0, -3, 0), metres_per_unit=0.1),
-    ]
-    unsized += [lc.NamedSplats(word="a" * 99, row=0, value=1, colour=(1, 2, 3), margin=0.1, threshold=0.2, **summary)]
-    unsized += [lc.SceneObject(id=0, name=None, views=("v",) * 99, feature=(0.1,) * 512, **sized_summary)]
-    unsized += [lc.CoveringRegion(example="region:v:0:1", view="v" * 99, level=0, region=1, share=0.5)]
-    classes = {value for name in lc.__all__ if isinstance(value := getattr(lc, name), type)}
-    no_values = [kind for kind in classes if issubclass(kind, Exception) or getattr(kind, "_is_protocol", False)]
-    classes -= {*no_values, lc.RayEngine, lc.Checkpoint, lc.Kernel}  # which needs Ray; a folder; a name
-    assert classes <= {kind for value in (*sized, *unsized) for kind in type(value).__mro__}
-    for value in (*sized, *unsized):
+    sized = [splats, result, lc.region_weights(splats, cameras, views), segmentation, lc.plan(splats, cameras, views)]
+    values = [cameras, cameras["v0"].replace(name="x" * 300), *views.values(), lc.FeatureGrid(np.ones((3, 4, 5)))]
+    values += [catalogue, *catalogue.objects, *segmentation.named_words, result.scene(splats, cameras)]
+    values += [result.query(vectors, splats=splats, threshold=0.1), lc.Query(text=["a" * 99], like=["splat:1"])]
+    values += [lc.LiftSettings.of(**dict(lc.LiftSettings.of(quality="fast"))), lc.CompositingParams(stride=3)]
+    values += [lc.LocalEngine(), lc.open_encoder("lvis"), lc.WorldFrame(up=(0, -3, 0), metres_per_unit=0.1)]
+    for value in (*sized, *values):
         line = repr(value)
         assert line.startswith(type(value).__name__ + "(") and line.endswith(")")
         assert len(line) <= 120 and "\n" not in line and len(str(value)) <= 120
     assert all(str(splats.count) in repr(value) for value in sized)
-    assert "[3, 4, 5]" in repr(lc.FeatureGrid(np.ones((3, 4, 5)))) and "stride=3" in repr(
-        lc.CompositingParams(stride=3)
-    )
 
 
 def test_what_a_caller_set_stays_when_a_call_names_another_quality_or_preset() -> None:

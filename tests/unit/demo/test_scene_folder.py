@@ -51,16 +51,6 @@ def test_a_scene_is_found_by_what_its_files_are(folder: Path, tmp_path: Path) ->
     assert scene.truth.name_of(masks) == "cat"
 
 
-def test_phrases_of_the_user_come_first_and_a_table_is_the_encoder(folder: Path, tmp_path: Path) -> None:
-    (folder / "text_table.safetensors").touch()
-    (folder / "cameras.json").touch()
-    (folder / "features.safetensors").write_bytes((folder / "grids.safetensors").read_bytes())
-    scene = find_scene(folder, ["a whale"], tmp_path)
-    assert scene.phrases == ("a whale",)
-    assert scene.encoder == f"table:{folder / 'text_table.safetensors'}"
-    assert (scene.cameras.name, scene.features.name) == ("cameras.json", "features.safetensors")
-
-
 def test_what_is_missing_is_named(folder: Path, tmp_path: Path) -> None:
     for missing, message in (("point_cloud.ply", "splats"), ("grids.safetensors", "features")):
         (folder / missing).unlink()
