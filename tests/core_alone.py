@@ -104,7 +104,7 @@ def check_hints(lc: Any, folder: Path) -> None:
     inputs = (lc.read_splats(scene.splats), lc.read_cameras(scene.cameras), lc.read_features(*scene.features))
     for package, extra, call in (
         ("open_clip", "encoders", lambda: lc.open_encoder("open_clip:ViT-B-32/openai").encode(["mug"])),
-        ("fastapi", "service", lambda: lc.load_plugin("splatlift.commands", "serve")),
+        ("fastapi", "service", lambda: lc.load_command("serve")),
         ("matplotlib", "evaluate", lambda: compare_speeds(scene, budget=1.0)),
         ("hdbscan", "aggregation", lambda: lc.lift(*inputs, aggregation=True)),
     ):

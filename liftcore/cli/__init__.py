@@ -15,7 +15,7 @@ from functools import partial
 from importlib import import_module
 from typing import Any
 
-from liftcore import __version__, load_plugin
+from liftcore import __version__, load_command
 from liftcore.cli.options import BAD_INPUT, Parser, shared_options, whole_number, wrong_kind_error
 from liftcore.errors import SplatliftError
 
@@ -36,7 +36,7 @@ COMMANDS = {
     "evaluate": "evaluate a lift by labels of its views",
     "tradeoff": "compare speed and accuracy on a scene",
 }
-SERVICE_COMMANDS = {  # modules of another package, which are entry points in splatlift.commands
+SERVICE_COMMANDS = {  # modules of the package service
     "demo": "run a complete example through the HTTP service",
     "serve": "run the HTTP service",
     "view": "show a lift on the service's page, until Ctrl-C",
@@ -105,4 +105,4 @@ def _module(name: str) -> Any:
     """
     if name in COMMANDS:
         return import_module(f"liftcore.cli.{name}")
-    return load_plugin("splatlift.commands", name)
+    return load_command(name)

@@ -65,12 +65,6 @@ def shared_pixels(labels: Tensor, truth: Tensor, count: int) -> tuple[Tensor, Te
     return shared, union
 
 
-def class_ious(labels: Tensor, truth: Tensor, count: int) -> Tensor:
-    """Compute the IoU of every class over all pixels: labels, truth [...] int -> [count] f64, NaN if in neither."""
-    shared, union = shared_pixels(labels, truth, count)
-    return torch.where(union > 0, shared.double() / union, float("nan"))
-
-
 def centred_cosines(
     raster: Raster,
     views: Sequence[tuple[Camera, ViewFeatures]],

@@ -234,9 +234,9 @@ class LiftResult(Lift):
             InvalidInput: required splats or cameras are missing, or not those of the lift.
             Unavailable: no package with the page is installed.
         """
-        from liftcore.runtime.plugins import load_plugin
+        from liftcore.runtime.commands import load_command
 
-        load_plugin("splatlift.viewers", "page")(self, splats, cameras, port=port, browser=browser)
+        load_command("view").show(self, splats, cameras, port=port, browser=browser)
 
 
 def load_lift(path: Path | str) -> LiftResult:

@@ -1,1 +1,1 @@
-"""Commands of ``splatlift`` that entry points announce: each file is one, as those of `liftcore.cli` are."""
+"""Commands of ``splatlift`` of the service: each file is one, as those of `liftcore.cli` are."""

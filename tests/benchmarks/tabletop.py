@@ -19,7 +19,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 import liftcore as lc
-from liftcore.evaluate.accuracy import class_ious
+from liftcore.evaluate.accuracy import shared_pixels
 from liftcore.query.scene import Scene
 from liftcore.raster.base import Raster
 from liftcore.raster.cpu.raster import CpuRaster
@@ -90,7 +90,8 @@ class Truth:
         best = torch.stack([image.argmax(dim=2) for image in images])
         truth_labels = torch.stack(list(self.held_out.values()))
         best[truth_labels < 0] = NO_LABEL  # rays that meet nothing show no class
-        ious = class_ious(best, truth_labels, len(self.classes))
+        shared, union = shared_pixels(best, truth_labels, len(self.classes))
+        ious = torch.where(union > 0, shared.double() / union, float("nan"))
         return Figures(accuracy, float(ious.nanmean()), float(ious[~ious.isnan()].min()))
 
 
