@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from liftcore.errors import InvalidSplats
 from liftcore.io.kinds import EXPORT_PLY, TRAINED
 from liftcore.io.quantised import Fields
 from liftcore.runtime.one_line import join_names
@@ -28,11 +27,7 @@ NERFSTUDIO = ("_model.gauss_params.", "_model.")  # before the names, in newer a
 
 
 def _require_whole(path: Path) -> None:
-    """Refuse the checkpoint of one of several ranks, by its name and those beside it.
-
-    Raises:
-        InvalidSplats: other ranks of its step hold further splats.
-    """
+    """Refuse the checkpoint of one of several ranks, by its name and those beside it."""
     match = _RANK.fullmatch(path.name)
     if match is None:
         return
@@ -46,16 +41,11 @@ def _require_whole(path: Path) -> None:
             f" beside {join_names(others, 3)}" if others else ""
         )
         hint = "join the tensors of all ranks in one checkpoint, or export the scene as .ply"
-        raise InvalidSplats(str(path), expected="a checkpoint of the complete scene", got=got, hint=hint)
+        raise ValueError(f"a checkpoint of the complete scene, got {got}; {hint}")
 
 
 def read_checkpoint(path: Path, *, colour: bool = True) -> Fields:
-    """Read the fields of a checkpoint's splats, in the frame of their training.
-
-    Raises:
-        InvalidSplats: the file holds more than tensors and plain values, no splats of either trainer, or a part of a
-            scene.
-    """
+    """Read the fields of a checkpoint's splats, in the frame of their training."""
     import torch
 
     _require_whole(path)
@@ -68,19 +58,19 @@ def read_checkpoint(path: Path, *, colour: bool = True) -> Fields:
             stored = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except Exception as error:  # unpickling raises errors of many types
         got = f"one that holds more than tensors, or is damaged ({str(error).splitlines()[0][:100]})"
-        raise InvalidSplats(str(path), expected="a checkpoint of tensors", got=got, hint=EXPORT_PLY) from None
-    tensors, names = _splats(stored, path)
-    fields: Fields = {field: _array(tensors, name, path) for field, name in GSPLAT.items()}
+        raise ValueError(f"a checkpoint of tensors, got {got.replace(';', ',')}; {EXPORT_PLY}") from None
+    tensors, names = _splats(stored)
+    fields: Fields = {field: _array(tensors, name) for field, name in GSPLAT.items()}
     fields["opacity_logits"] = fields["opacity_logits"].reshape(len(fields["opacity_logits"]), -1)[:, 0]
     if colour and names[0] in tensors:
         from liftcore.scene.splats import joined_harmonics
 
-        first, rest = (torch.from_numpy(_array(tensors, name, path)) for name in names)
+        first, rest = (torch.from_numpy(_array(tensors, name)) for name in names)
         fields["sh"] = joined_harmonics(first, rest, (f"{path} {names[0]}", names[1])).numpy()
     return fields | {"render_mode": mode_beside(path)}
 
 
-def _splats(stored: Any, path: Path) -> tuple[dict[str, Any], tuple[str, str]]:
+def _splats(stored: Any) -> tuple[dict[str, Any], tuple[str, str]]:
     """Return the tensors of the splats by gsplat's names, and the names of their colours."""
     inner = stored if isinstance(stored, dict) else {}
     if isinstance(inner.get("splats"), dict):
@@ -96,26 +86,22 @@ def _splats(stored: Any, path: Path) -> tuple[dict[str, Any], tuple[str, str]]:
     keys = ", ".join(map(repr, list(inner)[:4])) if inner else type(stored).__name__
     expected = "the splats of gsplat ('splats') or of nerfstudio ('pipeline')"
     hint = TRAINED if isinstance(stored, tuple) else EXPORT_PLY  # as 3DGS's trainer writes its chkpnt*.pth
-    raise InvalidSplats(str(path), expected=expected, got=f"a checkpoint of {keys}"[:160], hint=hint)
+    raise ValueError(f"{expected}, got a checkpoint of {keys}; {hint}")
 
 
-def _array(tensors: dict[str, Any], name: str, path: Path) -> np.ndarray:
+def _array(tensors: dict[str, Any], name: str) -> np.ndarray:
     import torch
 
     tensor = tensors.get(name)
-    if isinstance(tensor, torch.Tensor) and not _is_stored(tensor):
-        got = f"a tensor {list(tensor.shape)} that is not stored completely"
-        raise InvalidSplats(f"{path} {name}", expected="floats, a row a splat", got=got[:160], hint=EXPORT_PLY)
-    if not isinstance(tensor, torch.Tensor) or not tensor.is_floating_point() or not tensor.ndim or not len(tensor):
-        got = (
-            f"{str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape)}"
-            if isinstance(tensor, torch.Tensor)
-            else "none"
-        )
-        raise InvalidSplats(f"{path} {name}", expected="floats, a row a splat", got=got, hint=EXPORT_PLY)
-    # Map coordinates need more digits than float32 has.
-    is_double = name == GSPLAT["means"] and tensor.dtype == torch.float64
-    return tensor.detach().to(torch.float64 if is_double else torch.float32).numpy()
+    got = "none"
+    if isinstance(tensor, torch.Tensor):
+        if tensor.is_floating_point() and tensor.ndim and len(tensor) and _is_stored(tensor):
+            # Map coordinates need more digits than float32 has.
+            is_double = name == GSPLAT["means"] and tensor.dtype == torch.float64
+            return tensor.detach().to(torch.float64 if is_double else torch.float32).numpy()
+        got = f"{str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape)}"
+        got += "" if _is_stored(tensor) else ", which is not stored completely"
+    raise ValueError(f"floats as {name!r}, a row a splat, got {got}; {EXPORT_PLY}")
 
 
 def _is_stored(tensor: Any) -> bool:

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from liftcore.errors import InvalidSplats
-from liftcore.io.ply import EXPORT, padding_bytes, parse_elements, read_head, tail_warnings
+from liftcore.io.ply import padding_bytes, parse_elements, read_head, tail_warnings
 from liftcore.io.quantised import Fields, decoded, field_shapes, logits, smallest_three
 from liftcore.scene.harmonics import constant_terms
 from liftcore.scene.render_mode import mode_of_comments
@@ -24,27 +23,20 @@ SH_RANGE = 8.0  # of a higher harmonic, from -4 to 4
 
 
 def read_compressed_ply(path: Path, *, colour: bool = True) -> Fields:
-    """Read the fields of a compressed PLY.
-
-    Raises:
-        InvalidSplats: an element or a column is missing or of another type, or the file's size is another.
-    """
+    """Read the fields of a compressed PLY."""
     head, size = read_head(path)
     lines, elements, offset = parse_elements(head, str(path))
     mode, warnings = mode_of_comments(lines)
     tables: dict[str, np.ndarray] = {}
     total = offset + sum(element.count * element.dtype.itemsize for element in elements)
     if total > size or any(element.list_column for element in elements):
-        raise InvalidSplats(
-            str(path), expected=f"{total} bytes, as its header says", got=f"{size}",
-            hint="the file is truncated, or not of this format: export it again",
-        )  # fmt: skip
+        raise ValueError(f"{total} bytes as its header says, got {size}")
     tail = size - total - padding_bytes(path, size, size - total)
     for element in elements:
         table = np.memmap(path, np.uint8, "r", 0)[offset : offset + element.count * element.dtype.itemsize]
         tables[element.name] = table.view(element.dtype)
         offset += element.count * element.dtype.itemsize
-    chunks, vertices, harmonics = _check_tables(tables, path)
+    chunks, vertices, harmonics = _check_tables(tables)
     higher = 0 if harmonics is None or not colour else len(harmonics.dtype.names or ()) // 3
 
     def decode(rows: slice) -> Fields:
@@ -74,29 +66,28 @@ def read_compressed_ply(path: Path, *, colour: bool = True) -> Fields:
     return fields | {"render_mode": mode, "warnings": (*warnings, *tail_warnings(tail))}
 
 
-def _check_tables(tables: dict[str, np.ndarray], path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+def _check_tables(tables: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Check the columns of the format, and return the tables of chunks, vertices and harmonics."""
     ends = [f"{end}_{name}" for end in ("min", "max") for name in (*AXES, *(f"scale_{axis}" for axis in AXES))]
     colours = [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
     chunks, vertices, harmonics = (tables.get(name) for name in ("chunk", "vertex", "sh"))
     if chunks is None or vertices is None or not len(vertices):
-        raise InvalidSplats(str(path), expected="at least one splat in chunks", got="an empty scene", hint=EXPORT)
+        raise ValueError("at least one splat in chunks, got an empty scene")
     names = set(chunks.dtype.names or ())
     required = {"chunk": [*ends, *(colours if names.intersection(colours) else [])], "vertex": PACKED}
     for element, code in (("chunk", "<f4"), ("vertex", "<u4")):
         for name in required[element]:
             if name not in (tables[element].dtype.names or ()) or tables[element].dtype[name] != code:
                 kind = "float" if code == "<f4" else "uint"
-                raise InvalidSplats(str(path), expected=f"the {kind} {name!r} of the element {element!r}", got="none")
+                raise ValueError(f"the {kind} {name!r} of the element {element!r}, got none")
     if len(chunks) != -(-len(vertices) // CHUNK_ROWS):
-        expected, got = f"a chunk for {CHUNK_ROWS} splats", f"{len(chunks)} for {len(vertices)}"
-        raise InvalidSplats(str(path), expected=expected, got=got)
+        raise ValueError(f"a chunk for {CHUNK_ROWS} splats, got {len(chunks)} for {len(vertices)}")
     if harmonics is not None:
         columns = harmonics.dtype.names or ()
         complete = {f"f_rest_{i}" for i in range(len(columns))} == set(columns) and len(columns) in SH_COLUMNS
         if not complete or len(harmonics) != len(vertices) or any(harmonics.dtype[name] != "u1" for name in columns):
             expected = f"{' or '.join(map(str, SH_COLUMNS))} uchar f_rest_* of each splat in the element 'sh'"
-            raise InvalidSplats(str(path), expected=expected, got=f"{len(columns)} of {len(harmonics)} splats")
+            raise ValueError(f"{expected}, got {len(columns)} of {len(harmonics)} splats")
     return chunks, vertices, harmonics
 
 

@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from liftcore.errors import InvalidInput, InvalidSplats
+from liftcore.errors import InvalidInput
 from liftcore.io.files import open_regular
 from liftcore.io.labels import COLUMN, IDS
 from liftcore.io.ply import MODEL
@@ -54,7 +54,6 @@ RENDER_MODE = "SplatRenderMode"
 WORLD, LABELS = "splatlift_world", "splatlift_labels"  # of asset.extras
 METRES = UPRIGHT.model_copy(update={"metres_per_unit": 1.0})  # of a file without ``WORLD``
 SRGB = "srgb_rec709_display"
-HINT = "export it again, or as PLY"
 
 
 def read_gltf(path: Path, *, colour: bool = True) -> Fields:
@@ -62,10 +61,6 @@ def read_gltf(path: Path, *, colour: bool = True) -> Fields:
 
     Feature ids come as ``instance_id`` and ``class_id`` with 0 for none, other attributes with an underscore by their
     names, in lower case.
-
-    Raises:
-        InvalidSplats: the file is malformed, has no splats, another kernel or compressed ones, or refers to other
-            files; or a node has a scale for each axis.
     """
     asset = _Asset(path)
     parts = [asset.fields(matrix, primitive, colour=colour) for matrix, primitive in asset.splats()]
@@ -76,23 +71,22 @@ def _hint_of(extension: str) -> str:
     """Return the advice for a file that needs an extension that is not read."""
     if "spz" in extension.lower():
         return "export its splats as .spz, which is read, as .ply, or as .glb without compression"
-    return HINT
+    return ""
 
 
 class _Asset:
     """An open file: its JSON, and its bytes as they lie in the file."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
         with open_regular(path) as handle:
             head = handle.read(20)
         self.size = path.stat().st_size
         if head[:4] == MAGIC:
             if len(head) < 20 or head[16:20] != JSON_CHUNK or struct.unpack_from("<I", head, 4)[0] != 2:
-                raise self._broken("a glTF 2.0 file that begins with JSON", repr(head[4:20]))
+                raise _broken("a glTF 2.0 file that begins with JSON", repr(head[4:20]))
             length = struct.unpack_from("<I", head, 12)[0]
             if length > min(MAX_JSON_BYTES, self.size - 20):
-                raise self._broken(f"at most {MAX_JSON_BYTES} bytes of JSON in the file", str(length))
+                raise _broken(f"at most {MAX_JSON_BYTES} bytes of JSON in the file", str(length))
             content = np.memmap(path, np.uint8, "r")
             text, offset = content[20 : 20 + length].tobytes(), 20 + length
             self.binary = content[:0]
@@ -101,20 +95,20 @@ class _Asset:
                 self.binary = content[offset + 8 : offset + 8 + binary_length]
         else:
             if self.size > MAX_JSON_BYTES:
-                raise self._broken(f"at most {MAX_JSON_BYTES} bytes of JSON", str(self.size), "make a .glb of it")
+                raise _broken(f"at most {MAX_JSON_BYTES} bytes of JSON", str(self.size), "make a .glb of it")
             text, self.binary = path.read_bytes(), np.empty(0, np.uint8)
         try:
             self.json: Any = json.loads(text)
         except (ValueError, RecursionError) as error:
-            raise self._broken("JSON", str(error)[:120]) from None
+            raise _broken("JSON", str(error)[:120]) from None
         if not isinstance(self.json, dict):
-            raise self._broken("a JSON object", repr(self.json)[:40])
+            raise _broken("a JSON object", repr(self.json)[:40])
         unsupported = [
             name for name in map(str, self._list(self.json, "extensionsRequired")) if name not in SUPPORTED_EXTENSIONS
         ]
         if unsupported:
             got = f"one that requires {unsupported[0][:80]}"
-            raise self._broken("a file without other required extensions", got, _hint_of(unsupported[0]))
+            raise _broken("a file without other required extensions", got, _hint_of(unsupported[0]))
         self._buffers: dict[int, np.ndarray] = {}
         asset = self.json.get("asset")
         extras = asset.get("extras") if isinstance(asset, dict) else None
@@ -142,7 +136,7 @@ class _Asset:
             node = self._at(nodes, place, "node")
             if place in visited or max(len(visited), len(primitives)) >= MAX_NODES:
                 got = "one that meets a node twice, or has more nodes"
-                raise self._broken(f"a tree of at most {MAX_NODES} nodes with splats", got)
+                raise _broken(f"a tree of at most {MAX_NODES} nodes with splats", got)
             visited.add(place)
             matrix = above @ self._matrix(node, place) if TRANSFORM & node.keys() else above
             queue += [(child, matrix) for child in reversed(self._list(node, "children"))]
@@ -150,10 +144,10 @@ class _Asset:
                 mesh = self._at(meshes, node["mesh"], "mesh")
                 primitives += [(matrix, item) for item in self._list(mesh, "primitives") if _is_of_splats(item)]
         if not primitives:
-            raise InvalidSplats(str(self.path), expected=f"splats ({EXTENSION})", got="a glTF model without any")
+            raise _broken(f"splats ({EXTENSION})", "a glTF model without any")
         total = sum(self._count(primitive) for _, primitive in primitives)
         if not 0 < total * SPLAT_BYTES <= MOST_GROWTH * self.size:
-            raise self._broken("as many splats as the file's size can be of", str(total))
+            raise _broken("as many splats as the file's size can be of", str(total))
         return primitives
 
     def fields(self, matrix: np.ndarray, primitive: dict[str, Any], *, colour: bool) -> Fields:
@@ -164,8 +158,7 @@ class _Asset:
             move = Similarity.of(matrix)
         except InvalidInput as error:
             hint = "apply the node's transform to its splats in the program that made it"
-            argument = f"{self.path} transform of a node"
-            raise InvalidSplats(argument, expected=error.expected, got=error.got, hint=hint) from None
+            raise _broken(f"a node's transform of {error.expected}", error.got, hint) from None
         rotation = TO_FILE @ move.rotation
 
         def read(name: str, width: int) -> np.ndarray:
@@ -205,7 +198,7 @@ class _Asset:
     def _extras(self, primitive: dict[str, Any], count: int) -> dict[str, np.ndarray]:
         attributes = primitive["attributes"]
         if len(attributes) > MAX_ATTRIBUTES:
-            raise self._broken(f"at most {MAX_ATTRIBUTES} attributes", str(len(attributes)))
+            raise _broken(f"at most {MAX_ATTRIBUTES} attributes", str(len(attributes)))
         extras = {}
         for name, feature_set in self._feature_sets(primitive).items():
             ids = self._attribute(attributes, f"_FEATURE_ID_{feature_set['attribute']}", 1, count)[:, 0].astype(
@@ -258,10 +251,7 @@ class _Asset:
         if primitive.get("mode") != 0 or "indices" in primitive:
             unsupported = unsupported or "a primitive that is no list of points"
         if unsupported:
-            raise InvalidSplats(
-                str(self.path), expected="plain splats with the kernel 'ellipse'", got=unsupported[:100],
-                hint=_hint_of(compressed or ""),
-            )  # fmt: skip
+            raise _broken("plain splats with the kernel 'ellipse'", unsupported[:100], _hint_of(compressed or ""))
         space = kind.get("colorSpace")
         return () if space == SRGB else (f"colours are of {str(space)[:60]!r}, and are taken for sRGB",)
 
@@ -277,15 +267,15 @@ class _Asset:
             and accessor.get("count") == count
         )
         if code is None or not fits or "sparse" in accessor or "bufferView" not in accessor:
-            raise self._broken(f"{count} rows of {width} plain numbers as {name}", repr(accessor)[:80])
+            raise _broken(f"{count} rows of {width} plain numbers as {name}", repr(accessor)[:80])
         content = self._view(accessor["bufferView"])
         view = self._at(self._list(self.json, "bufferViews"), accessor["bufferView"], "buffer view")
         size = width * np.dtype(code).itemsize
         stride, first = view.get("byteStride", size), accessor.get("byteOffset", 0)
         if type(stride) is not int or type(first) is not int or stride < size or first < 0:
-            raise self._broken(f"rows of {size} bytes or more as {name}", f"{stride!r} from {first!r}"[:40])
+            raise _broken(f"rows of {size} bytes or more as {name}", f"{stride!r} from {first!r}"[:40])
         if first + (count - 1) * stride + size > len(content):
-            raise self._broken(f"{count} rows of {name} in the file", f"{len(content)} bytes")
+            raise _broken(f"{count} rows of {name} in the file", f"{len(content)} bytes")
         rows = np.lib.stride_tricks.as_strided(content[first:], (count, size), (stride, 1))
         values = np.ascontiguousarray(rows).view(code)
         if normalized and values.dtype.kind in "iu":
@@ -298,7 +288,7 @@ class _Asset:
         first, size, buffer = view.get("byteOffset", 0), view.get("byteLength"), view.get("buffer")
         content = self._buffer(buffer)
         if type(first) is not int or type(size) is not int or first < 0 or size < 0 or first + size > len(content):
-            raise self._broken("a buffer view that lies in the file", f"{size!r} bytes from {first!r}"[:60])
+            raise _broken("a buffer view that lies in the file", f"{size!r} bytes from {first!r}"[:60])
         return content[first : first + size]
 
     def _buffer(self, place: Any) -> np.ndarray:
@@ -308,23 +298,23 @@ class _Asset:
             return self.binary
         if not isinstance(uri, str) or not uri.startswith("data:") or ";base64," not in uri[:200]:
             got = f"a buffer in {str(uri)[:60]!r}"
-            raise self._broken("buffers within the file", got, "make one .glb of it, with its buffers")
+            raise _broken("buffers within the file", got, "make one .glb of it, with its buffers")
         if place not in self._buffers:
             try:
                 content = base64.b64decode(uri.partition(";base64,")[2], validate=True)
             except (binascii.Error, ValueError) as error:
-                raise self._broken("base64 as a buffer", str(error)[:60]) from None
+                raise _broken("base64 as a buffer", str(error)[:60]) from None
             self._buffers[place] = np.frombuffer(content, np.uint8)
         return self._buffers[place]
 
     def _count(self, primitive: dict[str, Any]) -> int:
         attributes = primitive.get("attributes")
         if not isinstance(attributes, dict):
-            raise self._broken("attributes of a primitive", repr(attributes)[:40])
+            raise _broken("attributes of a primitive", repr(attributes)[:40])
         accessor = self._at(self._list(self.json, "accessors"), attributes.get("POSITION"), "accessor of POSITION")
         count = accessor.get("count")
         if type(count) is not int or count < 1:
-            raise self._broken("a number of splats", repr(count)[:40])
+            raise _broken("a number of splats", repr(count)[:40])
         return count
 
     def _matrix(self, node: dict[str, Any], place: Any) -> np.ndarray:
@@ -337,7 +327,7 @@ class _Asset:
             matrix[:3, 3] = node.get("translation", (0, 0, 0))
             return matrix
         except (TypeError, ValueError, OverflowError):
-            raise self._broken("a transform of numbers", f"that of node {place}") from None
+            raise _broken("a transform of numbers", f"that of node {place}") from None
 
     def _extension(self, owner: dict[str, Any], name: str) -> dict[str, Any]:
         extensions = owner.get("extensions")
@@ -347,25 +337,24 @@ class _Asset:
     def _list(self, owner: Any, key: str) -> list[Any]:
         values = owner.get(key, []) if isinstance(owner, dict) else None
         if not isinstance(values, list):
-            raise self._broken(f"a list of {key}", repr(values)[:40])
+            raise _broken(f"a list of {key}", repr(values)[:40])
         return values
 
     def _at(self, values: list[Any], place: Any, noun: str) -> dict[str, Any]:
         if type(place) is not int or not 0 <= place < len(values) or not isinstance(values[place], dict):
-            raise self._broken(f"a {noun}", f"the number {place!r}"[:60])
+            raise _broken(f"a {noun}", f"the number {place!r}"[:60])
         item: dict[str, Any] = values[place]
         return item
 
     def _at_key(self, owner: Any, key: Any) -> dict[str, Any]:
         value = owner.get(key) if isinstance(owner, dict) and isinstance(key, str) else None
         if not isinstance(value, dict):
-            raise self._broken(f"{str(key)[:40]!r} as an object", repr(value)[:40])
+            raise _broken(f"{str(key)[:40]!r} as an object", repr(value)[:40])
         return value
 
-    def _broken(
-        self, expected: str, got: str, hint: str = f"the file is truncated or damaged: {HINT}"
-    ) -> InvalidSplats:
-        return InvalidSplats(str(self.path), expected=expected, got=got, hint=hint)
+
+def _broken(expected: str, got: str, hint: str = "") -> ValueError:
+    return ValueError(f"{expected}, got {got}" + (f"; {hint}" if hint else ""))
 
 
 def _is_of_splats(primitive: Any) -> bool:

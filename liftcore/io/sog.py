@@ -10,8 +10,10 @@ ours are the file's.
 
 import io
 import json
+import lzma
 import warnings
 import zipfile
+import zlib
 from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -19,8 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from liftcore.errors import InvalidSplats
-from liftcore.io.files import BROKEN_ZIP, open_regular, open_zip
+from liftcore.io.files import open_regular, open_zip
 from liftcore.io.quantised import MOST_GROWTH, Fields, decoded, field_shapes, logits, smallest_three
 from liftcore.scene.render_mode import mode_of_word
 
@@ -35,37 +36,17 @@ HINT = "export it again with SuperSplat or splat-transform, or as PLY"
 
 
 def read_sog(path: Path, *, colour: bool = True) -> Fields:
-    """Read the fields of a ``.sog`` file, of an unpacked folder, or of the ``meta.json`` in one.
-
-    Raises:
-        InvalidSplats: the file is malformed, of another version, or has more splats than its size can be of.
-    """
+    """Read the fields of a ``.sog`` file, of an unpacked folder, or of the ``meta.json`` in one."""
+    if not is_bundled(path):
+        meta, folder = _meta_of(path), _meta_of(path).parent
+        size = sum(file.stat().st_size for file in sog_files(path))
+        return _Pictures(_in_folder(folder), meta.name, size).fields(colour=colour)
     try:
-        if not is_bundled(path):
-            meta, folder = _meta_of(path), _meta_of(path).parent
-            size = sum(file.stat().st_size for file in sog_files(path))
-            return decode_sog(_in_folder(folder), path, size, meta=meta.name, colour=colour)
         with open_zip(path) as archive:
-            prefix = sog_folder(archive.namelist()) or ""
-            return decode_sog(partial(read_in_archive, archive, prefix), path, path.stat().st_size, colour=colour)
-    except BROKEN_ZIP as error:
-        got = f"one that does not open ({str(error)[:120]})"
-        raise InvalidSplats(str(path), expected="a .sog file", got=got, hint=HINT) from None
-
-
-def decode_sog(
-    read_member: Callable[[str, int], bytes | None], path: Path, size: int, *, meta: str = META, colour: bool = True
-) -> Fields:
-    """Decode the fields of a SOG whose files are read one by one.
-
-    Args:
-        read_member: name, limit in bytes -> first bytes of that file; None if it does not exist. path: for errors.
-        size: bytes of all files as they are stored. meta: the name of its description.
-
-    Raises:
-        InvalidSplats: it is malformed, of another version, or has more splats than its size can be of.
-    """
-    return _Pictures(read_member, meta, path, size).fields(colour=colour)
+            member = partial(_read_in_archive, archive, sog_folder(archive.namelist()) or "")
+            return _Pictures(member, META, path.stat().st_size).fields(colour=colour)
+    except (zipfile.BadZipFile, zlib.error, lzma.LZMAError, NotImplementedError, RuntimeError) as error:
+        raise _broken("a .sog file", f"one that does not open ({error})") from None
 
 
 def is_sog_document(document: Any) -> bool:
@@ -129,7 +110,7 @@ def _in_folder(folder: Path) -> Callable[[str, int], bytes | None]:
     return read
 
 
-def read_in_archive(archive: zipfile.ZipFile, prefix: str, name: str, limit: int) -> bytes | None:
+def _read_in_archive(archive: zipfile.ZipFile, prefix: str, name: str, limit: int) -> bytes | None:
     """Return the first bytes of a member of an archive, below a folder with a slash; None where there is none."""
     try:
         with archive.open(prefix + name) as member:
@@ -143,24 +124,25 @@ class _Pictures:
 
     Args:
         read_member: name, limit in bytes -> the first bytes of that member; None if it does not exist. meta: the name
-        of its description. path: for errors. size: bytes of all members as they are stored.
+        of its description. size: bytes of all members as they are stored.
     """
 
-    def __init__(self, read_member: Callable[[str, int], bytes | None], meta: str, path: Path, size: int) -> None:
-        self.read_member, self.path, self.size = read_member, path, size
+    def __init__(self, read_member: Callable[[str, int], bytes | None], meta: str, size: int) -> None:
+        self.read_member, self.size = read_member, size
+        document = self._member(meta, MAX_META_BYTES)
         try:
-            self.meta: Any = json.loads(self._member(meta, MAX_META_BYTES))
+            self.meta: Any = json.loads(document)
         except (ValueError, RecursionError) as error:
-            raise self._error(f"{META} as JSON", str(error)[:120]) from None
+            raise _broken(f"{META} as JSON", str(error)[:120]) from None
         version = self.meta.get("version") if isinstance(self.meta, dict) else None
         if version != 2:
-            raise self._error("version 2", repr(version)[:60])
+            raise _broken("version 2", repr(version)[:60])
         count = self.meta.get("count")
         bands = self.meta["shN"].get("bands") if isinstance(self.meta.get("shN"), dict) else 0
         higher = SH_ROWS[bands] if bands in (1, 2, 3) else 0
         row_bytes = FIELD_BYTES + TERM_BYTES * (1 + higher)
         if type(count) is not int or not 0 < count * row_bytes <= MOST_GROWTH * self.size:
-            raise self._error("a count of splats that the file's size can be of", repr(count)[:60])
+            raise _broken("a count of splats that the file's size can be of", repr(count)[:60])
         self.count: int = count  # P
 
     def fields(self, *, colour: bool) -> Fields:
@@ -199,22 +181,22 @@ class _Pictures:
         """Return the palette [n, K - 1, 3], and each splat's row in it [P]."""
         bands, count = (self._part("shN").get(key) for key in ("bands", "count"))
         if bands not in (1, 2, 3) or type(count) is not int or not 0 < count <= MAX_PALETTE:
-            raise self._error(f"1 to 3 bands and a palette of at most {MAX_PALETTE}", f"{bands} and {count}"[:60])
+            raise _broken(f"1 to 3 bands and a palette of at most {MAX_PALETTE}", f"{bands} and {count}"[:60])
         book, higher = self._numbers("shN", "codebook", 256), SH_ROWS[bands]
         picture = self._picture("shN", 0, -(-count // PALETTE_COLUMNS) * PALETTE_COLUMNS * higher)
         if picture.shape[1] != PALETTE_COLUMNS * higher:
-            raise self._error(f"a palette {PALETTE_COLUMNS * higher} pixels wide", f"{picture.shape[1]}")
+            raise _broken(f"a palette {PALETTE_COLUMNS * higher} pixels wide", f"{picture.shape[1]}")
         palette = book[picture[..., :3]].reshape(-1, higher, 3)[:count]
         bits = self._pixels("shN", 1).astype(np.int64)
         labels = bits[:, 0] | bits[:, 1] << 8
         if labels.max() >= count:
-            raise self._error(f"labels below {count}", f"the label {labels.max()}")
+            raise _broken(f"labels below {count}", f"the label {labels.max()}")
         return palette, labels
 
     def _part(self, name: str) -> dict[str, Any]:
         part = self.meta.get(name)
         if not isinstance(part, dict):
-            raise self._error(f"{name!r} in {META}", "none")
+            raise _broken(f"{name!r} in {META}", "none")
         return part
 
     def _numbers(self, part: str, key: str, count: int) -> np.ndarray:
@@ -224,7 +206,7 @@ class _Pictures:
         except (TypeError, ValueError, OverflowError):
             numbers = np.empty(0)
         if numbers.shape != (count,) or not np.abs(numbers).max() <= MAX_TERM:
-            raise self._error(f"{count} finite numbers as {key!r} of {part!r}", repr(values)[:60])
+            raise _broken(f"{count} finite numbers as {key!r} of {part!r}", repr(values)[:60])
         return numbers
 
     def _pixels(self, part: str, index: int) -> np.ndarray:
@@ -237,26 +219,27 @@ class _Pictures:
 
         names = self._part(part).get("files")
         if not isinstance(names, list) or len(names) <= index or not isinstance(names[index], str):
-            raise self._error(f"{index + 1} files of {part!r} in {META}", repr(names)[:60])
+            raise _broken(f"{index + 1} files of {part!r} in {META}", repr(names)[:60])
         content = self._member(names[index], self.size)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", Image.DecompressionBombWarning)
                 with Image.open(io.BytesIO(content), formats=["WEBP"]) as picture:
                     pixels = picture.width * picture.height
-                    if not least <= pixels <= 2 * least + (1 << 16):
-                        raise self._error(f"{least} pixels in {names[index]!r}", f"{pixels}")
-                    return np.asarray(picture.convert("RGBA"))
+                    if least <= pixels <= 2 * least + (1 << 16):
+                        return np.asarray(picture.convert("RGBA"))
         except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
-            raise self._error(f"a WebP picture as {names[index]!r}", str(error)[:120]) from None
+            raise _broken(f"a WebP picture as {names[index]!r}", str(error)[:120]) from None
+        raise _broken(f"{least} pixels in {names[index]!r}", f"{pixels}")
 
     def _member(self, name: str, limit: int) -> bytes:
         content = self.read_member(name, limit + 1) if PurePosixPath(name).name == name else None
         if content is None:
-            raise self._error(f"{name!r} beside {META}", "none")
+            raise _broken(f"{name!r} beside {META}", "none")
         if len(content) > limit:
-            raise self._error(f"at most {limit} bytes of {name!r}", "more")
+            raise _broken(f"at most {limit} bytes of {name!r}", "more")
         return content
 
-    def _error(self, expected: str, got: str) -> InvalidSplats:
-        return InvalidSplats(str(self.path), expected=expected, got=got, hint=HINT)
+
+def _broken(expected: str, got: str) -> ValueError:
+    return ValueError(f"{expected}, got {got}; {HINT}")

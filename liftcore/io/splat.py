@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from liftcore.errors import InvalidSplats
 from liftcore.io.quantised import Fields, decoded, field_shapes, gaussian_rows, logits
 from liftcore.scene.harmonics import constant_terms
 
@@ -37,15 +36,10 @@ def looks_like_splat(head: bytes, size: int) -> bool:
 
 
 def read_splat(path: Path, *, colour: bool = True) -> Fields:
-    """Read the fields of a ``.splat`` file.
-
-    Raises:
-        InvalidSplats: it has no rows, or ends within one.
-    """
+    """Read the fields of a ``.splat`` file."""
     size = path.stat().st_size
     if not size or size % ROW.itemsize:
-        got, hint = f"{size} bytes", "the file is truncated, or none of this format: export it again"
-        raise InvalidSplats(str(path), expected=f"rows of {ROW.itemsize} bytes", got=got, hint=hint)
+        raise ValueError(f"rows of {ROW.itemsize} bytes, got {size} bytes")
     table = np.memmap(path, ROW, "r")
 
     def decode(rows: slice) -> Fields:

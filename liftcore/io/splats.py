@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liftcore.errors import InvalidSplats
+from liftcore.errors import InvalidSplats, reading
 from liftcore.io import ply
 from liftcore.io.checkpoint import read_checkpoint
 from liftcore.io.compressed_ply import read_compressed_ply
@@ -134,11 +134,7 @@ def write_splats(path: Path | str, splats: Splats, columns: Mapping[str, Any] | 
 
 
 def _column(name: Any, values: Any, count: int) -> Tensor:
-    """Convert values to a column [P] of a type that PLY has.
-
-    Raises:
-        InvalidSplats: the name or the values are none of a column.
-    """
+    """Convert values to a column [P] of a type that PLY has."""
     import torch
 
     from liftcore.scene.splats import shared_tensor
@@ -168,20 +164,12 @@ def _column(name: Any, values: Any, count: int) -> Tensor:
 
 
 def blocks_as(splats: Splats, suffix: str) -> Iterator[bytes]:
-    """Encode splats in the format of a suffix, in blocks, with their layout and header where the format has these.
-
-    Raises:
-        InvalidSplats: the format is not written.
-    """
+    """Encode splats in the format of a suffix, in blocks, with their layout and header where the format has these."""
     return _writer_of(suffix, "suffix")(splats, None)
 
 
 def _writer_of(suffix: str, argument: str) -> Callable[[Splats, Document | None], Iterator[bytes]]:
-    """Return the writer of files with this suffix.
-
-    Raises:
-        InvalidSplats: there is none.
-    """
+    """Return the writer of files with this suffix."""
     if suffix not in _WRITERS:
         hint = "write a .ply, and convert it: npx @playcanvas/splat-transform IN.ply OUT"
         expected = f"one of {', '.join(_WRITERS)}"
@@ -194,16 +182,11 @@ def read_places(path: Path, kernel: Kernel | str = "auto") -> np.ndarray:
 
     Only checkpoints and scenes in map coordinates need torch, which takes a second to import. Means that
     are not finite become the first finite one.
-
-    Raises:
-        InvalidSplats: the file is of no format of splats.
     """
     splat_format = format_of(path)
-    places = (
-        ply.read_places(path)
-        if splat_format is SplatFormat.PLY
-        else _READERS[splat_format](path, colour=False)["means"]
-    )
+    with _naming(path):
+        is_ply = splat_format is SplatFormat.PLY
+        places = ply.read_places(path) if is_ply else _READERS[splat_format](path, colour=False)["means"]
     if lies_apart(places):
         return read_splats(path, kernel, colour=False).positions()
     with np.errstate(over="ignore"):
@@ -215,11 +198,7 @@ def read_places(path: Path, kernel: Kernel | str = "auto") -> np.ndarray:
 
 
 def format_of(path: Path) -> SplatFormat:
-    """Return the format of a file, by its content.
-
-    Raises:
-        InvalidSplats: it is of none; the error names its kind if it is recognised.
-    """
+    """Return the format of a file, by its content."""
     identified = identify(path)
     if identified.format is not None:
         return identified.format
@@ -246,20 +225,12 @@ def quick_count(path: Path) -> int | None:
 
 
 def splat_files(path: Path) -> list[Path]:
-    """Return the files that splats are read from: one, or the several of a SOG that is not bundled.
-
-    Raises:
-        OSError: there is none.
-    """
+    """Return the files that splats are read from: one, or the several of a SOG that is not bundled."""
     return sog_files(path) if format_of(path) is SplatFormat.SOG and not is_bundled(path) else [path]
 
 
 def require_kernel(path: Path, kernel: Kernel, source: str) -> None:
-    """Refuse a kernel that a file lacks a property of, by its header alone.
-
-    Raises:
-        InvalidSplats: it does; ``source`` is named.
-    """
+    """Refuse a kernel that a file lacks a property of, by its header alone."""
     splat_format = format_of(path)
     if splat_format is SplatFormat.PLY:
         ply.model_slots(ply.read_header(path).names, kernel, source)
@@ -277,9 +248,6 @@ def some_rows(path: Path, mask: np.ndarray, suffix: str = ".ply", world: WorldFr
     Args:
         path: the file. mask: [P] bool, the rows to keep. suffix: of the output.
         world: of its splats; None: the file's.
-
-    Raises:
-        InvalidSplats: the file is malformed, or has another number of splats.
     """
     write = _writer_of(suffix, "suffix")
     if suffix == ".ply" and format_of(path) is SplatFormat.PLY:
@@ -298,9 +266,6 @@ def labelled(path: Path, labels: Labels, suffix: str = ".ply", mask: np.ndarray 
         path: the file. labels: of its splats; columns that it has are replaced. suffix: of what is written.
             The document's ``world`` is that of the splats.
         mask: [P] bool, the rows to keep; None: all.
-
-    Raises:
-        InvalidSplats: the file is malformed or has another number of splats, or the format holds no columns.
     """
     write = _writer_of(suffix, "suffix")
     if suffix not in WITH_COLUMNS:
@@ -326,9 +291,6 @@ def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
 
     Args:
         path: the file. colours: [P, 3] u8 sRGB.
-
-    Raises:
-        InvalidSplats: the file is malformed, has another number of splats, or is a PLY that holds no colours.
     """
     terms = constant_terms(colours / 255).astype(np.float32)
     if format_of(path) is SplatFormat.PLY:
@@ -345,9 +307,10 @@ def _of_count(path: Path, count: int, *, colour: bool = True) -> Splats:
 
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
-    """Name the file in what the splats themselves find wrong."""
+    """Name the file in what its reader, or the splats themselves, find wrong."""
     try:
-        yield
+        with reading(path, InvalidSplats, EXPECTED, "the file is truncated or damaged: export it again, or as PLY"):
+            yield
     except InvalidSplats as error:
         if str(path) in error.argument:
             raise

@@ -6,7 +6,7 @@ magnitude, behind two bits for the largest of x y z w) and higher harmonics u8, 
 3 all is one gzip stream with a header of 16 bytes. Version 4 has a plain header of 32, then extensions, then the
 sizes of the sections' zstd streams, then these.
 
-The frame is right, up, back (RUB) unless an extension declares another of 16. PLYs and cameras are in right, down,
+The frame is right, up, back (RUB) unless an extension declares another of 8. PLYs and cameras are in right, down,
 front (RDF): axes are turned, and quaternions and harmonics with them. A flag records that the splats were trained
 antialiased. The format is of nianticlabs/spz. What is written has version 3, which every reader knows.
 """
@@ -33,7 +33,7 @@ from liftcore.io.quantised import (
     logits,
     smallest_three,
 )
-from liftcore.scene.harmonics import SH_C0, band_rotation
+from liftcore.scene.harmonics import SH_C0
 from liftcore.scene.render_mode import RenderMode, RenderModel
 
 if TYPE_CHECKING:
@@ -50,32 +50,13 @@ MAX_FRACTIONAL_BITS = 24
 COLOUR_SCALE = 0.15  # of the constant term
 FRAME_EXTENSION = 0xADBE0003
 # Frames as spz numbers them, by what x, y and z point to: left or right, down or up, back or front.
-FRAMES = (
-    "LDB",
-    "RDB",
-    "LUB",
-    "RUB",
-    "LDF",
-    "RDF",
-    "LUF",
-    "RUF",
-    "LFD",
-    "RFD",
-    "LFU",
-    "RFU",
-    "LBD",
-    "RBD",
-    "LBU",
-    "RBU",
-)
-RUB, RDF = FRAMES.index("RUB") + 1, FRAMES.index("RDF") + 1
+FRAMES = ("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF")
+RUB = FRAMES.index("RUB") + 1
 ANTIALIASED, HAS_EXTENSIONS = 0x1, 0x2  # flags
 FLAG = "the flag 'antialiased' of the .spz"
-QUARTER_TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # about x: y to z
 WRITTEN_VERSION, WRITTEN_DEGREE = 3, 3  # and the highest degree of harmonics, as of 3DGS
 WRITTEN_BITS = 20  # fractional bits of means at most: a millionth of a scene unit
 LARGEST_MEAN = (1 << 23) - 1  # of 24 bits with their sign
-HINT = "export it again, or as PLY"
 # Which axes' signs change a harmonic of degree 1 to 4; the last as the library has it that writes these files.
 SH_AXES = (
     *("y", "z", "x"),
@@ -96,29 +77,24 @@ def begins_like_spz(head: bytes) -> bool:
 
 
 def read_spz(path: Path, *, colour: bool = True) -> Fields:
-    """Return the fields of an ``.spz`` file, in the frame of PLYs and cameras.
-
-    Raises:
-        InvalidSplats: the file is malformed, of a later version, or has more splats than its size can be of.
-    """
+    """Return the fields of an ``.spz`` file, in the frame of PLYs and cameras."""
     content = path.read_bytes()
     is_plain, unpacking = content[:4] == MAGIC, zlib.decompressobj(31)
-    start = content[:STREAMS_HEADER_BYTES] if is_plain else _inflate(unpacking, content, HEADER_BYTES, path)
-    version, count, degree, bits, flags, streams = _header(start, path)
+    start = content[:STREAMS_HEADER_BYTES] if is_plain else _inflate(unpacking, content, HEADER_BYTES)
+    version, count, degree, bits, flags, streams = _header(start)
     if is_plain != (version >= 4):
-        raise _broken(path, "gzip for versions 1 to 3 and a plain header for 4", f"the other for {version}")
+        raise ValueError(f"gzip for versions 1 to 3 and a plain header for 4, got the other for {version}")
     sizes = _section_bytes(version, count, degree)
     if sum(sizes) > MOST_GROWTH * len(content):
-        got = f"{count} in {len(content)} bytes"
-        raise InvalidSplats(str(path), expected="as many splats as the file's size can be of", got=got, hint=HINT)
+        raise ValueError(f"as many splats as the file's size can be of, got {count} in {len(content)} bytes")
     if is_plain:
         (table,) = struct.unpack_from("<I", start, HEADER_BYTES)
         zone = content[STREAMS_HEADER_BYTES : max(table, STREAMS_HEADER_BYTES)]
-        frame, sections = _declared_frame(zone, path), _streams(content, table, streams, sizes, path)
+        frame, sections = _declared_frame(zone), _streams(content, table, streams, sizes)
     else:
-        body = np.frombuffer(_inflate(unpacking, unpacking.unconsumed_tail, sum(sizes), path), np.uint8)
-        behind = _inflate(unpacking, unpacking.unconsumed_tail, 0, path)
-        frame = _declared_frame(behind, path) if flags & HAS_EXTENSIONS else RUB
+        body = np.frombuffer(_inflate(unpacking, unpacking.unconsumed_tail, sum(sizes)), np.uint8)
+        behind = _inflate(unpacking, unpacking.unconsumed_tail, 0)
+        frame = _declared_frame(behind) if flags & HAS_EXTENSIONS else RUB
         sections = np.split(body, np.cumsum(sizes)[:-1])
     fields = _decode(sections, version, degree if colour else 0, 2.0**-bits, frame, colour=colour)
     fields["render_mode"] = RenderMode(RenderModel.ANTIALIASED, FLAG) if flags & ANTIALIASED else None
@@ -129,9 +105,6 @@ def spz_blocks(splats: Splats) -> Iterator[bytes]:
     """Yield the bytes of an ``.spz`` file of any splats (`gaussian_rows`), in blocks, in the format's frame.
 
     Means have as many fractional bits as their reach leaves, 20 at most. Harmonics above degree 3 are left out.
-
-    Raises:
-        InvalidSplats: a mean lies beyond what 24 bits reach.
     """
     reach = float(splats.means.abs().amax())
     bits = int(np.clip(np.floor(np.log2(LARGEST_MEAN / max(reach, 1e-9))), 0, WRITTEN_BITS))
@@ -183,19 +156,19 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
     return (largest.astype(np.uint32) << 30 | words[:, 0] << 20 | words[:, 1] << 10 | words[:, 2]).astype("<u4")
 
 
-def _header(start: bytes, path: Path) -> tuple[int, int, int, int, int, int]:
+def _header(start: bytes) -> tuple[int, int, int, int, int, int]:
     """Version, number of splats, degree of the harmonics, fractional bits of means, flags, number of streams."""
     if len(start) < HEADER_BYTES or (start[4:8] == b"\4\0\0\0" and len(start) < STREAMS_HEADER_BYTES):
-        raise _broken(path, "a whole header", f"{len(start)} bytes")
+        raise ValueError(f"a whole header, got {len(start)} bytes")
     magic, version, count, degree, bits, flags, streams = struct.unpack_from(HEADER, start)
     if magic != MAGIC or version not in VERSIONS:
         got = f"version {version}" if magic == MAGIC else repr(magic)
-        raise InvalidSplats(str(path), expected="an .spz of version 1 to 4", got=got, hint=HINT)
+        raise ValueError(f"an .spz of version 1 to 4, got {got}")
     if degree > MAX_DEGREE or (version > 1 and not 1 <= bits <= MAX_FRACTIONAL_BITS):
         expected = f"harmonics of degree 0..{MAX_DEGREE} and 1..{MAX_FRACTIONAL_BITS} fractional bits"
-        raise _broken(path, expected, f"{degree} and {bits}")
+        raise ValueError(f"{expected}, got {degree} and {bits}")
     if count == 0:
-        raise InvalidSplats(str(path), expected="at least one splat", got="an empty scene")
+        raise ValueError("at least one splat, got an empty scene")
     return version, count, degree, bits, flags, streams
 
 
@@ -205,41 +178,40 @@ def _section_bytes(version: int, count: int, degree: int) -> list[int]:
     return [count * size for size in (6 if version == 1 else 9, 1, 3, 3, 4 if version >= 3 else 3, 3 * higher)]
 
 
-def _inflate(unpacking: zlib._Decompress, content: bytes, size: int, path: Path) -> bytes:
+def _inflate(unpacking: zlib._Decompress, content: bytes, size: int) -> bytes:
     """Return the next ``size`` bytes of a gzip stream; with 0 the rest, up to its checksum."""
     try:
         block = unpacking.decompress(content, size or MAX_EXTENSION_BYTES)
     except zlib.error as error:
-        raise _broken(path, "a whole gzip stream", str(error)[:120]) from None
+        raise ValueError(f"a whole gzip stream, got {error}") from None
     if len(block) < size:
-        raise _broken(path, f"{size} bytes in the gzip stream", f"{len(block)}")
+        raise ValueError(f"{size} bytes in the gzip stream, got {len(block)}")
     return block
 
 
-def _streams(content: bytes, table: int, streams: int, sizes: list[int], path: Path) -> list[np.ndarray]:
+def _streams(content: bytes, table: int, streams: int, sizes: list[int]) -> list[np.ndarray]:
     """Return the sections of version 4, each u8; those of no bytes have no stream."""
     import zstandard
 
     stream_sizes = [size for size in sizes if size]
     offset = table + 16 * streams
     if streams != len(stream_sizes) or table < STREAMS_HEADER_BYTES or offset > len(content):
-        raise _broken(path, f"{len(stream_sizes)} streams whose sizes lie in the file", f"{streams} at {table}")
+        raise ValueError(f"{len(stream_sizes)} streams whose sizes lie in the file, got {streams} at {table}")
     sections = []
     for place, size in enumerate(stream_sizes):
         packed, announced_size = struct.unpack_from("<QQ", content, table + 16 * place)
         if announced_size != size or offset + packed > len(content):
-            raise _broken(
-                path, f"a stream of {size} bytes", f"{announced_size} in {packed} of {len(content) - offset} left"
-            )
+            got = f"{announced_size} in {packed} of {len(content) - offset} left"
+            raise ValueError(f"a stream of {size} bytes, got {got}")
         stream = content[offset : offset + packed]
         try:
             if zstandard.frame_content_size(stream) not in (-1, size):  # else the announced size would be allocated
-                raise _broken(path, f"a stream of {size} bytes", "one of another size")
+                raise ValueError(f"a stream of {size} bytes, got one of another size")
             section = zstandard.ZstdDecompressor().decompress(stream, max_output_size=size)
             if len(section) != size:
-                raise _broken(path, f"a stream of {size} bytes", f"{len(section)}")
+                raise ValueError(f"a stream of {size} bytes, got {len(section)}")
         except zstandard.ZstdError as error:
-            raise _broken(path, "a whole zstd stream", str(error)[:120]) from None
+            raise ValueError(f"a whole zstd stream, got {error}") from None
         sections.append(np.frombuffer(section, np.uint8))
         offset += packed
     return sections + [np.empty(0, np.uint8)] * (len(sizes) - len(stream_sizes))
@@ -254,29 +226,20 @@ def _records(extensions: bytes) -> Iterator[tuple[int, bytes]]:
         at += 8 + size
 
 
-def _declared_frame(extensions: bytes, path: Path) -> int:
+def _declared_frame(extensions: bytes) -> int:
     """Return the frame that one of these extensions declares; RUB if none does."""
     for kind, payload in _records(extensions):
         if kind == FRAME_EXTENSION and len(payload) == 4:
             (frame,) = struct.unpack("<I", payload)
             if frame > len(FRAMES):
-                expected = f"one of the {len(FRAMES)} frames of the format"
-                raise InvalidSplats(str(path), expected=expected, got=f"frame {frame}", hint=HINT)
+                raise ValueError(f"one of the {len(FRAMES)} frames of the format, got frame {frame}")
             return frame or RUB
     return RUB
 
 
-def _turn_to_rdf(frame: int) -> tuple[np.ndarray, bool]:
-    """Return the transform of a frame to RDF: signs [3] of its axes, and True if a rotation by 90 degrees follows.
-
-    The letters of a frame define it: x' is x where that points right, y' is the axis that points down (or minus the
-    one that points up), z' the one that points to the front. Frames with y up or down need signs alone; where z is
-    up or down, ``(x, y, z)`` with its signs becomes ``(x, -z, y)``, a rotation about x. Scales stay as they are, as
-    they would not with an exchange of axes.
-    """
-    x, second, third = (1.0 if letter in "RDF" else -1.0 for letter in FRAMES[frame - 1])
-    has_z_up = FRAMES[frame - 1][1] in "FB"
-    return np.array([x, second, -third if has_z_up else third]), has_z_up
+def _signs_to_rdf(frame: int) -> np.ndarray:
+    """Return the signs [3] of a frame's axes that make it RDF: 1 where one points right, down or to the front."""
+    return np.array([1.0 if letter in "RDF" else -1.0 for letter in FRAMES[frame - 1]])
 
 
 def _decode(
@@ -284,14 +247,10 @@ def _decode(
 ) -> Fields:
     means, opacities, colours, scales, quats, harmonics = sections
     count, higher = len(opacities), (degree + 1) ** 2 - 1
-    flips, turns = _turn_to_rdf(frame)
+    flips = _signs_to_rdf(frame)
     x, y, z = flips
     signs = {"x": x, "y": y, "z": z}
-    sh_turn = np.diag([np.prod([signs[axis] for axis in axes]) for axes in SH_AXES[:higher]])
-    if turns:
-        for band in range(1, degree + 1):
-            band_rows = slice(band**2 - 1, (band + 1) ** 2 - 1)
-            sh_turn[band_rows] = band_rotation(band, QUARTER_TURN) @ sh_turn[band_rows]
+    sh_signs = np.array([np.prod([signs[axis] for axis in axes]) for axes in SH_AXES[:higher]])
     stored = harmonics.reshape(count, -1, 3)
 
     def decode(rows: slice) -> Fields:
@@ -302,8 +261,6 @@ def _decode(
             places = (low | middle << 8 | high << 16).astype(np.float64)
             places = np.where(places >= 1 << 23, places - (1 << 24), places) * step
         places, rotations = places * flips, _quats(quats.reshape(count, -1)[rows]) * (1, y * z, x * z, x * y)
-        if turns:
-            places, rotations = places @ QUARTER_TURN.T, _rotate_quarter(rotations)
         fields = {
             "means": places,
             "log_scales": scales.reshape(count, 3)[rows] / 16.0 - 10,
@@ -314,18 +271,10 @@ def _decode(
             fields["sh"] = np.empty((len(places), 1 + higher, 3))
             fields["sh"][:, 0] = (colours.reshape(count, 3)[rows] / 255.0 - 0.5) / COLOUR_SCALE
             if higher:
-                terms = stored[rows] / 128.0 - 1
-                diagonal = np.diagonal(sh_turn)[:, None]
-                fields["sh"][:, 1:] = np.einsum("ij,njc->nic", sh_turn, terms) if turns else terms * diagonal
+                fields["sh"][:, 1:] = (stored[rows] / 128.0 - 1) * sh_signs[:, None]
         return fields
 
     return decoded(count, field_shapes(1 + higher if colour else 0), decode)
-
-
-def _rotate_quarter(quats: np.ndarray) -> np.ndarray:
-    """Rotate quaternions [n, 4] w x y z by QUARTER_TURN."""
-    w, x, y, z = quats.T * np.sqrt(0.5)
-    return np.stack([w - x, x + w, y - z, z + y], axis=1)
 
 
 def _quats(stored: np.ndarray) -> np.ndarray:
@@ -337,7 +286,3 @@ def _quats(stored: np.ndarray) -> np.ndarray:
     parts = np.stack([packed >> 20, packed >> 10, packed], axis=1) & 1023
     values = (parts & 511) / 511 * np.sqrt(0.5) * np.where(parts & 512, -1, 1)
     return np.roll(smallest_three(values, (packed >> 30).astype(np.int64)), 1, axis=1)
-
-
-def _broken(path: Path, expected: str, got: str) -> InvalidSplats:
-    return InvalidSplats(str(path), expected=expected, got=got, hint=f"the file is truncated or damaged: {HINT}")
