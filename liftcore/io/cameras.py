@@ -23,7 +23,7 @@ from liftcore.io.inria import parse_inria
 from liftcore.io.json_file import read_json
 from liftcore.io.kinds import wrong_kind
 from liftcore.io.photos import PhotosBeside
-from liftcore.io.transforms import FRAME_FILE, is_export, parse_export, parse_transforms, read_frame
+from liftcore.io.transforms import FRAME_FILE, cameras_in_frame, is_export, parse_export, parse_transforms, read_frame
 from liftcore.runtime.arguments import as_path
 from liftcore.runtime.folders import scratch_folder
 from liftcore.scene.cameras import Cameras, cameras_from
@@ -61,11 +61,7 @@ class CameraSource:
         return [*cameras, *(path for path in (self.frame, self.data) if path is not None)]
 
     def read(self) -> Cameras:
-        """Read the cameras, in the frame of the splats where ``frame`` has the transform.
-
-        Raises:
-            InvalidCameras: a file is missing or malformed.
-        """
+        """Read the cameras, in the frame of the splats where ``frame`` has the transform."""
         cameras = self._read_in_splat_frame()
         cameras.warnings += self.warnings
         return cameras
@@ -83,9 +79,9 @@ class CameraSource:
             expected, got = "cameras in another frame", "Inria's, which are in the frame of their splats"
             hint = f"remove {source} or {FRAME_FILE}, whichever is of another run"
             raise InvalidCameras(str(self.frame), expected=expected, got=got, hint=hint)
-        similarity = read_frame(self.frame, document, source)
+        matrix = read_frame(self.frame, document, source)
         with cameras_from(str(self.frame)):
-            return similarity.transformed(cameras)
+            return cameras_in_frame(cameras, matrix)
 
     def _parse(self, document: object, source: str) -> Cameras:
         assert self.file is not None
@@ -143,9 +139,6 @@ def camera_source(path: Path) -> CameraSource:
     A ``FRAME_FILE`` applies from the folder, from beside the file, and from a model's folder up to its scene's. Where
     there is one, a transforms.json is preferred, as nerfstudio trains on its intrinsics. nerfstudio's camera export
     is preferred to all, as it is in the frame of the splats.
-
-    Raises:
-        InvalidCameras: the folder has several COLMAP models.
     """
     if path.is_dir():
         return _source_in_folder(path, _frame_in(path))
@@ -199,7 +192,7 @@ def _several_models(scene: Path, models: list[Path]) -> InvalidCameras:
             count = f"{len(read_image_names(model))} images"
         listing.append(f"{model.relative_to(scene).as_posix()} ({count})")
     rest = f" and {len(models) - MAX_LISTED} more" if len(models) > MAX_LISTED else ""
-    hint = f"each has a frame of its own: name the folder of the one that the splats were trained on, as {models[0]}"
+    hint = f"name the folder of the one that the splats were trained on, as {models[0]}: each has a frame of its own"
     return InvalidCameras(str(scene), expected="one COLMAP model", got=f"{', '.join(listing)}{rest}", hint=hint)
 
 
@@ -232,11 +225,7 @@ def _of_model(model: Path) -> CameraSource:
 
 
 def _frame_in(folder: Path) -> Path | None:
-    """Return the ``FRAME_FILE`` in a folder; None if there is none.
-
-    Raises:
-        InvalidCameras: there is something else of that name, such as a broken link.
-    """
+    """Return the ``FRAME_FILE`` in a folder; None if there is none."""
     path = folder / FRAME_FILE
     if path.is_file():
         return path
@@ -277,9 +266,8 @@ def _from_zip(path: Path, frame_file: Path | None) -> Cameras:
                 source = replace(source, photos=zipfile.Path(archive, "" if inner == "." else f"{inner}/"))
             return source.read()
         except InvalidCameras as error:
-            argument, got, hint = (
-                text.replace(str(root), str(path)) for text in (error.argument, error.got, error.hint)
-            )
+            argument, got = (text.replace(str(root), str(path)) for text in (error.argument, error.got))
+            hint = "unzip it, and " + error.hint.replace(f"{root}/", "") if str(root) in error.hint else error.hint
             raise InvalidCameras(argument, expected=error.expected, got=got, hint=hint) from None
 
 

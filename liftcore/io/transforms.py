@@ -10,9 +10,8 @@ frame of the exported splats; intrinsics are those of the transforms.json that t
 import math
 from collections import ChainMap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -32,6 +31,7 @@ from liftcore.scene.cameras import (
     viewmat_of,
 )
 from liftcore.scene.distortion import Distortion
+from liftcore.scene.similarity import Similarity
 from liftcore.scene.views import cameras_of_views, view_names
 from liftcore.scene.world import UNKNOWN, WorldFrame
 
@@ -41,7 +41,6 @@ OWN_FRAME = (
     f"--orientation-method none --center-method none --auto-scale-poses False. Put its run's {FRAME_FILE} beside them"
 )
 LEAST_UPRIGHT = 0.5  # cosine of the mean of the cameras' up axes with +Z
-TOLERANCE = 1e-3  # of a rotation's entries, which were stored as float32
 LEAST, LARGEST = 1e-9, 1e9  # scales
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 FISHEYE = "OPENCV_FISHEYE"
@@ -80,9 +79,6 @@ def parse_transforms(document: Any, source: str, photos: PhotosBeside | None = N
     Args:
         document: as JSON has it. source: its file, for errors.
         photos: source of sizes that the document does not have; None: none.
-
-    Raises:
-        InvalidCameras: a key is missing or malformed, or a camera is distorted in a way that is not read.
     """
     if not isinstance(document, dict) or "frames" not in document:
         listing = ", ".join(list(document)[:5]) if isinstance(document, dict) else type(document).__name__
@@ -111,9 +107,6 @@ def parse_export(records: Any, source: str, data: Any = None, photos: PhotosBesi
     Args:
         records: as JSON has them. source: their file, for errors. photos: as `parse_transforms` has it.
         data: the transforms.json of the data, whose intrinsics count by the photo's name; None: there is none.
-
-    Raises:
-        InvalidCameras: as `parse_transforms` has it, or neither has intrinsics.
     """
     names, poses = _named_frames(records, source, f"{source} camera")
     shared = data if isinstance(data, dict) else {}
@@ -290,52 +283,15 @@ def _format_coefficients(values: Mapping[str, float]) -> str:
     return ", ".join(f"{key} = {value:g}" for key, value in values.items()) or "none"
 
 
-@dataclass(frozen=True)
-class Similarity:
-    """A map between frames: ``p' = scale rotation p + translation``."""
-
-    scale: float
-    rotation: np.ndarray  # [3, 3] f64, proper
-    translation: np.ndarray  # [3] f64
-
-    @classmethod
-    def of(cls, matrix: np.ndarray, source: str) -> Self:
-        """Return the map of an affine matrix [4, 4] f64.
-
-        Raises:
-            InvalidCameras: it is no rotation, translation and scale.
-        """
-        linear = matrix[:3, :3]
-        scale = float(np.cbrt(np.linalg.det(linear)))
-        if not LEAST <= scale <= LARGEST or not np.isfinite(matrix).all():
-            expected = f"a proper rotation with a scale in {LEAST:g}..{LARGEST:g}"
-            raise InvalidCameras(source, expected=expected, got=f"a determinant of {np.linalg.det(linear):.3g}")
-        error = float(np.abs(linear @ linear.T / scale**2 - np.eye(3)).max())
-        if error > TOLERANCE:
-            raise InvalidCameras(
-                source, expected="a rotation, a shift and a scale", got=f"a matrix off by {error:.2g}"
-            )
-        left, _, right = np.linalg.svd(linear)  # the nearest rotation
-        return cls(scale, left @ right, matrix[:3, 3])
-
-    def transformed(self, cameras: Cameras) -> Cameras:
-        """Return the same views of the transformed scene: every pixel shows the same splats.
-
-        Of ``x = R p + t`` in a camera it makes ``R' = R rotation^T`` and ``t' = scale t - R' translation``, so that
-        x' is scale x.
-        """
-        views = []
-        for camera in cameras.values():
-            pose = np.eye(4)
-            pose[:3, :3] = camera.viewmat[:3, :3] @ self.rotation.T
-            pose[:3, 3] = self.scale * camera.viewmat[:3, 3] - pose[:3, :3] @ self.translation
-            views.append(replace(camera, viewmat=pose))
-        warnings = [warning for warning in cameras.warnings if warning != OWN_FRAME]
-        return Cameras(tuple(views), frame=FRAME_FILE, world=nerfstudio_world(views), warnings=warnings)
+def cameras_in_frame(cameras: Cameras, matrix: np.ndarray) -> Cameras:
+    """Return the cameras in the frame of the splats, of `read_frame`."""
+    views = [camera.transformed(matrix) for camera in cameras.values()]
+    warnings = [warning for warning in cameras.warnings if warning != OWN_FRAME]
+    return Cameras(views, frame=FRAME_FILE, world=nerfstudio_world(views), warnings=warnings)
 
 
-def read_frame(path: Path, applied: Mapping[str, Any], source: str) -> Similarity:
-    """Return the map from the frame of camera files to that of the splats.
+def read_frame(path: Path, applied: Mapping[str, Any], source: str) -> np.ndarray:
+    """Return the similarity [4, 4] f64 from the frame of camera files to that of the splats.
 
     The file holds ``transform`` T [3, 4] and ``scale`` s, which take the frame of the COLMAP model to that of the
     splats. Poses of a transforms.json are transformed already, by its ``applied_transform`` A and
@@ -344,9 +300,6 @@ def read_frame(path: Path, applied: Mapping[str, Any], source: str) -> Similarit
     Args:
         path: a ``FRAME_FILE``. applied: the transforms.json that the cameras are of; empty of a COLMAP model.
         source: the name of that file.
-
-    Raises:
-        InvalidCameras: a matrix or a scale is missing, malformed, or no rotation, translation and scale.
     """
     document = read_json(path)
     transform = _affine(entry(document, "transform", str(path)), f"{path} transform")
@@ -354,10 +307,18 @@ def read_frame(path: Path, applied: Mapping[str, Any], source: str) -> Similarit
     before = np.eye(4)
     if applied.get("applied_transform") is not None:
         before = _affine(applied["applied_transform"], f"{source} applied_transform")
-        Similarity.of(before, f"{source} applied_transform")
+        _require_similarity(before, f"{source} applied_transform")
     combined = transform @ np.linalg.inv(before)
     combined[:3] *= scale / _scale(applied.get("applied_scale", 1.0), f"{source} applied_scale")
-    return Similarity.of(combined, f"{path} transform")
+    _require_similarity(combined, f"{path} transform")
+    return combined
+
+
+def _require_similarity(matrix: np.ndarray, source: str) -> None:
+    try:
+        Similarity.of(matrix)
+    except InvalidInput as error:
+        raise InvalidCameras(source, expected=error.expected, got=error.got, hint=error.hint) from None
 
 
 def _affine(value: Any, source: str) -> np.ndarray:

@@ -43,9 +43,6 @@ class Similarity:
         Args:
             matrix: [4, 4] or [3, 4], (s R | t). None: of the parts.
             scale: above zero. rotation: [3, 3], or a quaternion [4] w x y z. translation: [3].
-
-        Raises:
-            InvalidInput: it is none, such as a reflection, a shear or a scale for each axis; or both forms are given.
         """
         if matrix is not None:
             is_default = isinstance(scale, float | int) and scale == 1.0
@@ -72,7 +69,7 @@ class Similarity:
         if not _is_positive(scale):
             got = f"a determinant of {scale**3:.3g}"
             raise InvalidInput("matrix", expected="a rotation times a scale, no reflection", got=got)
-        return cls(scale, _proper("matrix", matrix[:3, :3] / scale), matrix[:3, 3].copy())
+        return cls(scale, _proper("matrix", matrix[:3, :3], scale), matrix[:3, 3].copy())
 
     def points(self, points: np.ndarray) -> np.ndarray:
         """Transform points [n, 3] f64 to the new frame."""
@@ -105,12 +102,12 @@ def _numbers(name: str, values: Any, shapes: tuple[tuple[int, ...], ...]) -> np.
     return array
 
 
-def _proper(name: str, rotation: np.ndarray) -> np.ndarray:
-    """Return the nearest rotation to a matrix that is one but for rounding."""
-    off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if off > NEAR or np.linalg.det(rotation) < 0:
+def _proper(name: str, linear: np.ndarray, scale: float = 1.0) -> np.ndarray:
+    """Return the nearest rotation to a matrix that is one but for rounding and a scale."""
+    off = float(np.abs(linear @ linear.T / scale**2 - np.eye(3)).max())
+    if off > NEAR or np.linalg.det(linear) < 0:
         description = "a reflection" if off <= NEAR else f"a matrix off by {off:.2g}"
         hint = "" if off <= NEAR else "a scale for each axis, or a shear, would make no Gaussians of Gaussians"
         raise InvalidInput(name, expected="a proper rotation", got=description, hint=hint)
-    left, _, right = np.linalg.svd(rotation)
+    left, _, right = np.linalg.svd(linear)
     return left @ right

@@ -20,7 +20,6 @@ import torch
 
 import liftcore as lc
 from liftcore.io.colmap import MODELS_BY_NAME, calibration
-from liftcore.io.transforms import Similarity
 from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.cameras import MAX_FOCAL, MAX_SIDE, MIN_FOCAL, behind_lens, distortion_warning, drawn_by
 from liftcore.scene.distortion import Brown, Distortion, Fisheye, photo_places
@@ -294,8 +293,7 @@ def _transformed(scale: float, digits: type = np.float64) -> Scene:
     def scene(kernel: Kernel) -> View:
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = scale * TURN, scale * np.array([3.0, -2.0, 1.0])
-        similarity = Similarity.of(matrix.astype(digits).astype(np.float64), "here")
-        [camera] = similarity.transformed(lc.Cameras((camera_at_origin(),))).values()
+        camera = camera_at_origin().transformed(matrix.astype(digits).astype(np.float64))
         means = np.asarray(ROW, np.float32).astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
         splats = splats_at(means, LENS_SCALES, quats=THIRD_OF_A_TURN, kernel=kernel)
         return View(replace(splats, log_scales=splats.log_scales + math.log(scale)), camera, DEFAULTS)
@@ -325,8 +323,8 @@ LENSES: tuple[Extreme, ...] = (
     error_of("a barrel that turns back near the axis (k1 = -9)", lambda: _behind(Brown(k1=-9.0)), "of the photo"),
     error_of("a thin prism", lambda: calibration(MODELS_BY_NAME["THIN_PRISM_FISHEYE"], [0.0] * 12, "camera 1"),
         "undistort the photos first"),
-    error_of("a frame that mirrors", lambda: Similarity.of(np.diag([1.0, 1.0, -1.0, 1.0]), "transform"),
-        "a proper rotation"),
+    error_of("a frame that mirrors", lambda: camera_at_origin().transformed(np.diag([1.0, 1.0, -1.0, 1.0])),
+        "no reflection"),
 )
 # fmt: on
 

@@ -1,0 +1,104 @@
+"""Inputs that would give a wrong lift without a word: each is read right, or refused with what to do."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from pathlib import Path
+
+import liftcore as lc
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from tests.tiny_scene import PROPERTIES, ply, splat_rows
+
+PANORAMA = "1 EQUIRECTANGULAR 64 32 32 16\n"
+PINHOLE = "1 PINHOLE 64 48 50 50 32 24\n"
+TURNED = 6  # EXIF's orientation of a camera that was held upright: a quarter turn
+
+
+def write_model(folder: Path, camera: str, *names: str) -> None:
+    folder.mkdir(parents=True)
+    (folder / "cameras.txt").write_text(camera)
+    lines = [f"{number} 1 0 0 0 0 0 {number} 1 {name}\n\n" for number, name in enumerate(names, start=1)]
+    (folder / "images.txt").write_text("".join(lines))
+
+
+@pytest.mark.parametrize("other", ["sparse/1", "dense/0/sparse", "colmap/sparse/0"])
+def test_one_of_several_models_is_read_by_its_folder(other: str, tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    write_model(scene / "sparse/0", PINHOLE, "a.png", "b.png")
+    write_model(scene / other, PINHOLE, "c.png")
+    with pytest.raises(lc.InvalidCameras) as error:
+        lc.read_cameras(scene)
+    assert "sparse/0 (2 images)" in error.value.got and f"{other} (1 images)" in error.value.got
+    assert error.value.hint.startswith("name the folder") and str(scene / "sparse/0") in error.value.hint
+    assert list(lc.read_cameras(scene / "sparse/0")) == ["a", "b"] and list(lc.read_cameras(scene / other)) == ["c"]
+
+
+def test_a_zip_of_several_models_says_to_unzip_it(tmp_path: Path) -> None:
+    for number in (0, 1):
+        write_model(tmp_path / f"sparse/{number}", PINHOLE, "a.png")
+    with zipfile.ZipFile(tmp_path / "scene.zip", "w") as archive:
+        for path in (tmp_path / "sparse").rglob("*.txt"):
+            archive.write(path, path.relative_to(tmp_path))
+    with pytest.raises(lc.InvalidCameras) as error:
+        lc.read_cameras(tmp_path / "scene.zip")
+    assert error.value.hint.startswith("unzip it, and name the folder") and "as sparse/0" in error.value.hint
+
+
+def test_a_panorama_is_refused_with_how_to_make_pinholes(tmp_path: Path) -> None:
+    write_model(tmp_path / "model", PANORAMA, "a.png")
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
+    document = {"camera_model": "EQUIRECTANGULAR", "w": 64, "h": 32, "fl_x": 32, "frames": [frame]}
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    for path in (tmp_path / "model", tmp_path / "transforms.json"):
+        with pytest.raises(lc.InvalidCameras, match="make pinhole photos of it"):
+            lc.read_cameras(path)
+
+
+def test_one_rank_of_a_training_is_no_scene(tmp_path: Path) -> None:
+    tensors = {
+        "means": torch.rand(3, 3),
+        "quats": torch.rand(3, 4),
+        "scales": torch.zeros(3, 3),
+        "opacities": torch.zeros(3),
+    }
+    for rank in (0, 1):
+        torch.save({"splats": tensors}, tmp_path / f"ckpt_29999_rank{rank}.pt")
+    for rank in (0, 1):
+        with pytest.raises(lc.InvalidSplats, match="one of several GPUs"):
+            lc.read_splats(tmp_path / f"ckpt_29999_rank{rank}.pt")
+
+
+@pytest.mark.parametrize("column", ["x", "scale_1", "rot_2", "opacity"])
+def test_a_row_with_nan_stays_unseen_and_is_counted(column: str, tmp_path: Path) -> None:
+    rows = splat_rows()
+    rows[4, PROPERTIES.index(column)] = np.nan
+    (tmp_path / "s.ply").write_bytes(ply(rows))
+    splats = lc.read_splats(tmp_path / "s.ply")
+    assert splats.count == len(rows) and splats.opacity_logits[4] == -np.inf
+    assert splats.warnings and torch.isfinite(splats.means).all()
+
+
+def test_map_coordinates_keep_the_digits_of_the_file(tmp_path: Path) -> None:
+    rows = splat_rows()
+    quats, log_scales = torch.from_numpy(rows[:, 10:]), torch.from_numpy(rows[:, 7:10])
+    far = rows[:, :3] + np.array([500_000.0, 5_400_000.0, 300.0])
+    splats = lc.Splats(far, quats, log_scales, torch.from_numpy(rows[:, 6]))
+    lc.write_splats(tmp_path / "far.ply", splats)
+    read = lc.read_splats(tmp_path / "far.ply")
+    assert np.abs(read.positions() - far).max() < 1e-6 and float(read.means.abs().max()) < 1e4
+
+
+def test_size_of_a_turned_photo_is_as_it_is_stored(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = TURNED
+    Image.new("RGB", (64, 48)).save(tmp_path / "a.jpg", exif=exif)
+    frame = {"file_path": "a.jpg", "transform_matrix": np.eye(4).tolist()}
+    for centre, size in (({}, (64, 48)), ({"cx": 32, "cy": 24}, (64, 48)), ({"cx": 24, "cy": 32}, (48, 64))):
+        (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 50.0, "frames": [frame], **centre}))
+        camera = lc.read_cameras(tmp_path / "transforms.json")["a"]
+        assert (camera.width, camera.height) == size
