@@ -63,9 +63,6 @@ def array_views(folder: Path, layout: Layout = "hwc") -> ViewFolder[FeatureGrid]
     """Open the grids of a folder of ``.npy``, ``.npz`` or ``.pt`` files [h, w, F], or [F, h, w] for layout ``chw``.
 
     Leading axes of length 1 are removed. ``IMG_fmap_CxHxW.pt``, as feature-3dgs writes it, is [F, h, w].
-
-    Raises:
-        InvalidFeatures: the folder has no such files, or two of one view.
     """
     suffixes = (*ARRAYS, *TENSORS)
     files = npy_files(folder, *suffixes)
@@ -97,12 +94,7 @@ def grids_of(files: Mapping[str, Path], layout: Layout = "hwc") -> ViewFolder[Fe
 
 
 def langsplat_views(folder: Path) -> ViewFolder[Regions]:
-    """Open the regions of a folder of ``IMG_s.npy`` and ``IMG_f.npy`` files, and of its sub-folders.
-
-    Raises:
-        InvalidFeatures: the folder has no such files, or the file of the embeddings of a map is missing. When a view
-            is read: a file is malformed, an id has no embedding, or an embedding is not finite.
-    """
+    """Open the regions of a folder of ``IMG_s.npy`` and ``IMG_f.npy`` files, and of its sub-folders."""
     files = npy_files(folder, LABELS)
     labels = {composed(path.relative_to(folder).as_posix().removesuffix(LABELS)): path for path in files}
     codebooks = {view: path.with_name(path.name.removesuffix(LABELS) + CODEBOOK) for view, path in labels.items()}
@@ -136,11 +128,7 @@ def files_below(folder: Path) -> list[Path]:
 
 
 def npy_files(folder: Path, *suffixes: str) -> list[Path]:
-    """List the files in a folder and its sub-folders with one of these suffixes, sorted.
-
-    Raises:
-        InvalidFeatures: there is none. The message mentions pickles if there are some.
-    """
+    """List the files in a folder and its sub-folders with one of these suffixes, sorted."""
     suffix = suffixes[0]
     if not folder.is_dir():
         raise InvalidFeatures(str(folder), expected=f"a folder of *{suffix} files", got="no such folder")
@@ -166,9 +154,6 @@ def files_by_view(
 
     Args:
         noun: for the files, in errors. hint: of errors.
-
-    Raises:
-        InvalidFeatures: two files have the same view.
     """
     by_view: dict[str, Path] = {}
     for path in paths:

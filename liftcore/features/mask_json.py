@@ -72,10 +72,6 @@ def read_mask_document(path: Path, *, unannotated_negative: bool = False) -> Mas
 
     Args:
         unannotated_negative: images without an annotation show none of the document's phrases.
-
-    Raises:
-        InvalidFeatures: not such a document, or a record without a phrase, of an unknown image, or with a malformed
-            mask.
     """
     document = MaskDocument(path, [])
     with reading(path, InvalidFeatures, "COCO's JSON, or records with masks and phrases", AS_COCO):

@@ -34,11 +34,7 @@ OVERLAP = "move photos to another folder than their masks"
 
 
 def mask_files(folder: Path) -> dict[str, Path]:
-    """Return view -> its file of masks, of a folder without vectors and its sub-folders.
-
-    Raises:
-        InvalidFeatures: the folder has no masks, or has vectors, or a view has two files of masks.
-    """
+    """Return view -> its file of masks, of a folder without vectors and its sub-folders."""
     if not folder.is_dir():
         raise InvalidFeatures(str(folder), expected="a folder of masks", got="no such folder")
     arrays = [path for path in files_below(folder) if path.name.endswith((VECTORS, ZIPPED_ARRAY))]
@@ -56,11 +52,7 @@ def mask_files(folder: Path) -> dict[str, Path]:
 
 
 def labels_alone(path: Path, unlabelled: int = 0) -> tuple[np.ndarray, int]:
-    """Read labels [L, h, w] i32 of a view's masks, -1 for none, and the number of masks, of a view without vectors.
-
-    Raises:
-        InvalidFeatures: as in `mask_views`.
-    """
+    """Read labels [L, h, w] i32 of a view's masks without vectors, -1 for none, and the number of masks."""
     with reading(path, InvalidFeatures, "masks"):
         labels, rows = _labels(path, None, unlabelled)
         if not rows:
@@ -76,11 +68,6 @@ def mask_views(
     Args:
         folder: of the masks. unlabelled: value of pixels without a mask in label pictures.
         mask_vectors: view -> vectors [M, F], for a folder without vectors (`liftcore.features.encoders.crops`).
-
-    Raises:
-        InvalidFeatures: the folder has no vectors, a view has only vectors or only masks, or has two files of either.
-            When a view is read: a file is malformed, the numbers of masks and vectors differ, or masks need too many
-            levels.
     """
     if mask_vectors is not None:
         by_view = mask_files(folder)

@@ -142,10 +142,6 @@ def prompt_views(
         names: of label pictures, JSON from values to names.
         unlabelled: value of unlabelled pixels in pictures (255).
         unannotated: images of a data set without an annotation: ``skip`` them, or ``negative``, they show no phrase.
-
-    Raises:
-        InvalidFeatures: no masks, masks of several kinds, a record without a phrase, or too many phrases. When a view
-            is read: a file is malformed, or its masks have several sizes.
     """
     if not folder.is_dir():
         raise InvalidFeatures(str(folder), expected="a folder of masks", got="no such folder")

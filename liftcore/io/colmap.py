@@ -117,11 +117,7 @@ def model_files(folder: Path) -> list[Path]:
 
 
 def read_colmap(folder: Path) -> Cameras:
-    """Read the cameras of a sparse model, by image name.
-
-    Raises:
-        InvalidCameras: a file is missing or malformed, or a camera is distorted in a way that is not read.
-    """
+    """Read the cameras of a sparse model, by image name."""
     camera_file, image_file = model_files(folder)
     for path in (camera_file, image_file):
         if not path.is_file():
@@ -144,11 +140,7 @@ def read_colmap(folder: Path) -> Cameras:
 
 
 def read_image_names(folder: Path) -> list[str]:
-    """Read the names of a sparse model's views, without their cameras.
-
-    Raises:
-        InvalidCameras: the file of its images is missing or malformed.
-    """
+    """Read the names of a sparse model's views, without their cameras."""
     path = model_files(folder)[1]
     if path.suffix == ".bin":
         images: list[_Image] = _binary_images(path)
@@ -307,11 +299,7 @@ def _bad_line(path: Path, expected: str, line: str) -> InvalidCameras:
 
 
 def calibration(model: CameraModel, parameters: Sequence[float], source: str) -> tuple[Intrinsics, Distortion | None]:
-    """Return the intrinsics of a camera of this model, and its distortion; None without distortion.
-
-    Raises:
-        InvalidCameras: a parameter is missing, too many or not finite, or the model is one that is not read.
-    """
+    """Return the intrinsics of a camera of this model, and its distortion; None without distortion."""
     if model.distortion is None:
         hint = PINHOLES if model.name == PANORAMA else UNDISTORT
         raise InvalidCameras(source, expected=f"a camera of {READ_MODELS}", got=model.name, hint=hint)

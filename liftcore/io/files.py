@@ -52,22 +52,14 @@ def visible_files(folder: Path | str, pattern: str = "*") -> list[Path]:
 
 
 def refuse_pointer(source: str, head: bytes) -> None:
-    """Refuse a Git LFS pointer in place of a camera file.
-
-    Raises:
-        InvalidCameras: the first bytes are those of a pointer.
-    """
+    """Refuse a Git LFS pointer in place of a camera file."""
     if head.startswith(LFS_POINTER):
         got = "a Git LFS pointer, which stands for the file"
         raise InvalidCameras(source, expected="a camera file", got=got, hint=LFS_HINT)
 
 
 def open_regular(path: Path) -> BufferedReader:
-    """Open a regular file to read: devices may have no end, and pipes may block forever.
-
-    Raises:
-        OSError: it does not open, or is not a regular file.
-    """
+    """Open a regular file to read: devices may have no end, and pipes may block forever."""
     handle = open(path, "rb", opener=_open_without_waiting)  # noqa: SIM115 - the caller closes it
     if stat.S_ISREG(os.fstat(handle.fileno()).st_mode):
         return handle
@@ -80,11 +72,7 @@ def _open_without_waiting(path: str, flags: int) -> int:
 
 
 def open_zip(path: Path) -> zipfile.ZipFile:
-    """Open a zip, whose list of files is checked against a limit before zipfile reads it.
-
-    Raises:
-        zipfile.BadZipFile: it is no zip, or its list is too large. OSError: it does not open, or is no regular file.
-    """
+    """Open a zip, whose list of files is checked against a limit before zipfile reads it."""
     with open_regular(path) as handle:
         size = _directory_bytes(handle)
     if size > MAX_DIRECTORY_BYTES:
@@ -114,12 +102,7 @@ def _directory_bytes(handle: IO[bytes]) -> int:
 
 @contextmanager
 def whole_file(path: Path | str) -> Iterator[IO[bytes]]:
-    """Write ``path`` atomically, through a draft beside it: synced and renamed at the end, removed after an error.
-
-    Raises:
-        InvalidInput: ``path`` is a folder.
-        Unavailable: the file is open or mapped, which Windows does not replace.
-    """
+    """Write ``path`` atomically, through a draft beside it: synced and renamed at the end, removed after an error."""
     path = Path(path)
     if path.is_dir():
         hint = "name a file within it"

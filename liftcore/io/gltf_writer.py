@@ -50,9 +50,6 @@ def gltf_blocks(splats: Splats, document: Mapping[str, Any] | None = None) -> It
 
     Args:
         splats: P. document: of `liftcore.io.labels`; None: splats without labels.
-
-    Raises:
-        InvalidSplats: the file would be too large for the format, or cannot store the columns.
     """
     binary, columns = _Binary(), stored_columns(splats)
     sets = [name for name in IDS if name in columns]
@@ -172,11 +169,7 @@ def _primitive(
 
 
 def _attribute_values(name: str, column: np.ndarray) -> np.ndarray:
-    """Convert a column [P] to a type that attributes have: integers of at most 16 bits, or f32.
-
-    Raises:
-        InvalidSplats: whole numbers too large for float32.
-    """
+    """Convert a column [P] to a type that attributes have: integers of at most 16 bits, or f32."""
     if column.dtype.kind == "f":
         return column.astype("<f4")
     low, high = int(column.min()), int(column.max())

@@ -9,11 +9,7 @@ from liftcore.scene.views import view_names
 
 
 def parse_inria(document: Any, source: str) -> Cameras:
-    """Parse a cameras.json document; the format puts the principal point at the image's centre.
-
-    Raises:
-        InvalidCameras: a key is missing or malformed.
-    """
+    """Parse a cameras.json document; the format puts the principal point at the image's centre."""
     if not isinstance(document, list):
         raise InvalidCameras(source, expected="a list of cameras", got=type(document).__name__)
     if document and not (isinstance(document[0], dict) and "img_name" in document[0]):

@@ -16,11 +16,7 @@ FORMATS = "an object with 'frames' (nerfstudio) or a list of cameras with 'img_n
 
 
 def read_json(path: Path) -> Any:
-    """Read the document in a JSON file of at most 64 MiB.
-
-    Raises:
-        InvalidCameras: the file does not open, is too large or is not JSON.
-    """
+    """Read the document in a JSON file of at most 64 MiB."""
     try:
         with open_regular(path) as handle:
             content = handle.read(MAX_JSON_BYTES + 1)

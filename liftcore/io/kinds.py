@@ -220,11 +220,7 @@ def _replacement_hint(path: Path, identified: FileKind, kind: str) -> str:
 
 
 def identify(path: Path | str) -> FileKind:
-    """Identify a file or folder, without an error: one that does not open has a name that says so.
-
-    Raises:
-        InvalidInput: it is no path.
-    """
+    """Identify a file or folder, without an error: one that does not open has a name that says so."""
     as_path(path)
     path = Path(path)
     try:
@@ -316,11 +312,7 @@ def _safetensors(path: Path) -> FileKind:
 
 
 def keys_of(path: Path) -> tuple[set[str], dict[str, str]]:
-    """Return the names of a safetensors file's tensors, and its metadata.
-
-    Raises:
-        InvalidInput: it does not open.
-    """
+    """Return the names of a safetensors file's tensors, and its metadata."""
     from safetensors import SafetensorError, safe_open
 
     try:

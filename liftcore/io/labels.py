@@ -56,11 +56,7 @@ def id_column(values: np.ndarray) -> np.ndarray:
 
 
 def stored_columns(splats: Splats) -> dict[str, np.ndarray]:
-    """Return the extras of splats without normals, each [P] i32 or f32, as formats with columns of 32 bits hold them.
-
-    Raises:
-        InvalidSplats: whole numbers need more bits, or the columns are too many.
-    """
+    """Return the extras of splats without normals, each [P] i32 or f32, for formats with columns of 32 bits."""
     columns: dict[str, np.ndarray] = {}
     for name, column in splats.extras.items():
         values = column.cpu().numpy()

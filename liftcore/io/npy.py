@@ -26,22 +26,14 @@ Values = TypeVar("Values", np.ndarray, "Tensor")
 
 
 def open_array(path: Path, kinds: str = NUMBERS) -> np.ndarray:
-    """Open the array of a ``.npy`` file, the only one of a ``.npz``, or the tensor of a ``.pt`` or ``.pth`` file.
-
-    Raises:
-        InvalidFeatures: as `open_npy`; a ``.npz`` of several arrays, or a ``.pt`` that holds more than a tensor.
-    """
+    """Open the array of a ``.npy`` file, the only one of a ``.npz``, or the tensor of a ``.pt`` or ``.pth`` file."""
     if path.suffix.lower() in TENSORS:
         return _read_tensor(path, kinds)
     return _read_npz(path, kinds) if path.suffix.lower() == ".npz" else open_npy(path, kinds)
 
 
 def open_npy(path: Path, kinds: str = NUMBERS) -> np.ndarray:
-    """Map a ``.npy`` file whose dtype is one of ``kinds``, in NumPy's letters.
-
-    Raises:
-        InvalidFeatures: the file is no ``.npy`` file, holds Python objects, or has another size than its header.
-    """
+    """Map a ``.npy`` file whose dtype is one of ``kinds``, in NumPy's letters."""
     try:
         with open_regular(path) as handle:
             size = handle.seek(0, 2)
@@ -139,9 +131,6 @@ def read_floats(path: Path, axes: str) -> np.ndarray:
     """Read an array of floats with axes such as "M, F": f16, or f32 if it is stored wider; perhaps not finite.
 
     Leading axes of length 1 are removed.
-
-    Raises:
-        InvalidFeatures: as `open_array`, or it has other axes or no floats.
     """
     stored = open_array(path)
     array = without_unit_axes(stored, len(axes.split()))

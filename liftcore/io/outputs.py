@@ -46,10 +46,6 @@ def check_output(path: Path | str, inputs: Path | str | Iterable[Path | str], ki
 
     Returns:
         The file: the path itself, or the index of a folder of shards.
-
-    Raises:
-        InvalidInput: it is one of these, its suffix is not written, no file can be made there, or there is no such
-            kind.
     """
     from liftcore.io.shards import INDEX, SUFFIX
 
@@ -106,11 +102,7 @@ def _require_same_kind(path: Path, output: OutputType) -> None:
 
 @contextmanager
 def writing(path: Path | str) -> Iterator[None]:
-    """Name the output in errors of the operating system: a full disk, a folder without permission.
-
-    Raises:
-        InvalidInput: the operating system refused.
-    """
+    """Name the output in errors of the operating system: a full disk, a folder without permission."""
     try:
         yield
     except OSError as error:

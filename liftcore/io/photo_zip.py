@@ -34,11 +34,7 @@ EXPECTED = "a zip of JPEG or PNG photos, named like the views"
 
 
 def describe_photos(path: Path) -> dict[str, Any]:
-    """Check a zip of photos: return the number of ``photos``, their ``names`` as of views, and ``warnings``.
-
-    Raises:
-        InvalidPhotos: it is no zip, a photo is none or too large, or it would unpack to much more than it is.
-    """
+    """Check a zip of photos: return the number of ``photos``, their ``names`` as of views, and ``warnings``."""
     try:
         with open_zip(path) as archive:
             if (size := path.stat().st_size - archive.start_dir) > DIRECTORY_BYTES:
@@ -111,11 +107,7 @@ class PhotoIndex:
         return set(cameras_of_views(self.members, views).values())
 
     def open(self, view: str) -> tuple[str, int, Iterator[bytes]] | None:
-        """Return the media type, the size and the blocks of a view's photo; None when there is none.
-
-        Raises:
-            NotFound: the zip is gone, or damaged where the photo begins.
-        """
+        """Return the media type, the size and the blocks of a view's photo; None when there is none."""
         name = view if view in self.members else next(iter(cameras_of_views(self.members, [view])), None)
         if name is None:
             return None
@@ -145,11 +137,7 @@ class PhotoIndexes:
         self._of = lru_cache(KEPT_ZIPS)(_index)
 
     def of(self, path: Path) -> PhotoIndex:
-        """Return the index of a zip.
-
-        Raises:
-            NotFound: it is not there, or no longer one.
-        """
+        """Return the index of a zip."""
         try:
             with self._turn:
                 return self._of(path, path.stat().st_mtime_ns)  # an upload replaces a damaged one in place

@@ -89,11 +89,7 @@ def orientation_warnings(readings: Mapping[str, Reading], counterparts: str) -> 
 
 
 def read_header(photo: Path | IO[bytes], name: str = "") -> PhotoHeader:
-    """Read the size and the orientation of a photo; no pixel is decoded.
-
-    Raises:
-        InvalidInput: it is no image, or one of a kind that Pillow does not read.
-    """
+    """Read the size and the orientation of a photo; no pixel is decoded."""
     from PIL import Image, UnidentifiedImageError
 
     source = name or str(photo)
@@ -132,11 +128,7 @@ class PhotosBeside:
         self._names: dict[str, dict[str, list[str]]] = {}
 
     def header(self, file_path: str) -> PhotoHeader | None:
-        """Read the header of the photo at a path, with or without a suffix; None if it does not exist.
-
-        Raises:
-            InvalidInput: it does not open as an image.
-        """
+        """Read the header of the photo at a path, with or without a suffix; None if it does not exist."""
         for folder, place in self._places(file_path):
             if (photo := self._photo(folder, place)) is not None:
                 if isinstance(photo, Path):

@@ -93,9 +93,6 @@ def read_ply(path: Path, kernel: Kernel | str = "auto", *, colour: bool = True) 
     coarsely (`Splats`). Without ``colour`` neither colours nor extras are read or
     allocated, and what comes cannot be written back. A ``filter_3D`` becomes part of scales and opacities, which are
     then written as plain splats; elements behind the vertices are neither read nor written.
-
-    Raises:
-        InvalidSplats: the file is malformed, lacks a property of the kernel, or holds no splat of finite numbers.
     """
     import torch
 
@@ -141,11 +138,7 @@ def read_places(path: Path) -> np.ndarray:
 
 
 def ply_blocks(splats: Splats) -> Iterator[bytes]:
-    """Yield the bytes of a PLY of splats in blocks, with the layout they were read with, or their kernel's usual one.
-
-    Raises:
-        InvalidSplats: the layout names a column that the splats do not have.
-    """
+    """Yield the bytes of a PLY in blocks, in the layout that they were read with or their kernel's usual one."""
     layout = splats.layout or _default_layout(splats)
     columns = _columns_of(splats, layout)
     source = None
@@ -180,9 +173,6 @@ def some_rows(path: Path, mask: np.ndarray) -> Iterator[bytes]:
 
     Yields:
         The bytes of the copy, in blocks.
-
-    Raises:
-        InvalidSplats: the file is malformed, or has another number of splats.
     """
     header = _header_of(path, len(mask))
     yield header_bytes(header.lines_for(int(np.count_nonzero(mask))))
@@ -202,9 +192,6 @@ def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
 
     Yields:
         The bytes of the copy, in blocks.
-
-    Raises:
-        InvalidSplats: the file is malformed, has another number of splats, or holds no colours.
     """
     header = _header_of(path, len(colours))
     slots = model_slots(header.names, recognise_kernel(header.names), str(path))
@@ -240,9 +227,6 @@ def with_columns(path: Path, columns: Mapping[str, np.ndarray]) -> Iterator[byte
 
     Yields:
         The bytes of the copy, in blocks.
-
-    Raises:
-        InvalidSplats: the file is malformed, or has another number of splats.
     """
     header = _header_of(path, len(next(iter(columns.values()))))
     unchanged_names = [name for name in header.names if name not in columns]
@@ -416,11 +400,7 @@ def usual_layout(kernel: Kernel, sh_rows: int, lobes: int) -> tuple[str, ...]:
 
 
 def model_slots(names: Sequence[str], kernel: Kernel, source: str) -> dict[str, Slot]:
-    """Return the columns that are fields of the model; the others are extras.
-
-    Raises:
-        InvalidSplats: a column of the kernel is missing, there is an odd number of them, or the model is another.
-    """
+    """Return the columns that are fields of the model; the others are extras."""
     for name in SCAFFOLD:
         if name in names:
             got = f"anchors of Scaffold-GS, which its networks turn into splats (property {name!r})"
@@ -508,10 +488,6 @@ def read_header(path: Path) -> PlyHeader:
     """Read and check the header of a splat PLY, at most 256 KiB of the file.
 
     Bytes behind all elements count in ``tail``, but for zeros and blanks: viewers open such files, too.
-
-    Raises:
-        InvalidSplats: the file cannot be opened, is not a binary little-endian PLY that begins with a vertex element
-            of scalar properties, is shorter than its header has it, or has longer rows.
     """
     head, size = read_head(path)
     header = parse_header(head, str(path))
@@ -545,11 +521,7 @@ def padding_bytes(path: Path, size: int, tail: int) -> int:
 
 
 def read_head(path: Path) -> tuple[bytes, int]:
-    """Read as many bytes of a file as a header may take, and return them with the file's size.
-
-    Raises:
-        InvalidSplats: it does not open.
-    """
+    """Read as many bytes of a file as a header may take, and return them with the file's size."""
     try:
         with open_regular(path) as handle:
             return handle.read(MAX_HEADER_BYTES), handle.seek(0, 2)
@@ -559,11 +531,7 @@ def read_head(path: Path) -> tuple[bytes, int]:
 
 
 def parse_header(head: bytes, source: str) -> PlyHeader:
-    """Parse the first bytes of a PLY of plain splats; ``source`` names the file in errors.
-
-    Raises:
-        InvalidSplats: the bytes are not the header of a splat PLY.
-    """
+    """Parse the first bytes of a PLY of plain splats; ``source`` names the file in errors."""
     lines, elements, offset = parse_elements(head, source)
     first, *remaining = elements
     if first.name != "vertex":
@@ -587,11 +555,7 @@ class Element:
 
 
 def parse_elements(head: bytes, source: str) -> tuple[tuple[str, ...], list[Element], int]:
-    """Return the lines of a binary little-endian header, its elements, at least one, and its length in bytes.
-
-    Raises:
-        InvalidSplats: the bytes are not such a header.
-    """
+    """Return the lines of a binary little-endian header, its elements, at least one, and its length in bytes."""
     from plyfile import (
         PlyData,
         PlyListProperty,

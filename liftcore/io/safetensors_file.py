@@ -153,10 +153,6 @@ def map_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Return the tensors of a safetensors file, and its metadata.
 
     The mapping is private: what a caller writes into an array stays in memory.
-
-    Raises:
-        SafetensorError: it is no such file. OSError: it does not open.
-        ValueError: a type that NumPy does not have.
     """
     from safetensors import safe_open
 
@@ -183,9 +179,6 @@ def map_over(place: mmap.mmap, offset: int, file: IO[bytes], begin: int, size: i
     """Map ``size`` bytes of a file, from the page at ``begin`` on, over ``place`` from ``offset`` on.
 
     What is written there stays in memory. Windows maps nothing over addresses that are mapped: there it is a copy.
-
-    Raises:
-        OSError: they cannot be mapped.
     """
     if sys.platform == "win32":
         file.seek(begin)

@@ -96,11 +96,7 @@ def write_shards(folder: Path, tensors: Mapping[str, Tensor], metadata: str) -> 
 
 
 def map_shards(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Return the tensors of a sharded lift, and its metadata, as `map_tensors` has those of one file.
-
-    Raises:
-        SafetensorError, OSError, ValueError: a file is missing, is none, or does not fit the others.
-    """
+    """Return the tensors of a sharded lift, and its metadata, as `map_tensors` has those of one file."""
     with open_regular(folder / INDEX) as handle:
         content = handle.read(MAX_INDEX_BYTES + 1)
     if len(content) > MAX_INDEX_BYTES:
@@ -119,11 +115,7 @@ def map_shards(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
 
 
 def shard_at(path: Path) -> Shard:
-    """Read the header of a shard.
-
-    Raises:
-        OSError, ValueError: there is no whole shard.
-    """
+    """Read the header of a shard."""
     with open_regular(path) as handle:
         begin = 8 + int.from_bytes(handle.read(8), "little")
         if begin % PAGE or begin > 2 * PAGE:
@@ -142,11 +134,7 @@ def shard_at(path: Path) -> Shard:
 
 
 def map_rows(shards: Sequence[Shard]) -> np.ndarray:
-    """Return one array [P, F] over the rows of all shards, mapped; what is written into it stays in memory.
-
-    Raises:
-        OSError: they cannot be mapped. ValueError: shards differ, or one but the last ends within a page.
-    """
+    """Return one array [P, F] over the rows of all shards, mapped; what is written into it stays in memory."""
     first = shards[0]
     sizes = [shard.shape[0] * shard.shape[1] * shard.dtype.itemsize for shard in shards]
     if any((shard.shape[1], shard.dtype) != (first.shape[1], first.dtype) for shard in shards):

@@ -39,11 +39,7 @@ DOCUMENT = "splatlift"  # of the field's custom data: the labels' document as JS
 
 
 def open_library() -> Any:
-    """Import the modules of OpenUSD, and return them by their names.
-
-    Raises:
-        Unavailable: they are not installed.
-    """
+    """Import the modules of OpenUSD, and return them by their names."""
     try:
         modules = SimpleNamespace(**{name: import_module(f"pxr.{name}") for name in MODULES})
     except ImportError:
@@ -60,10 +56,6 @@ def usd_blocks(splats: Splats, document: Mapping[str, Any] | None = None, suffix
     Args:
         splats: P. Those of an instance are ``/Scene/instance_N``, the others ``/Scene/Splats``.
         document: of `liftcore.io.labels`; None: splats without labels. suffix: .usdc or .usdz.
-
-    Raises:
-        InvalidSplats: the format cannot store the columns.
-        Unavailable: usd-core is not installed.
     """
     pxr, columns = open_library(), stored_columns(splats)
     with scratch_folder("splatlift-") as folder:

@@ -19,22 +19,14 @@ def one_of(names: Iterable[str]) -> str:
 def check_choice(
     argument: str, value: object, names: Iterable[str], error: type[SplatliftError] = InvalidInput
 ) -> None:
-    """Refuse a value that is none of these names.
-
-    Raises:
-        SplatliftError: of the type ``error``.
-    """
+    """Refuse a value that is none of these names."""
     names = tuple(names)
     if not isinstance(value, str) or value not in names:
         raise error(argument, expected=one_of(names), got=repr(value)[:80])
 
 
 def as_path(path: object, argument: str = "path") -> Path:
-    """Return an argument as a path.
-
-    Raises:
-        InvalidInput: it is neither a path nor a text, or an empty text.
-    """
+    """Return an argument as a path."""
     if not isinstance(path, str | PathLike) or not str(path):
         got = f"{type(path).__name__} {path!r}"[:80]
         hint = "give several paths one by one" if isinstance(path, list | tuple) else ""
@@ -43,20 +35,12 @@ def as_path(path: object, argument: str = "path") -> Path:
 
 
 def as_paths(paths: Any, argument: str = "path") -> list[Path]:
-    """Return several paths as a list; a single one as a list of one.
-
-    Raises:
-        InvalidInput: as for `as_path`.
-    """
+    """Return several paths as a list; a single one as a list of one."""
     return [as_path(path, argument) for path in as_list(paths)]
 
 
 def check_text(argument: str, value: object) -> None:
-    """Refuse a value that is no text, or an empty one.
-
-    Raises:
-        InvalidInput: the value is refused.
-    """
+    """Refuse a value that is no text, or an empty one."""
     if not isinstance(value, str) or not value.strip():
         raise InvalidInput(argument, expected="a non-empty text", got=repr(value)[:80])
 
@@ -67,11 +51,7 @@ def as_list(values: Any) -> list[Any]:
 
 
 def check_count(argument: str, value: object, none: str = "") -> None:
-    """Refuse a count that is no integer of at least one; ``none`` is the meaning of None, empty if None is refused.
-
-    Raises:
-        InvalidSettings: the count is refused.
-    """
+    """Refuse a count that is no integer of at least one; ``none`` is the meaning of None, empty to refuse it."""
     if none and value is None:
         return
     if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:

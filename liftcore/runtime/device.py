@@ -80,11 +80,7 @@ def out_of_memory(error: BaseException) -> bool:
 
 @contextmanager
 def within_memory(device: Device) -> Iterator[None]:
-    """Convert an out-of-memory error of work that cannot be split any further.
-
-    Raises:
-        Unavailable: an allocation failed on the device.
-    """
+    """Convert an out-of-memory error of work that cannot be split any further."""
     try:
         yield
     except RuntimeError as error:

@@ -11,11 +11,7 @@ _DEVICE_NUMBER = re.compile(r"cuda:([0-9]{1,4})")
 
 
 def device_name(device: object) -> object:
-    """Return ``cuda`` for the current GPU, given as ``cuda:0`` or a ``torch.device``; other values unchanged.
-
-    Raises:
-        InvalidSettings: another GPU than the current one of this process.
-    """
+    """Return ``cuda`` for the current GPU, given as ``cuda:0`` or a ``torch.device``; other values unchanged."""
     name = str(device) if type(device).__module__ == "torch" else device
     match = _DEVICE_NUMBER.fullmatch(name) if isinstance(name, str) else None
     if match is None:

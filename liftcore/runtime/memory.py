@@ -29,9 +29,6 @@ def zeros(shape: tuple[int, ...], dtype: torch.dtype, *, name: str, in_file: boo
     Args:
         name: of the array, for errors. in_file: map a file in the temporary folder that is removed with the tensor;
             on Windows, which cannot delete mapped files, the page file serves.
-
-    Raises:
-        Unavailable: the disk is too full. Its space is reserved now, as a page without disk would kill the process.
     """
     size = prod(shape) * dtype.itemsize
     if not size:
@@ -54,11 +51,7 @@ def zeros(shape: tuple[int, ...], dtype: torch.dtype, *, name: str, in_file: boo
 
 
 def check_disk(size: int, name: str) -> None:
-    """Check early that the disk has ``size`` free bytes.
-
-    Raises:
-        Unavailable: it has fewer.
-    """
+    """Check early that the disk has ``size`` free bytes."""
     got = lack_of_disk(size)
     if got:
         raise _no_disk(size, name, got)
@@ -110,9 +103,6 @@ def group_memory(limit: str, usage: str, stat: str) -> int | None:
     """Return the free bytes of a control group, from the texts of its files; None if it has no limit.
 
     The usage includes the page cache of files, which is dropped on demand: it counts as free.
-
-    Raises:
-        ValueError: the texts are not those of a control group.
     """
     if limit.strip() == "max":
         return None

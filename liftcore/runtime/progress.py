@@ -65,9 +65,6 @@ def shown_progress(progress: Progress | bool | None) -> Iterator[Progress]:
     Args:
         progress: a function that is called as work advances; True for bars on a terminal and lines elsewhere; False
             for nothing; None for bars on a terminal and nothing elsewhere.
-
-    Raises:
-        InvalidSettings: ``progress`` is something else.
     """
     if progress is None:
         progress = sys.stderr is not None and sys.stderr.isatty()

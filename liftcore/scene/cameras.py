@@ -467,9 +467,6 @@ def read_views(
 
     Args:
         views: names and records. cameras_of: of a name and its record, its cameras.
-
-    Raises:
-        InvalidCameras: a record is malformed elsewhere, or no view has a pose.
     """
     cameras: list[Camera] = []
     broken: dict[str, InvalidPose] = {}
@@ -489,22 +486,14 @@ def read_views(
 
 
 def check_count(count: int, source: str) -> None:
-    """Refuse more views than a scene may have, by their number alone.
-
-    Raises:
-        InvalidCameras: there are more than MAX_VIEWS.
-    """
+    """Refuse more views than a scene may have, by their number alone."""
     if count > MAX_VIEWS:
         limit = f"at most {MAX_VIEWS} views"
         raise InvalidCameras(source, expected=limit, got=f"{count} or more", hint=FEWER_VIEWS)
 
 
 def behind_lens(camera: Camera, distortion: Distortion) -> Camera:
-    """Return the camera of a distorted photo, from a camera with the photo's size and intrinsics.
-
-    Raises:
-        InvalidCameras: a pinhole would see hardly anything of the photo.
-    """
+    """Return the camera of a distorted photo, from a camera with the photo's size and intrinsics."""
     photo = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
     lens = shared_lens(Lens(*photo, distortion))
     try:

@@ -73,11 +73,7 @@ class Weighting:
 
 
 def check_antialiased(kernel: Kernel, antialiased: bool) -> None:
-    """Refuse the mip filter's compensation where it has no meaning.
-
-    Raises:
-        InvalidSettings: the splats are no 3D Gaussians.
-    """
+    """Refuse the mip filter's compensation where it has no meaning."""
     if antialiased and kernel is not Kernel.GAUSSIAN_3D:
         raise InvalidSettings(
             "antialiased",
@@ -88,11 +84,7 @@ def check_antialiased(kernel: Kernel, antialiased: bool) -> None:
 
 
 def check_weighting(weighting: Weighting) -> None:
-    """Refuse what is out of its range.
-
-    Raises:
-        InvalidInput: the power or top_k.
-    """
+    """Refuse what is out of its range."""
     if weighting.power not in (1, 2):
         raise InvalidInput("power", expected="1 or 2", got=str(weighting.power))
     if not 0 <= weighting.top_k <= MOST_OF_A_RAY:

@@ -196,11 +196,7 @@ class Lens:
 
     @cached_property
     def inner(self) -> Rectangle:
-        """The largest rectangle within the photo.
-
-        Raises:
-            ValueError: the rectangle is empty or covers hardly any of the photo; the message has the reason.
-        """
+        """The largest rectangle within the photo."""
         rectangle = self._within_reach(self._ends_of_sides(INWARDS))
         if rectangle.left >= rectangle.right or rectangle.top >= rectangle.bottom:
             raise ValueError("one whose pinhole image within the photo is empty")

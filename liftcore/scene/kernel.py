@@ -20,11 +20,7 @@ class Kernel(StrEnum):
 
 
 def kernel_named(name: Kernel | str) -> Kernel:
-    """Return the kernel of a name.
-
-    Raises:
-        InvalidSplats: there is none of that name.
-    """
+    """Return the kernel of a name."""
     try:
         return Kernel(name)
     except ValueError:

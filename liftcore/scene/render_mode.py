@@ -55,11 +55,7 @@ _OF_NERFSTUDIO = re.compile(r"^ +rasterize_mode: *(classic|antialiased) *$", re.
 
 
 def render_mode_of(mode: RenderMode | str | None) -> RenderMode | None:
-    """Return the mode of a name: ``classic``, ``antialiased`` or ``2dgs``; None stays None.
-
-    Raises:
-        InvalidSplats: there is none of that name.
-    """
+    """Return the mode of a name: ``classic``, ``antialiased`` or ``2dgs``; None stays None."""
     if mode is None or isinstance(mode, RenderMode):
         return mode
     if not isinstance(mode, str) or mode not in set(RenderModel):

@@ -20,9 +20,6 @@ def chosen_rows(keep: Rows, count: int) -> Tensor:
 
     Args:
         keep: booleans [P], a slice, or whole numbers [n], of which negative ones count from the end. count: P.
-
-    Raises:
-        InvalidInput: a mask of another length, a number out of range, something else than these, or no row at all.
     """
     expected = f"booleans [{count}], a slice, or row numbers in 0..{count - 1}"
     if isinstance(keep, slice):

@@ -374,9 +374,6 @@ def joined_harmonics(first: Tensor, rest: Array | None, names: tuple[str, str]) 
 
     Args:
         names: of both, for errors.
-
-    Raises:
-        InvalidSplats: they have other shapes.
     """
     higher = first[:0] if rest is None else _floats(names[1], rest)
     try:
@@ -478,11 +475,7 @@ def _column(name: str, values: Array, shape: tuple[Any, ...], device: torch.devi
 
 
 def _repair_columns(columns: dict[str, Tensor]) -> tuple[dict[str, Tensor], list[str]]:
-    """Replace NaN and infinity in columns (`Splats`), and return a warning of each kind.
-
-    Raises:
-        InvalidSplats: no splat has a place, a size, a turn and an opacity.
-    """
+    """Replace NaN and infinity in columns (`Splats`), and return a warning of each kind."""
     bad = {name: ~_meaningful(name, values) for name, values in columns.items() if not _all_meaningful(name, values)}
     if not bad:
         return columns, []

@@ -37,9 +37,6 @@ def view_names(images: Sequence[str]) -> list[str]:
 
     Were it only those that collide, the longer of two cameras of a rig would have its last photos named otherwise
     than its first.
-
-    Raises:
-        InvalidCameras: a name with control characters, or with half of a surrogate pair, which UTF-8 cannot encode.
     """
     for image in images:
         require_name(image, "image name", InvalidCameras)
@@ -89,11 +86,7 @@ def cameras_of_views(views: Collection[str], cameras: Collection[str]) -> dict[s
 
 
 def require_pairs(views: Collection[str], cameras: Collection[str]) -> dict[str, str]:
-    """Return `cameras_of_views` of the views of features, and refuse none.
-
-    Raises:
-        InvalidFeatures: no view has a camera.
-    """
+    """Return `cameras_of_views` of the views of features, and refuse none."""
     pairs = cameras_of_views(views, cameras)
     if not pairs:
         raise InvalidFeatures(

@@ -71,9 +71,6 @@ def check_encoder(spec: str) -> None:
     """Check that a specification is valid, that its file opens, and that a table has a valid header.
 
     Values are read and checked when the encoder is opened.
-
-    Raises:
-        InvalidInput: an unknown encoder, a file that is missing or does not open, or a file that is not a table.
     """
     file = encoder_file(spec)
     if file is None:
@@ -130,10 +127,6 @@ def encoder_of_space(text_space: str, hint: str = "", *, stand_in: bool = False)
         hint: the advice of an error.
         stand_in: if the weights are not available, use the shipped table of this encoder, which encodes only its
             own words.
-
-    Raises:
-        InvalidQuery: the space has no name, has no words, or does not belong to a known encoder.
-        Unavailable: the encoder's weights are not on this machine, and no shipped table is used.
     """
     if text_space in ("", NO_WORDS):
         space = f"is {NO_WORDS!r}: its features share no space with words" if text_space else "is not recorded"
@@ -153,11 +146,7 @@ def encoder_of_space(text_space: str, hint: str = "", *, stand_in: bool = False)
 
 
 def check_texts(texts: Sequence[str], argument: str = "texts") -> None:
-    """Check that ``texts`` is a list of non-empty texts.
-
-    Raises:
-        InvalidQuery: a single text, items that are not texts, or an empty text.
-    """
+    """Check that ``texts`` is a list of non-empty texts."""
     is_list = isinstance(texts, Collection) and not isinstance(texts, str)
     if not is_list or not all(isinstance(text, str) for text in texts):
         raise InvalidQuery(argument, expected="a list of texts", got=repr(texts)[:80], hint='such as ["a mug"]')

@@ -41,10 +41,6 @@ def open_model(kind: str, spec: str) -> OpenedModel:
     Args:
         kind: the user's text before the colon, for messages.
         spec: the text after the colon.
-
-    Raises:
-        InvalidQuery: an unknown model or tag, or a file without weights of this model.
-        Unavailable: the specification has no weights, or they are not available here.
     """
     model_name, at, file = spec.partition("@")
     model_name, _, tag = (model_name, "", "") if at else spec.partition("/")
@@ -68,11 +64,7 @@ def create_model(model_name: str, pretrained: str | None) -> Any:
 
 
 def tokenizer_of(model_name: str) -> Callable[[list[str]], Any]:
-    """Return the model's tokenizer.
-
-    Raises:
-        Unavailable: it needs the package transformers, which is not installed.
-    """
+    """Return the model's tokenizer."""
     with _quiet():
         try:
             return library().get_tokenizer(model_name)
@@ -84,11 +76,7 @@ def tokenizer_of(model_name: str) -> Callable[[list[str]], Any]:
 
 
 def library() -> Any:
-    """Import and return the module open_clip.
-
-    Raises:
-        Unavailable: it is not installed.
-    """
+    """Import and return the module open_clip."""
     try:
         import_torchvision()
         import open_clip
@@ -172,10 +160,6 @@ class OpenClipEncoder:
         """Load ``MODEL/PRETRAINED_TAG`` (cached or downloaded by open_clip) or ``MODEL@WEIGHTS_FILE``.
 
         Local files are read with ``weights_only``: a pickle that contains more than tensors is an error.
-
-        Raises:
-            InvalidQuery: an unknown model or tag, or a file without weights of this model.
-            Unavailable: the specification has no weights, or they are not available here.
         """
         model = open_model("open_clip", spec)
         return cls(model.name, _without_images(model.model), tokenizer_of(model.model_name), templates)
@@ -187,11 +171,7 @@ class OpenClipEncoder:
         return cls(f"open_clip:{model_name} (random)", model, tokenizer_of(model_name), templates)
 
     def encode(self, texts: Sequence[str]) -> np.ndarray:
-        """Encode n texts as [n, F] f32 unit rows.
-
-        Raises:
-            InvalidQuery: an empty text.
-        """
+        """Encode n texts as [n, F] f32 unit rows."""
         check_texts(texts)
         if not texts:
             return np.empty((0, self.channels), np.float32)

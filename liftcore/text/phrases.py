@@ -104,9 +104,6 @@ def read_phrase(text: str, is_word: Callable[[str], bool] | None) -> Reading:
 
     Args:
         is_word: whether a table has a word for a text as a whole; None for an encoder that reads any text.
-
-    Raises:
-        InvalidQuery: a phrase that names no thing by itself, or asks for more than scores can answer.
     """
     is_name = is_word or (lambda _: False)
     typed = _tidy(text)

@@ -23,11 +23,7 @@ EXPECTED = "a safetensors file with embeddings and words"
 
 
 def check_table(path: Path) -> None:
-    """Check the header of a table, without reading its values.
-
-    Raises:
-        InvalidInput: the file is not a table.
-    """
+    """Check the header of a table, without reading its values."""
     from safetensors import SafetensorError, safe_open
 
     from liftcore.io.kinds import wrong_kind
@@ -83,11 +79,7 @@ class TableEncoder:
 
     @classmethod
     def open(cls, path: Path) -> Self:
-        """Open ``embeddings`` [n, F] f16 or f32 with metadata ``words`` (a JSON list of n strings).
-
-        Raises:
-            InvalidTable: the file does not exist, or is not a table.
-        """
+        """Open ``embeddings`` [n, F] f16 or f32 with metadata ``words`` (a JSON list of n strings)."""
         from liftcore.io.kinds import wrong_kind  # imported late: it loads readers of all kinds, for errors alone
 
         name = f"text table {path.name}"
@@ -113,11 +105,7 @@ class TableEncoder:
 
     @classmethod
     def of(cls, name: str, words: str, embeddings: np.ndarray) -> Self:
-        """Create a table from the words of a file, a JSON list of n strings, and its embeddings [n, F] f16 or f32.
-
-        Raises:
-            InvalidTable: the words are not such a list, or the embeddings do not match them.
-        """
+        """Create a table from the words of a file, a JSON list of n strings, and its embeddings [n, F] f16 or f32."""
         try:
             word_list = json.loads(words)
         except (ValueError, RecursionError) as error:
@@ -136,11 +124,7 @@ class TableEncoder:
         return self._unit
 
     def encode(self, texts: Sequence[str]) -> np.ndarray:
-        """Encode n words as [n, F] f32 unit rows.
-
-        Raises:
-            InvalidQuery: a word that is not in the table; the error lists the nearest ones.
-        """
+        """Encode n words as [n, F] f32 unit rows."""
         check_texts(texts)
         return self._unit[[self._row(text) for text in texts]]
 

@@ -22,11 +22,7 @@ log = logging.getLogger(__name__)
 
 
 def fetch_weights(label: str, load: Callable[[], T], hint: str) -> T:
-    """Call ``load``, which reads weights of the Hugging Face Hub, and return its result. A download is logged.
-
-    Raises:
-        Unavailable: the weights are not in the cache, and the network is not reachable or does not have them.
-    """
+    """Call ``load``, which reads weights of the Hugging Face Hub, and return its result. A download is logged."""
     from huggingface_hub import constants
 
     with _cache_alone(), suppress(Exception):  # each library raises its own types

@@ -23,9 +23,6 @@ def at_levels(features: ViewFeatures, levels: Levels, view: str) -> ViewFeatures
 
     Args:
         levels: "rows" as they are, a number that level alone. view: named in an error.
-
-    Raises:
-        InvalidFeatures: the view lacks the level.
     """
     if levels == "rows":
         return features

@@ -142,9 +142,6 @@ class Lift:
 
         All columns follow. Objects and clusters of which no splat is left go, and the others are numbered anew in
         their order. It remembers no file of splats, as a file's rows are others. Diagnostics stay those of the whole.
-
-        Raises:
-            InvalidInput: they choose no splat, or are none of these (`liftcore.scene.rows`).
         """
         from liftcore.scene.rows import chosen_rows
 
@@ -181,9 +178,6 @@ class Lift:
 
         Features, total weight and objects know no frame and stay. What it remembers of places moves along; it forgets
         the files of its splats and cameras, which are in the frame of before.
-
-        Raises:
-            InvalidInput: it is no similarity.
         """
         import numpy as np
 
@@ -213,9 +207,6 @@ class Lift:
         """Refuse splats that are not those of the lift, row for row, by their number and where some of them lie.
 
         Copies that were quantised pass: half of the landmarks must lie within NEAR of their extent.
-
-        Raises:
-            InvalidSplats: they are something else, another number of them, in another order or moved.
         """
         from liftcore.scene.splats import Splats
 

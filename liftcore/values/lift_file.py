@@ -57,10 +57,6 @@ def save_lift(lift: Lift, path: Path | str) -> None:
 
     Args:
         path: a file; with ``.shards`` at its end, a folder of shards.
-
-    Raises:
-        InvalidInput: it lies elsewhere and cannot be sent there.
-        InvalidLift: features and those of its nodes have other channels, as after features were replaced by others.
     """
     from liftcore.io.safetensors_file import write_tensors
 
@@ -86,11 +82,7 @@ def tensors_of(lift: Lift) -> dict[str, Tensor]:
 
 
 def open_lift(path: Path | str) -> Lift:
-    """Open a lift file; the tensors are mapped, not read.
-
-    Raises:
-        InvalidLift: the file is missing, is not a safetensors file, or is not a lift with a row a splat.
-    """
+    """Open a lift file; the tensors are mapped, not read."""
     import torch
 
     from liftcore.values.lift import Lift
@@ -101,11 +93,7 @@ def open_lift(path: Path | str) -> Lift:
 
 
 def read_lift(path: Path | str) -> tuple[dict[str, np.ndarray], str]:
-    """Return the mapped arrays of a lift by their names, and its metadata as JSON: without torch and pydantic.
-
-    Raises:
-        InvalidLift: as `open_lift` has it.
-    """
+    """Return the mapped arrays of a lift by their names, and its metadata as JSON: without torch and pydantic."""
     source = as_path(path)
     try:
         return _read_arrays(source, path)
@@ -136,11 +124,7 @@ def _read_arrays(source: Path, path: Path | str) -> tuple[dict[str, np.ndarray],
 
 
 def parse_metadata(text: str, path: Path | str) -> LiftMetadata:
-    """Return the metadata of a lift file from its JSON.
-
-    Raises:
-        InvalidLift: they are none.
-    """
+    """Return the metadata of a lift file from its JSON."""
     from liftcore.values.lift import LiftMetadata
 
     try:
@@ -151,11 +135,7 @@ def parse_metadata(text: str, path: Path | str) -> LiftMetadata:
 
 
 def _check_format(text: str, path: Path | str) -> None:
-    """Refuse the metadata of a lift of a later format.
-
-    Raises:
-        InvalidLift: their format is another. ValueError: they are no JSON.
-    """
+    """Refuse the metadata of a lift of a later format."""
     metadata = json.loads(text)
     name = metadata.get("format", FORMAT) if isinstance(metadata, dict) else FORMAT
     if name != FORMAT:
@@ -232,11 +212,7 @@ def input_files(splats: Path, cameras: Path, features: Sequence[Path]) -> list[I
 
 
 def input_file(path: Path) -> InputFile:
-    """Return the path and the digest of a file, or of a SOG that is not bundled.
-
-    Raises:
-        OSError: it does not open, or is no regular file.
-    """
+    """Return the path and the digest of a file, or of a SOG that is not bundled."""
     from liftcore.io.sog import META, sog_files
     from liftcore.values.lift import InputFile
 
@@ -309,11 +285,7 @@ def _in_store(lift: Path, sha256: str) -> Iterator[Path]:
 
 
 def has_poses(place: Path, metadata: LiftMetadata) -> bool:
-    """Return True if a file or folder has the cameras of the lifted views as they were, whatever others it has.
-
-    Raises:
-        InvalidCameras: it does not read.
-    """
+    """Return True if a file or folder has the cameras of the lifted views as they were, whatever others it has."""
     from liftcore.io.cameras import read_cameras
 
     cameras = read_cameras(place)
@@ -334,10 +306,6 @@ def poses_of(cameras: Sequence[Camera]) -> str:
 
 
 def sha256_of(path: Path) -> str:
-    """Return the digest of a file, in hexadecimal digits.
-
-    Raises:
-        OSError: it does not open, or is no regular file.
-    """
+    """Return the digest of a file, in hexadecimal digits."""
     with open_regular(path) as handle:
         return hashlib.file_digest(handle, "sha256").hexdigest()

@@ -27,12 +27,7 @@ class LiftViews:
 
     @classmethod
     def of(cls, views: ViewValues, cameras: Cameras | Mapping[str, Camera], settings: LiftSettings) -> "LiftViews":
-        """Pair views with cameras by name, every ``view_stride``-th of them.
-
-        Raises:
-            InvalidFeatures: no view has a camera, or views are malformed.
-            InvalidCameras: there is no camera.
-        """
+        """Pair views with cameras by name, every ``view_stride``-th of them."""
         by_name = cameras if isinstance(cameras, Cameras) else Cameras(cameras)
         features, unpaired = pair(as_views(views), by_name)
         return cls(by_name, features, features.views[:: settings.view_stride], unpaired)

@@ -153,11 +153,6 @@ def as_views(
     Args:
         views: `Views`, a mapping of names, which may read its values lazily, or pairs of a name and a value.
         scratch: the folder for an iterator's views; None: the system's for temporary files.
-
-    Raises:
-        InvalidFeatures: there are none, one is neither regions nor a grid, a name comes twice, channels differ, or it
-            is something else, such as a path.
-        Unavailable: the disk has no room for an iterator's views.
     """
     if isinstance(views, Views):
         return views
@@ -210,11 +205,7 @@ def read_features(*paths: str | Path) -> Views:
 
 
 def pair(views: Views, cameras: Mapping[str, Camera]) -> tuple[Views, list[str]]:
-    """Return the views that have a camera, named like it, and the names of views without one, to skip with a warning.
-
-    Raises:
-        InvalidFeatures: no view has a camera.
-    """
+    """Return the views that have a camera, named like it, and the names of views without one."""
     names = require_pairs(views.views, cameras)
     by_camera = {name: view for view, name in names.items()}
     return views.seen_by(by_camera, cameras), [view for view in views if view not in names]
@@ -239,9 +230,6 @@ def write_pack(
             names) and what else to keep.
         progress: called in the stages "check" and "pack", in views.
         table: words of the pack's own, of as many channels.
-
-    Raises:
-        InvalidFeatures: there are no views, or their channels differ.
     """
     if not views:
         raise InvalidFeatures(str(path), expected="at least one view", got="none")

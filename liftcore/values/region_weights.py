@@ -218,9 +218,6 @@ def stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None = N
 
     Args:
         splats: P. threads: None takes the cores that this process may use. The number changes no bit.
-
-    Raises:
-        Unavailable: there are more regions than four bytes can number, or no room for W.
     """
     try:
         return _stacked(parts, splats, threads)

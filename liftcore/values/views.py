@@ -184,9 +184,6 @@ def label_levels(masks: Sequence[np.ndarray], location: str) -> np.ndarray:
 
     Args:
         masks: [h, w] bool each, at least one, all of one size; each is read twice. location: the argument, in errors.
-
-    Raises:
-        InvalidFeatures: they take more than MAX_LEVELS levels.
     """
     boxes, areas = zip(*map(_extent, masks), strict=True)
     # Space for all levels that there may be: pages of those that are never written take no memory.
@@ -247,11 +244,7 @@ def _levels_of(masks: np.ndarray, levels: Sequence[int], location: str) -> np.nd
 
 
 def check_finite(values: Tensor, location: str) -> None:
-    """Refuse NaN, infinity, and what no encoder gives and whose squares would be infinite.
-
-    Raises:
-        InvalidFeatures: some value is not finite or too large; the error says where and how many.
-    """
+    """Refuse NaN, infinity, and what no encoder gives and whose squares would be infinite."""
     # The extremes carry NaN and infinity along, and cost a tenth of testing every value.
     low, high = torch.aminmax(values) if values.numel() else values.new_zeros(2)
     if not (float(low) >= -LARGEST and float(high) <= LARGEST):  # in float64: float16 would take the bound for inf

@@ -66,10 +66,6 @@ def open_image_encoder(spec: str, device: str = "cpu") -> ImageEncoder:
     Args:
         spec: one of ``IMAGE_ENCODERS``; weights by name are downloaded by the library, or read from its cache.
         device: as torch names it.
-
-    Raises:
-        InvalidInput: the specification is not one of these, or a file does not contain weights of the model.
-        Unavailable: the weights, or the device, are not on this machine.
     """
     kind, _, rest = spec.partition(":")
     if not rest or kind not in ("maskclip", "timm"):
@@ -86,11 +82,7 @@ def open_image_encoder(spec: str, device: str = "cpu") -> ImageEncoder:
 
 
 def device_named(name: str) -> torch.device:
-    """Return a device by torch's name of it.
-
-    Raises:
-        Unavailable: this device is not available.
-    """
+    """Return a device by torch's name of it."""
     try:
         device = torch.device(name)
         torch.empty(0, device=device)

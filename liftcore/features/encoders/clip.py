@@ -37,12 +37,7 @@ class ClipImageEncoder:
 
     @classmethod
     def open(cls, spec: str, device: torch.device) -> Self:
-        """Load ``MODEL/PRETRAINED_TAG`` or ``MODEL@WEIGHTS_FILE``.
-
-        Raises:
-            InvalidInput: an unknown model, an unsupported image tower, or a file without weights of the model.
-            Unavailable: the specification has no weights, or they are not available here.
-        """
+        """Load ``MODEL/PRETRAINED_TAG`` or ``MODEL@WEIGHTS_FILE``."""
         clip_model = open_model("maskclip", spec)
         return cls(clip_model, space_of(clip_model, spec), device)
 

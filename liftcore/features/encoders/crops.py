@@ -45,12 +45,7 @@ class CropEncoder:
 
     @classmethod
     def open(cls, spec: str, device: torch.device) -> Self:
-        """Load ``open_clip:MODEL/TAG`` or ``open_clip:MODEL@FILE``.
-
-        Raises:
-            InvalidInput: another specification, an unknown model, or a file without weights of the model.
-            Unavailable: the specification has no weights, or they are not available here.
-        """
+        """Load ``open_clip:MODEL/TAG`` or ``open_clip:MODEL@FILE``."""
         kind, _, rest = spec.partition(":")
         if kind != "open_clip" or not rest:
             raise InvalidInput("encoder", expected=SPEC, got=repr(spec))
@@ -75,9 +70,6 @@ def crop_vectors(
     Args:
         masks: view -> file, from `liftcore.features.masks.mask_files`. photos: view -> image.
         unlabelled: value of pixels without a mask in label pictures. progress: called for "encode", in views.
-
-    Raises:
-        InvalidInput: a view has no photo, or a photo cannot be read. InvalidFeatures: masks that cannot be read.
     """
     missing_photos = [view for view in masks if view not in photos]
     if missing_photos:

@@ -82,9 +82,6 @@ def write_encoded(
         settings: of the resizing and the batches.
         progress: called for the stages "encode", "check" and "pack", in views.
         sizes: view name -> width and height of its camera, which give the orientation of photos.
-
-    Raises:
-        InvalidInput: a file is not an image, the size is too large or too small, or a feature is not finite.
     """
     patch = encoder.pixels.patch
     if settings.size is not None and settings.size < patch:
@@ -208,11 +205,7 @@ def encode_images(
 
 
 def find_images(paths: Path | str | Sequence[Path | str]) -> dict[str, Path]:
-    """Return view name -> image of files and folders, sorted by name; views of sub-folders are named ``camA/000``.
-
-    Raises:
-        InvalidInput: a path that does not exist, a folder without images, or two images of one view.
-    """
+    """Return view name -> image of files and folders, sorted by name; views of sub-folders are named ``camA/000``."""
     images: dict[str, Path] = {}
     for path in as_paths(paths, "images"):
         for file in _images_of(path):
@@ -247,9 +240,6 @@ def read_image(path: Path | str, size: tuple[int, int] | None = None) -> tuple[I
 
     Args:
         path: of the image. size: width and height of its camera or masks, of any resolution; None: unknown.
-
-    Raises:
-        InvalidInput: the file is not an image, is truncated, or has more pixels than Pillow opens.
     """
     path = Path(path)
     try:
@@ -311,9 +301,6 @@ def grid_size(width: int, height: int, shorter: int, patch: int) -> tuple[int, i
     """Return columns and rows of the grid of an image [pixels] whose shorter side is resized to ``shorter`` pixels.
 
     Sides are rounded to whole patches, at least one, so that cells tile the image exactly.
-
-    Raises:
-        InvalidInput: the grid would be too large.
     """
     scale = shorter / min(width, height) / patch
     columns, rows = (max(1, round(side * scale)) for side in (width, height))

@@ -36,12 +36,7 @@ class TimmEncoder:
 
     @classmethod
     def open(cls, spec: str, device: torch.device) -> Self:
-        """Load ``NAME`` (cached or downloaded by timm) or ``NAME@WEIGHTS_FILE`` (tensors only).
-
-        Raises:
-            InvalidInput: an unknown model, one that takes a single image size, or a file without its weights.
-            Unavailable: there are no weights of that name, or they are not available here.
-        """
+        """Load ``NAME`` (cached or downloaded by timm) or ``NAME@WEIGHTS_FILE`` (tensors only)."""
         name, at, file = spec.partition("@")
         label = f"encoder timm:{spec}"
         _check_name(label, name)
