@@ -16,11 +16,9 @@ from liftcore.lifting.geometry import weigh_views
 from liftcore.lifting.planning.contradictions import contradictions
 from liftcore.lifting.planning.views import (
     NOISE_VIEWS,
-    WELL_COVERED,
     Visibility,
     count_covering_views,
     estimate_view_noise,
-    spare_views,
     view_order,
     visibility,
 )
@@ -28,7 +26,7 @@ from liftcore.raster import open_raster
 from liftcore.raster.base import Raster
 from liftcore.runtime.device import CPU, Device
 from liftcore.runtime.memory import check_disk, free_memory, lack_of_disk
-from liftcore.runtime.one_line import join_names, one_line
+from liftcore.runtime.one_line import one_line
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import silent
 from liftcore.scene.cameras import Camera, Cameras, distortion_warning
@@ -50,7 +48,6 @@ from liftcore.values.views import DENSE_ROWS
 FEW_VIEWS = 32  # and fewer are all lifted, whatever view_cosine: estimating the noise would cost what it saves
 TIMED_VIEWS = 32  # and more have one of them timed, which costs little of the lift then
 TRACED_RAYS = 1_000  # of a view of a dense map, to count the splats on a ray
-SHOWN_VIEWS = 6  # names in a line for people
 MIB, GIB = 2**20, 2**30
 LIBRARIES = 450_000_000  # of torch, numba, numpy and the compiled kernels, before anything is read
 SCENE_BYTES = 230  # of a splat: in the raster, its order and counts in a view, sums of the solution
@@ -90,7 +87,6 @@ class Plan:
     left_out: tuple[str, ...]  # that the settings' coverage or view_cosine leaves out
     available_views: int  # views with features and a camera, also those that the settings leave out
     view_cosine: float | None  # expected, of the views' features to those of all, if the setting chose views
-    spare: tuple[str, ...]  # of those lifted: WELL_COVERED of the others see the same splats
     seen_share: float  # of the splats, that some view can see, before occlusion
     splats_a_view: float  # that a view can see, before occlusion
     levels: tuple[int, int] | None  # the single level of the setting, and the number of levels in maps; None: all
@@ -142,7 +138,6 @@ class Plan:
             "views": len(self.views),
             "views_left_out": len(self.left_out),
             "view_cosine": self.view_cosine,
-            "spare_views": list(self.spare),
             "levels": None if self.levels is None else {"alone": self.levels[0], "of": self.levels[1]},
             "channels": self.channels,
             "dtype": self.dtype,
@@ -155,8 +150,7 @@ class Plan:
     def summary(self) -> Iterator[str]:
         """Yield three lines for people: the scene and its views, the channels, the memory."""
         visible = f"{self.seen_share:.1%} in some view's field"
-        spare = f", {len(self.spare)} of them see nothing that {WELL_COVERED} others do not" if self.spare else ""
-        views = f"{len(self.views)} of {self.available_views} views{spare}"
+        views = f"{len(self.views)} of {self.available_views} views"
         yield f"{self.splats} splats ({self.rendered}), {visible}; {views}"
         level = f", level {self.levels[0]} alone of {self.levels[1]}, as the settings choose" if self.levels else ""
         yield f"{self.channels} channels, stored as {self.dtype}{level}"
@@ -171,17 +165,11 @@ class Plan:
         omitted = f"{len(self.left_out)} views left out" if self.left_out else "no view left out"
         if self.view_cosine is not None:
             omitted += f" (expected: features with a cosine of {self.view_cosine:.3f} to those of all)"
-        yield f"  {omitted}{self._spare_line()}"
+        yield f"  {omitted}"
         yield f"  {channels}"
         parts = ", ".join(f"{name} {size / MIB:.0f}" for name, size in self.memory.items())
         yield f"  {memory} ({parts})"
         yield from (f"warning: {warning}" for warning in (*self.warnings, *self.input_warnings))
-
-    def _spare_line(self) -> str:
-        if not self.spare:
-            return ""
-        names = join_names(self.spare, SHOWN_VIEWS)
-        return f"; {len(self.spare)} add nothing that {WELL_COVERED} others do not show: {names}"
 
 
 @one_thread()
@@ -242,7 +230,6 @@ def plan_lift(
         left_out=tuple(name for name in views.names if name not in lifted),
         available_views=len(features),
         view_cosine=expected,
-        spare=tuple(names[k] for k in spare_views(visible)),
         seen_share=visible.seen_share,
         splats_a_view=visible.splats_a_view,
         levels=_single_level(features, names, settings),

@@ -61,7 +61,6 @@ T = TypeVar("T")
 SAMPLE = 16_384  # splats at most; a view of them takes a millisecond
 ORDER_SPLATS = 4_096  # at most: 300 views are in order after .3 s, where 16,384 take 1 s
 SIDES = 24  # directions of view: three of each octant
-WELL_COVERED = 8  # views of a splat, beyond which another view is redundant
 NOISE_SIDE = 160  # pixels of an image's longer side, about
 NOISE_CHANNELS = 64
 NOISE_VIEWS = 12
@@ -200,22 +199,6 @@ def count_covering_views(visible: Visibility, order: Sequence[int], times: int) 
     target = times * int(in_view.any(axis=0).sum())
     counts = in_view.sum(axis=1)[list(order)].cumsum()
     return min(len(order), int(np.searchsorted(counts, target)) + 1)
-
-
-def spare_views(visible: Visibility) -> list[int]:
-    """List views that may all be left out: WELL_COVERED of the remaining views see every splat that they see.
-
-    The search begins with the view that sees the fewest splats.
-    """
-    in_view = visible.in_view
-    times = in_view.sum(axis=0)
-    spare = []
-    for view in np.argsort(in_view.sum(axis=1), kind="stable"):
-        splats = in_view[view]
-        if splats.sum() == 0 or int(times[splats].min()) > WELL_COVERED:
-            spare.append(int(view))
-            times = times - splats
-    return sorted(spare)
 
 
 @dataclass(frozen=True)

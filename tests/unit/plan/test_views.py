@@ -8,10 +8,7 @@ import torch
 
 from liftcore.lifting.files import lift_files
 from liftcore.lifting.planning.views import (
-    WELL_COVERED,
-    Visibility,
     count_covering_views,
-    spare_views,
     view_order,
     visibility,
 )
@@ -27,12 +24,6 @@ def ring(count: int) -> list:
     angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
     places = [4 * np.array([np.cos(angle), 0.2, np.sin(angle)]) for angle in angles]
     return [look_at(f"v{k}", place, 40, 30, 40.0) for k, place in enumerate(places)]
-
-
-def seen_as(in_view: list[list[int]]) -> Visibility:
-    areas = np.array(in_view, np.float32)
-    views, splats = areas.shape
-    return Visibility(areas, np.zeros((views, 3)), np.ones((splats, 3), np.float32), splats)
 
 
 @pytest.mark.parametrize("kernel", list(Kernel))
@@ -74,15 +65,6 @@ def test_views_are_added_until_each_splat_is_shown_often_enough_and_the_choice_r
         )
     assert count_covering_views(visible, order, 0) == 1
     assert count_covering_views(visible, order, 1_000) == 12
-
-
-def test_views_that_add_nothing_can_be_left_out_together():
-    copies, distinct = [[1, 1, 0]] * (WELL_COVERED + 3), [[0, 1, 1]]
-    spare = spare_views(seen_as(copies + distinct))
-    assert WELL_COVERED + 3 not in spare  # it alone shows the third splat
-    stay = [k for k in range(WELL_COVERED + 4) if k not in spare]
-    assert spare
-    assert np.array(copies + distinct)[stay].sum(axis=0)[0] >= WELL_COVERED
 
 
 def test_a_lift_with_coverage_is_the_lift_of_the_chosen_views(tmp_path):
