@@ -37,10 +37,11 @@ from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, silent
 from liftcore.scene.neighbours import SplatGraph
 from liftcore.scene.splats import Splats
+from liftcore.solve import shared_rows as wide
 
 LEAST_CONFIDENCE = 0.02  # lower bound of c, for splats of a single view
 LEAST_WEIGHT = 1e-30  # of the largest; a splat below it has no total weight
-BLOCK = 8 * LANES  # channels solved at a time: three [P, 64] f32
+BLOCK = 2 * wide.LANES  # channels solved at a time: three [P, 64] f32
 ROWS = 1 << 13  # splats per task
 PROBES = LANES  # random sums of all channels, whose steps are used
 # Of the gradient, relative to that at X0, over sqrt(1 + lambda): components that vary slowly over the scene have a
@@ -243,37 +244,21 @@ def step_rows(
     first, last, starts, neighbours, couplings, weights, diagonal, start, X, before, length, turn
 ):  # fmt: skip
     """Overwrite the iterate before X by that after it, in rows first..last of flat [P, 64] arrays."""
-    minus_one, momentum = in_all_lanes(np.float32(-1.0)), in_all_lanes(turn)
     for j in range(first, last):
-        at, weight, minus = BLOCK * j, in_all_lanes(weights[j]), in_all_lanes(-diagonal[j])
-        far = in_all_lanes(length / diagonal[j] if diagonal[j] > 0 else np.float32(0.0))
-        x0, x1 = lanes_at(X, at), lanes_at(X, at + 8)
-        x2, x3 = lanes_at(X, at + 16), lanes_at(X, at + 24)
-        x4, x5 = lanes_at(X, at + 32), lanes_at(X, at + 40)
-        x6, x7 = lanes_at(X, at + 48), lanes_at(X, at + 56)
-        r0 = plus_product(times(weight, lanes_at(start, at)), minus, x0)
-        r1 = plus_product(times(weight, lanes_at(start, at + 8)), minus, x1)
-        r2 = plus_product(times(weight, lanes_at(start, at + 16)), minus, x2)
-        r3 = plus_product(times(weight, lanes_at(start, at + 24)), minus, x3)
-        r4 = plus_product(times(weight, lanes_at(start, at + 32)), minus, x4)
-        r5 = plus_product(times(weight, lanes_at(start, at + 40)), minus, x5)
-        r6 = plus_product(times(weight, lanes_at(start, at + 48)), minus, x6)
-        r7 = plus_product(times(weight, lanes_at(start, at + 56)), minus, x7)
+        far = length / diagonal[j] if diagonal[j] > 0 else np.float32(0.0)
+        at, middle = BLOCK * j, BLOCK * j + wide.LANES
+        x, y = wide.lanes_at(X, at), wide.lanes_at(X, middle)
+        p = wide.plus_times(wide.no_lanes(), weights[j], wide.lanes_at(start, at))
+        q = wide.plus_times(wide.no_lanes(), weights[j], wide.lanes_at(start, middle))
+        p, q = wide.plus_times(p, -diagonal[j], x), wide.plus_times(q, -diagonal[j], y)
         for n in range(starts[j], starts[j + 1]):
-            k, coupling = BLOCK * np.int64(neighbours[n]), in_all_lanes(couplings[n])
-            r0 = plus_product(r0, coupling, lanes_at(X, k))
-            r1 = plus_product(r1, coupling, lanes_at(X, k + 8))
-            r2 = plus_product(r2, coupling, lanes_at(X, k + 16))
-            r3 = plus_product(r3, coupling, lanes_at(X, k + 24))
-            r4 = plus_product(r4, coupling, lanes_at(X, k + 32))
-            r5 = plus_product(r5, coupling, lanes_at(X, k + 40))
-            r6 = plus_product(r6, coupling, lanes_at(X, k + 48))
-            r7 = plus_product(r7, coupling, lanes_at(X, k + 56))
-        rows = ((x0, r0), (x1, r1), (x2, r2), (x3, r3), (x4, r4), (x5, r5), (x6, r6), (x7, r7))
-        for part, (x, rest) in enumerate(rows):
-            place = at + LANES * part
-            change = plus(x, times(minus_one, lanes_at(before, place)))
-            store_lanes(before, place, plus_product(plus_product(x, far, rest), momentum, change))
+            k = BLOCK * np.int64(neighbours[n])
+            p = wide.plus_times(p, couplings[n], wide.lanes_at(X, k))
+            q = wide.plus_times(q, couplings[n], wide.lanes_at(X, k + wide.LANES))
+        p = wide.plus_times(wide.plus_times(x, far, p), turn, wide.minus(x, wide.lanes_at(before, at)))
+        wide.store_lanes(before, at, p)
+        q = wide.plus_times(wide.plus_times(y, far, q), turn, wide.minus(y, wide.lanes_at(before, middle)))
+        wide.store_lanes(before, middle, q)
 
 
 @kernel
