@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Unpack
 
 import numpy as np
@@ -10,13 +11,17 @@ import torch
 from torch import Tensor
 
 from liftcore.errors import InvalidCameras, InvalidSettings
+from liftcore.lifting.algebra import Algebra
+from liftcore.lifting.engines.base import LocalEngine
 from liftcore.lifting.geometry import weigh_views
-from liftcore.lifting.in_memory import InMemory, SceneWeights
+from liftcore.lifting.in_memory import scene_of
 from liftcore.lifting.inputs import LiftInputs
-from liftcore.lifting.pipeline import find_objects, needs_separate_levels, reweigh
+from liftcore.lifting.pipeline import find_objects, needs_separate_levels, prepare_reweighting
+from liftcore.lifting.steps import reweighted, splat_block
 from liftcore.raster import check_splats_and_threads, open_raster
 from liftcore.raster.base import Raster
 from liftcore.runtime.device import choose_device
+from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, Timings, shown_progress
 from liftcore.runtime.torch_modes import callers_modes, default_modes
 from liftcore.scene.cameras import Camera, Cameras
@@ -188,17 +193,20 @@ def region_weights(
         InvalidFeatures, InvalidSettings, Unavailable: as in `lift`.
     """
     inputs = LiftInputs.of(splats, cameras, views, preset, {**settings, "diagnostic_rays": 0}, threads)
-    device = choose_device(inputs.settings.device)
-    raster = open_raster(inputs.splats, device, threads)
-    count = inputs.splats.count
-    with shown_progress(progress) as reporter:
-        geometry = weigh_views(raster, count, inputs.views, inputs.settings, reporter, by_rows=True, threads=threads)
-        W = SceneWeights(raster, device, None, inputs.views, geometry, threads=threads)
-        if reweight:
-            steps = InMemory(inputs.splats, inputs.settings, Timings(reporter), threads)
-            masks, levels_apart = bool((geometry.levels >= 0).any()), False
-            if inputs.settings.robust and np.unique(geometry.levels).size > 1:
-                _, node_vectors = find_objects(steps, W, masks, inputs.settings, steps.timings)
-                levels_apart = needs_separate_levels(node_vectors, len(inputs.views.names))
-            W, _ = reweigh(steps, W, masks, levels_apart, inputs.settings, steps.timings)
-    return W.weights.cpu()
+    raster = open_raster(inputs.splats, choose_device(inputs.settings.device), threads)
+    arguments = raster, inputs.splats.count, inputs.views, inputs.settings
+    with shown_progress(progress) as reporter, one_thread():
+        geometry = weigh_views(*arguments, reporter, by_rows=True, threads=threads)
+        W = geometry.weights.cpu()
+        if not (reweight and inputs.settings.robust):
+            return W
+        scene = scene_of(geometry, inputs.splats.means, inputs.settings, inputs.views.names, threads=threads)
+        del geometry
+        timings, masks = Timings(reporter), bool((scene.load("regions")["levels"] >= 0).any())
+        algebra, levels_apart = Algebra(scene, LocalEngine(threads), reporter, threads), False
+        if np.unique(scene.load("regions")["levels"]).size > 1:
+            _, node_vectors = find_objects(algebra, masks, timings)
+            levels_apart = needs_separate_levels(node_vectors, len(inputs.views.names))
+        prepare_reweighting(algebra, masks, levels_apart, timings)
+        block = splat_block(algebra.scene, 0)
+        return replace(W, weight=reweighted(algebra.scene, 0, block, threads)[0].weight)

@@ -10,29 +10,40 @@ from typing import Any, Unpack
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from liftcore.errors import InvalidSettings
-from liftcore.lifting.base import LiftSteps, SplatSupport, Weights, WeightStatistics
+from liftcore.lifting.algebra import Algebra, SplatSupport, WeightStatistics
 from liftcore.lifting.checkpoint import Checkpoint
-from liftcore.lifting.engines.base import Engine
-from liftcore.lifting.engines.lift import plan_of_a_worker, steps_in_blocks
-from liftcore.lifting.in_memory import InMemory
+from liftcore.lifting.engines.base import Engine, LocalEngine
+from liftcore.lifting.engines.lift import BlockFolder, block_folder, plan_of_a_worker
+from liftcore.lifting.geometry import strided
+from liftcore.lifting.in_memory import weigh_in_memory
 from liftcore.lifting.inputs import LiftInputs
+from liftcore.lifting.pieces import Pieces
 from liftcore.lifting.planning.plan import Plan, plan_lift
 from liftcore.lifting.warm_up import warm_up_lift
 from liftcore.query.result import LiftResult
-from liftcore.runtime.device import choose_device, within_memory
+from liftcore.raster import open_raster
+from liftcore.runtime.device import choose_device, give_back_memory, within_memory
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, Timings, shown_progress
 from liftcore.runtime.torch_modes import default_modes
 from liftcore.scene.cameras import Camera, Cameras
+from liftcore.scene.compositing import CompositingParams
+from liftcore.scene.neighbours import SplatGraph
 from liftcore.scene.splats import Splats
+from liftcore.solve.aggregate import aggregate
 from liftcore.solve.diagnostics import ViewMeasures, compute_diagnostics, lift_warnings
 from liftcore.solve.objects import NodeVectors, RegionObjects, object_facts
+from liftcore.solve.optimum import compare_with_optimum
 from liftcore.solve.reweight import reweighting_facts
+from liftcore.solve.smooth import smooth
+from liftcore.values.levels import at_levels
 from liftcore.values.lift_options import LiftOptions
 from liftcore.values.lift_views import ViewValues
 from liftcore.values.settings import LiftSettings, Preset
+from liftcore.values.views import ViewFeatures
 
 log = logging.getLogger(__name__)
 
@@ -93,81 +104,118 @@ def lift(
     checkpoint = _open_checkpoint(checkpoint)
     log_once = WarningLog()
     show_plan = on_plan or (lambda plan: log_once((*plan.warnings, *plan.input_warnings)))
-    with shown_progress(progress) as reporter:
+    with shown_progress(progress) as reporter, one_thread():
         timings = Timings(reporter)
         if engine is None:
-            steps = InMemory(inputs.splats, inputs.settings, timings, threads, checkpoint)
-            with one_thread():
-                result = run(steps, inputs, timings, show_plan)
+            result = run(inputs, timings, show_plan, threads, checkpoint)
         else:
-            folder = checkpoint.folder if checkpoint else None
-            with steps_in_blocks(engine, inputs, timings, folder, threads=threads) as steps:
-                result = run(steps, inputs, timings, show_plan)
+            with block_folder(engine, inputs.settings, checkpoint.folder if checkpoint else None) as blocks:
+                result = run(inputs, timings, show_plan, threads, blocks=blocks)
     log_once(result.diagnostics["warnings"] if on_plan is None else ())
     return result
 
 
 def run(
-    steps: LiftSteps[Weights], inputs: LiftInputs, timings: Timings, on_plan: Callable[[Plan], None]
+    inputs: LiftInputs,
+    timings: Timings,
+    on_plan: Callable[[Plan], None],
+    threads: int | None = None,
+    checkpoint: Checkpoint | None = None,
+    blocks: BlockFolder | None = None,
 ) -> LiftResult:
-    """Run all steps of a lift; the same for W and X in memory and in blocks."""
-    splats, views, settings = inputs.splats, inputs.views, inputs.settings
+    """Run all steps of a lift in memory, or in ``blocks``."""
+    splats, settings = inputs.splats, inputs.settings
     device = choose_device(settings.device)
     with timings.step("compile"):
         warm_up_lift(splats.kernel, device, settings)
     with timings.step("plan"):
-        plan = steps.plan(views, device)
+        if blocks is None:  # the weighing reports contradictions, by the views that it begins with
+            plan = plan_lift(splats, inputs.views, settings, device, threads)
+        else:
+            plan = blocks.plan(inputs, device, threads)
     if plan.device != device:
         with timings.step("compile"):
             warm_up_lift(splats.kernel, plan.device, settings)
+    inputs = replace(inputs, views=inputs.views.only(plan.views))
     with within_memory(plan.device):
-        return _run(steps, replace(inputs, views=views.only(plan.views)), plan, timings, on_plan)
+        if blocks is None:
+            with timings.stage("geometry"):
+                scene, statistics = weigh_in_memory(inputs, plan, on_plan, timings, threads, checkpoint)
+            lift = _solve(scene, LocalEngine(threads), inputs, statistics, timings, threads)
+            is_in_file = scene.memory_limit is not None and lift.features.nbytes > scene.memory_limit
+            return lift if is_in_file else lift.to(plan.device.place)
+        with timings.stage("geometry"):
+            job, statistics = blocks.weigh(inputs, plan, on_plan, timings)
+        return blocks.deliver(job, _solve(job, blocks.engine, inputs, statistics, timings, threads))
 
 
-def _run(
-    steps: LiftSteps[Weights], inputs: LiftInputs, plan: Plan, timings: Timings, on_plan: Callable[[Plan], None]
+def _solve(
+    scene: Pieces,
+    engine: Engine,
+    inputs: LiftInputs,
+    statistics: WeightStatistics,
+    timings: Timings,
+    threads: int | None,
 ) -> LiftResult:
-    """Run the steps after the plan."""
-    settings, views = inputs.settings, inputs.views
-    with timings.stage("geometry"):
-        W, statistics = steps.weigh(views, plan, on_plan)
-    aggregation = None
-    objects, node_vectors = find_objects(steps, W, statistics.masks, settings, timings)
-    levels_apart = needs_separate_levels(node_vectors, len(plan.views))
-    W, reliability = reweigh(steps, W, statistics.masks, levels_apart, settings, timings)
+    """Run the steps after W is known."""
+    settings, views, splats, aggregation = inputs.settings, inputs.views, inputs.splats, None
+    algebra = Algebra(scene, engine, timings.progress, threads)
+    objects, node_vectors = find_objects(algebra, statistics.masks, timings)
+    levels_apart = needs_separate_levels(node_vectors, len(views))
+    reliability = prepare_reweighting(algebra, statistics.masks, levels_apart, timings)
     with timings.stage("solve"):
-        X, support = steps.solve(W)
+        X, support = algebra.solve()
+    give_back_memory()
     facts = dict[str, Any]()
     if settings.reference_channels:
         with timings.stage("reference"):
-            facts["reference"] = steps.compare_with_optimum(W, X, support.sums > 0)
+            facts["reference"] = _optimum_facts(inputs, statistics.plan, X, support, algebra, threads)
     if settings.smoothness:
         with timings.stage("smooth"):
-            X, facts["smoothing"] = steps.smooth(W, X, support)
+            graph, visible = SplatGraph.of(splats, threads), torch.from_numpy(support.sums > 0)
+            X, facts["smoothing"] = smooth(
+                X, graph, support.total_weight, support.confidence, visible, settings.smoothness, timings.progress,
+                threads,
+            )  # fmt: skip
     if settings.aggregation:
         with timings.stage("aggregate"):
-            X, aggregation = steps.aggregate(W, X)
+            raster, total_weight = open_raster(splats, statistics.plan.device, threads), support.total_weight.numpy()
+            X, aggregation = aggregate(X, total_weight, raster, views, settings, timings.progress, threads)
         facts["aggregation"] = aggregation.facts
     if settings.robust:
         facts["reweighting"] = reweighting_facts(statistics.levels, reliability, support.confidence, levels_apart)
     if objects and node_vectors:
         facts["objects"] = object_facts(objects, node_vectors)
     with timings.step("certify"):
-        measures = steps.measure(W, X)
-        diagnostics = diagnose(inputs, statistics, X.dtype, support, measures, facts)
+        diagnostics = diagnose(inputs, statistics, X.dtype, support, algebra.measure(X), facts)
     table = views.features.table
-    lift = LiftResult(
+    return LiftResult(
         features=X,
         total_weight=support.total_weight,
         confidence=support.confidence,
         has_feature=torch.from_numpy(support.sums > 0),
-        metadata=views.metadata(settings, inputs.splats, diagnostics, timings.seconds),
+        metadata=views.metadata(settings, splats, diagnostics, timings.seconds),
         cluster=aggregation.clusters if aggregation else None,
         cluster_features=aggregation.cluster_features if aggregation else None,
         embeddings=torch.from_numpy(table.embeddings) if table else None,
         **(object_tensors(objects, node_vectors) if objects and node_vectors else {}),
     )
-    return steps.deliver(W, lift)
+
+
+def _optimum_facts(
+    inputs: LiftInputs, plan: Plan, X: Tensor, support: SplatSupport, algebra: Algebra, threads: int | None
+) -> dict[str, Any]:
+    """Compare X with the least-squares optimum of the splats that have weights."""
+    settings, views, scene = inputs.settings, inputs.views, algebra.scene
+
+    def read(number: int) -> tuple[Camera, ViewFeatures, CompositingParams]:
+        camera, features = views[number]
+        params = strided(settings.compositing, settings, camera, number)
+        return camera, at_levels(features, settings.levels, camera.name), params
+
+    raster, books = open_raster(inputs.splats, plan.device, threads), [view.rows for view in scene.codebook.views]
+    arguments = map(read, range(len(views))), X, support.sums > 0, scene.samples(), books
+    return compare_with_optimum(raster, *arguments, settings, algebra.progress)
 
 
 def object_tensors(objects: RegionObjects, node_vectors: NodeVectors) -> dict[str, torch.Tensor]:
@@ -178,19 +226,16 @@ def object_tensors(objects: RegionObjects, node_vectors: NodeVectors) -> dict[st
     return {name: torch.from_numpy(column) for name, column in columns.items()}
 
 
-def find_objects(
-    steps: LiftSteps[Weights], W: Weights, masks: bool, settings: LiftSettings, timings: Timings
-) -> tuple[RegionObjects | None, NodeVectors | None]:
+def find_objects(algebra: Algebra, masks: bool, timings: Timings) -> tuple[RegionObjects | None, NodeVectors | None]:
     """Find objects and the mean features of their nodes; None and None if the settings have them off.
 
     Args:
         masks: True if any view has masks.
     """
-    if not settings.finds_objects(masks):
+    if not algebra.scene.settings.finds_objects(masks):
         return None, None
     with timings.stage("objects"):
-        objects = steps.find_objects(W)
-        return objects, steps.node_vectors(W, objects)
+        return algebra.find_objects()
 
 
 def needs_separate_levels(node_vectors: NodeVectors | None, views: int) -> bool:
@@ -198,22 +243,20 @@ def needs_separate_levels(node_vectors: NodeVectors | None, views: int) -> bool:
     return node_vectors is not None and node_vectors.levels_disagree and views >= MIN_LEVEL_VIEWS
 
 
-def reweigh(
-    steps: LiftSteps[Weights], W: Weights, masks: bool, levels_apart: bool, settings: LiftSettings, timings: Timings
-) -> tuple[Weights, float | None]:
-    """Reweight W for the solve; return it and the median reliability of regions, None without masks.
+def prepare_reweighting(algebra: Algebra, masks: bool, levels_apart: bool, timings: Timings) -> float | None:
+    """Prepare the robust step of the settings; return the median reliability of regions, None without masks.
 
     Args:
         masks: True if any view has masks.
         levels_apart: True if regions are compared with those of their own level alone.
     """
-    if not settings.robust:
-        return W, None
+    if not algebra.scene.settings.robust:
+        return None
     if masks:
         with timings.stage("consensus"):
-            W = steps.compare_masks(W)
+            algebra.compare_masks()
     with timings.stage("robust"):
-        return steps.reweight(W, levels_apart)
+        return algebra.reweight(levels_apart)
 
 
 def diagnose(

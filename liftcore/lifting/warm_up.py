@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from liftcore.lifting.algebra import Algebra
+from liftcore.lifting.engines.base import LocalEngine
+from liftcore.lifting.geometry import Geometry
+from liftcore.lifting.in_memory import scene_of
 from liftcore.raster.cpu.warm_up import warm_up
-from liftcore.solve.closed_form import solve
+from liftcore.runtime.progress import silent
 from liftcore.solve.codebook import Codebook, ViewCodebook
-from liftcore.solve.consensus import mask_consensus
-from liftcore.solve.objects import region_objects
-from liftcore.solve.reweight import reweighting_factors
 from liftcore.solve.smooth import warm_up_smoothing
 from liftcore.values.region_weights import one_view
 
@@ -27,12 +28,14 @@ def warm_up_lift(kernel: Kernel, device: Device, settings: LiftSettings) -> None
     warm_up(kernel, device, settings.compositing, settings.weighting)
     first, unit = torch.zeros(1, dtype=torch.int32), torch.ones(1, dtype=torch.float32)
     W = one_view(first, torch.tensor([0, 1]), first, unit, first, unit, regions=1)
-    book = Codebook((ViewCodebook(unit[None]),))
-    solve(W, book, torch.float32, threads=1)
+    geometry = Geometry(W, Codebook((ViewCodebook(unit[None]),)), (), (), np.zeros(1, np.int8))
+    scene = scene_of(geometry, torch.zeros(1, 3), settings, ("view",), threads=1)
+    algebra = Algebra(scene, LocalEngine(1), silent, 1)
     if settings.objects:
-        region_objects(W, np.zeros(1, np.int8), np.ones(1), 1)
+        algebra.find_objects()
     if settings.robust:
-        mask_consensus(W, np.zeros(1, np.int8), 1)
-        reweighting_factors(W, book, principal=1, threads=1, masks=torch.ones(1, dtype=torch.bool))
+        algebra.compare_masks()
+        algebra.reweight(levels_apart=False)
+    algebra.solve()
     if settings.smoothness:
         warm_up_smoothing()

@@ -13,64 +13,35 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from liftcore.runtime.device import give_back_memory
-from liftcore.runtime.memory import zeros
-from liftcore.runtime.one_thread import one_thread
-from liftcore.runtime.progress import Progress, silent
 from liftcore.solve.codebook import Codebook
 from liftcore.solve.shared_rows import LONG, flat_table, sum_rows
 from liftcore.values.region_weights import BLOCK_ENTRIES, BLOCK_ROWS, RegionWeights, from_zero, row_blocks, run_each
-
-
-@one_thread()
-def solve(
-    W: RegionWeights,
-    codebook: Codebook,
-    dtype: torch.dtype,
-    progress: Progress = silent,
-    *,
-    means: Tensor | None = None,
-    threads: int | None = None,
-    memory: int | None = None,
-) -> Tensor:
-    """Return ``X = D^-1 W E``, [P, F] f16 or f32, with zero rows of splats without weights.
-
-    Args:
-        W: of all views, with a row for every splat, on the CPU.
-        dtype: of X; float16 becomes float32 if the codebooks are too large or too small for it.
-        means: [P, 3] f32, centres of the splats: neighbours read the same codebook rows, so they are solved in one
-            block. None solves in the order of the rows.
-        threads: None uses the cores that this process may use. The result is bitwise identical for any.
-        memory: bytes above which X is stored in a mapped file; None for no limit.
-    """
-    if dtype == torch.float16 and not codebook.fits_float16():
-        dtype = torch.float32
-    shape = W.splats.shape[0], codebook.channels
-    size = shape[0] * shape[1] * dtype.itemsize
-    X = zeros(shape, dtype, name="features", in_file=memory is not None and size > memory)
-    solve_rows(X, W, codebook, progress, means=means, threads=threads)
-    give_back_memory()
-    return X
 
 
 def solve_rows(
     X: Tensor,
     W: RegionWeights,
     codebook: Codebook,
-    progress: Progress = silent,
     *,
+    sums: Tensor | None = None,
     means: Tensor | None = None,
     threads: int | None = None,
 ) -> None:
-    """Write the rows of X [P, F] of the splats that have weights."""
-    rows, sums = torch.nonzero(W.indptr.diff())[:, 0], W.row_sums()
+    """Write ``D^-1 W E`` to the rows of X [P, F] f16 or f32 of splats that have weights.
+
+    Args:
+        W: of all views, with a row for every splat of X, on the CPU. sums: [P] f64, of its rows, if they are known.
+        means: [P, 3] f32, centres of the splats: neighbours read the same codebook rows, so they are solved in one
+            block. None solves in the order of the rows.
+        threads: None uses the cores that this process may use. The result is bitwise identical for any.
+    """
+    rows, sums = torch.nonzero(W.indptr.diff())[:, 0], W.row_sums() if sums is None else sums
     if means is not None:
         rows = rows[torch.argsort(morton_codes(means.cpu()[rows]))]
     scales = torch.where(sums > 0, 1.0 / sums, 0.0).numpy()
     indptr, region, weight = (part.numpy() for part in (W.indptr, W.region, W.weight))
     blocks = row_blocks(W.indptr.diff()[rows].numpy(), BLOCK_ROWS, BLOCK_ENTRIES)
-    slices = list(codebook.slices())
-    for number, channels in enumerate(slices):
+    for channels in codebook.slices():
         table, width = flat_table(codebook.values(channels, X.device)), channels.stop - channels.start
 
         def solve_block(
@@ -82,7 +53,6 @@ def solve_rows(
             X[:, channels].index_copy_(0, block_rows, torch.from_numpy(block_means).to(X.dtype))
 
         run_each(solve_block, blocks, threads)
-        progress("solve", number + 1, len(slices), "slices")
 
 
 def bag_sums(index: Tensor, table: Tensor, starts: Tensor, shares: Tensor | None = None) -> Tensor:

@@ -41,13 +41,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from liftcore.runtime.jit import kernel
-from liftcore.runtime.one_thread import one_thread
 from liftcore.solve.closed_form import morton_codes
-from liftcore.solve.membership import Memberships, RegionGroups, memberships
+from liftcore.solve.membership import RegionGroups
 from liftcore.values.region_weights import RegionWeights, run_each
 
 OBSERVES = 0.3  # share of a region that a level of a view must see to observe it
@@ -83,34 +81,6 @@ class RegionShares:
     def share_count(self) -> int:
         """The number of all q."""
         return int(self.views.sum(dtype=np.int64))
-
-
-@one_thread()
-def mask_consensus(
-    W: RegionWeights,
-    levels: np.ndarray,
-    threads: int | None = None,
-    *,
-    means: Tensor | None = None,
-    members: Memberships | None = None,
-) -> np.ndarray:
-    """Return c_jm of every entry of W, [nnz] f32 in 0..1; one if no view of the scene observes another's region.
-
-    Args:
-        W: of all views, by rows of codebooks, on the CPU.
-        levels: [M] i8, the level of each region in its view; -1 for cells of grids, which are ignored.
-        threads: None uses the cores that this process may use. The result is bitwise identical for any number.
-        means: [P, 3] of the splats: neighbours, which belong to the same regions, are read together.
-        members: of W, if computed before.
-    """
-    groups = RegionGroups.of(W.offsets.numpy(), levels)
-    members = members or memberships(W, groups, threads)
-    rows = np.flatnonzero(np.diff(W.indptr.numpy()))
-    if means is not None:
-        rows = rows[along_curve(means[torch.from_numpy(rows)])]
-    tuples = splat_tuples(W, members.own_region, groups, rows)
-    shares = region_shares(W, members.own_region, groups, rows, members.totals[rows], tuples, threads=threads)
-    return with_mean(shares.sums, shares.views, mean_share(shares.share_sum, shares.share_count), threads)
 
 
 def along_curve(points: Tensor, bounds: Tensor | None = None) -> np.ndarray:

@@ -24,7 +24,7 @@ from liftcore.runtime.jit import kernel
 from liftcore.solve.clusters import EXACT_CHANNELS, principal_axes
 from liftcore.solve.codebook import LEAST_CHANNELS, TABLE_BYTES, Codebook
 from liftcore.solve.shared_rows import flat_table, new_table
-from liftcore.solve.sums import PieceSums, piece_sums, sum_pieces
+from liftcore.solve.sums import PieceSums, piece_sums
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import DIRECTIONS
 
@@ -51,14 +51,6 @@ class RegionDirections:
         self._codebook, self.totals = codebook, totals
         self.mean, self._distances = self._mean_and_distances()
         self._axes = self._principal_axes(entries, principal)
-
-    @classmethod
-    def of_weights(
-        cls, W: RegionWeights, codebook: Codebook, principal: int = DIRECTIONS, threads: int | None = None
-    ) -> "RegionDirections":
-        """Compute from W of all views by rows of codebooks, in one piece on the CPU."""
-        totals = sum_pieces(region_totals(W, threads), (1, codebook.regions))[0]
-        return cls(codebook, torch.from_numpy(totals), W.region.shape[0], principal)
 
     @property
     def width(self) -> int:

@@ -37,39 +37,30 @@ class RegionGroups:
         )
 
 
-@dataclass(frozen=True)
-class Memberships:
-    """Memberships of some splats in regions of some or all views."""
-
-    own_region: np.ndarray  # [nnz] bool, the entries of W whose splat belongs to their region
-    totals: np.ndarray  # [n] f64, the sum of each row of W: t_j where W is of all views
-
-
-def memberships(W: RegionWeights, groups: RegionGroups, threads: int | None = None) -> Memberships:
-    """Compute the memberships of some splats.
+def memberships(W: RegionWeights, groups: RegionGroups, threads: int | None = None) -> np.ndarray:
+    """Return [nnz] bool: the entries of W whose splat belongs to their region.
 
     Args:
         W: of views by rows of codebooks, on the CPU; its regions are numbered as those of the groups.
         threads: None uses the cores that this process may use. The result is bitwise identical for any value.
     """
     indptr, region, weight = (part.numpy() for part in (W.indptr, W.region, W.weight))
-    result = Memberships(np.zeros(region.size, np.bool_), np.zeros(indptr.size - 1))
-    arrays = indptr, region, weight, groups.view, groups.group, groups.levels, result.own_region, result.totals
+    own_region = np.zeros(region.size, np.bool_)
+    arrays = indptr, region, weight, groups.view, groups.group, groups.levels, own_region
     run_each(lambda first, last: mark_memberships(first, last, *arrays), W.blocks(1 << 16, 1 << 18), threads)
-    return result
+    return own_region
 
 
 @kernel
-def mark_memberships(first, last, indptr, region, weight, view, group, levels, own_region, totals):
+def mark_memberships(first, last, indptr, region, weight, view, group, levels, own_region):
     """Compute `memberships` of rows ``first..last``."""
     sums = np.zeros(levels)
     for j in range(first, last):
-        k, end, total = indptr[j], indptr[j + 1], 0.0
+        k, end = indptr[j], indptr[j + 1]
         while k < end:
             begin, v = k, view[region[k]]
             sums[:] = 0.0
             while k < end and view[region[k]] == v:
-                total += weight[k]
                 if group[region[k]] >= 0:
                     sums[group[region[k]] - v * levels] += weight[k]
                 k += 1
@@ -78,4 +69,3 @@ def mark_memberships(first, last, indptr, region, weight, view, group, levels, o
                 if g >= 0:
                     group_weight = sums[g - v * levels]
                     own_region[n] = group_weight > FAINT and weight[n] >= BELONGS * group_weight
-        totals[j] = total

@@ -33,9 +33,9 @@ from scipy.sparse import csr_array
 from liftcore.runtime.jit import kernel
 from liftcore.solve.codebook import Codebook
 from liftcore.solve.consensus import SplatTuples
-from liftcore.solve.membership import Memberships, RegionGroups, memberships
-from liftcore.solve.region_tree import NO_NODE, SPLIT, UNSEEN, RegionTree, node_groups, region_tree
-from liftcore.solve.sums import PieceSums, in_order, piece_sums, pieces, sum_pieces
+from liftcore.solve.membership import RegionGroups
+from liftcore.solve.region_tree import NO_NODE, SPLIT, UNSEEN, RegionTree, node_groups
+from liftcore.solve.sums import PieceSums, in_order, piece_sums, pieces
 from liftcore.values.region_weights import RegionWeights, row_blocks, run_each
 
 CPU = torch.device("cpu")
@@ -87,71 +87,6 @@ class NodeNumbers:
     count: int  # objects
 
 
-def region_objects(
-    W: RegionWeights,
-    levels: np.ndarray,
-    total_weight: np.ndarray,
-    threads: int | None = None,
-    *,
-    members: Memberships | None = None,
-) -> RegionObjects:
-    """Return the objects and parts of a scene whose W is in one piece.
-
-    Args:
-        W: of all views, by rows of codebooks, on the CPU.
-        levels: [M] i8, the level of each region in its view; -1 for cells of grids, which are ignored.
-        total_weight: [P], sums of unscaled weights; objects are numbered by it.
-        threads: None uses the cores that this process may use. The result is bitwise identical for any number.
-        members: of W, if computed before.
-    """
-    groups = RegionGroups.of(W.offsets.numpy(), levels)
-    inputs = TreeInputs(W, groups, members or memberships(W, groups, threads), threads)
-    nodes, other_masks = choose_nodes(groups, inputs.region_sizes())
-    tree = region_tree(nodes, groups, inputs.containers(nodes), threads)
-    number = tree.parents.size
-    labels = inputs.labels(tree)
-    if number and other_masks.size:
-        tree = add_regions(tree, other_masks, inputs.node_shares(labels, number, other_masks))
-        labels = inputs.labels(tree)
-    return number_objects(
-        labels, tree, node_numbering(labels, total_weight, tree), inputs.view_weights(labels, number)
-    )
-
-
-@dataclass(frozen=True)
-class TreeInputs:
-    """The inputs of the tree and of its numbering that are read from W."""
-
-    W: RegionWeights  # of all views and splats
-    groups: RegionGroups
-    members: Memberships
-    threads: int | None
-
-    def region_sizes(self) -> np.ndarray:
-        """Return the number of splats of each region, [M] i64."""
-        sizes = np.zeros(self.groups.view.size, np.int64)
-        count_members(self.W.region.numpy(), self.members.own_region, sizes)
-        return sizes
-
-    def containers(self, nodes: np.ndarray) -> np.ndarray:
-        """See `node_containers`."""
-        table = node_splats(self.W, self.members, nodes, self.threads)
-        return node_containers(table, nodes, self.groups, self.threads)
-
-    def labels(self, tree: RegionTree) -> np.ndarray:
-        """See `node_labels`."""
-        return node_labels(self.W, self.groups, tree, self.threads)
-
-    def node_shares(self, labels: np.ndarray, number: int, regions: np.ndarray) -> Iterator[PieceSums]:
-        """See `node_shares`."""
-        return node_shares(self.W, labels, number, regions, self.threads)
-
-    def view_weights(self, labels: np.ndarray, number: int) -> np.ndarray:
-        """Return the weight of each label in each view, [number, V] f64."""
-        shares = view_shares(self.W, self.groups, labels, number, self.threads)
-        return sum_pieces(shares, (1, number * self.groups.views)).reshape(number, self.groups.views)
-
-
 def choose_nodes(groups: RegionGroups, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Choose the regions of evenly spaced views as nodes; of more than MOST_REGIONS those with the most splats.
 
@@ -180,48 +115,27 @@ def node_numbers(nodes: np.ndarray, regions: int) -> np.ndarray:
     return number
 
 
-def node_splats(W: RegionWeights, members: Memberships, nodes: np.ndarray, threads: int | None = None) -> NodeSplats:
-    """Return the splats of all nodes, from W of all views."""
-    indptr, region = W.indptr.numpy(), W.region.numpy()
-    number, starts = node_numbers(nodes, int(W.offsets[-1])), np.zeros(indptr.size, np.int64)
-    blocks = W.blocks(1 << 16, BLOCK_ENTRIES << 2)
-    run_each(lambda a, b: count_nodes(a, b, indptr, region, members.own_region, number, starts), blocks, threads)
-    np.cumsum(starts, out=starts)
-    node_members = np.empty(starts[-1], np.uint16)
-    run_each(
-        lambda a, b: list_nodes(a, b, indptr, region, members.own_region, number, starts, node_members),
-        blocks,
-        threads,
-    )
-    return NodeSplats(*by_node(starts, node_members, nodes.size), starts, node_members, np.sqrt(members.totals))
-
-
-def sampled_splats(
-    W: RegionWeights, own_region: np.ndarray, nodes: np.ndarray, base: int
+def sample_splats(
+    W: RegionWeights, own_region: np.ndarray, sizes: np.ndarray, nodes: np.ndarray, base: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sample splats of the nodes of some views: return the offsets [n + 1] i64 of each, and rows of W.
+    """Choose MOST_SPLATS evenly spaced splats at most of each node of some views.
 
     Args:
         W, own_region: as `memberships` has them, of the regions ``base..base + offsets[-1]``.
-        nodes: [N] i64, of all views.
+        sizes: [offsets[-1]] i64, the number of splats of each of these regions. nodes: [N] i64, of all views.
+
+    Returns:
+        The offsets [n + 1] i64 of the nodes of these views, and rows of W i64, ascending in a node.
     """
-    view_nodes = nodes[slice(*np.searchsorted(nodes, [base, base + int(W.offsets[-1])]))]
-    number = node_numbers(view_nodes - base, int(W.offsets[-1]))
-    entries = np.flatnonzero(own_region)
-    members = number[W.region.numpy()[entries] - base]
-    entries, members = entries[members >= 0], members[members >= 0]
-    rows = np.repeat(np.arange(W.indptr.shape[0] - 1), W.indptr.diff().numpy())[entries]
-    order = np.argsort(members, kind="stable")
-    parts = [rows[part[:: max(-(-part.size // MOST_SPLATS), 1)]] for part in _split(order, members, view_nodes.size)]
-    return np.cumsum([0, *(part.size for part in parts)]), np.concatenate([np.zeros(0, np.int64), *parts])
+    view_nodes = nodes[slice(*np.searchsorted(nodes, [base, base + sizes.size]))] - base
+    steps = np.maximum(-(-sizes[view_nodes] // MOST_SPLATS), 1)
+    begins = np.concatenate([[0], np.cumsum(-(-sizes[view_nodes] // steps))])
+    rows, number = np.empty(begins[-1], np.int64), node_numbers(view_nodes, sizes.size)
+    list_spaced(W.indptr.numpy(), W.region.numpy(), own_region, base, number, steps, begins[:-1].copy(), rows)
+    return begins, rows
 
 
-def _split(order: np.ndarray, members: np.ndarray, nodes: int) -> list[np.ndarray]:
-    """Split an order by node; without nodes there are no parts."""
-    return np.split(order, np.cumsum(np.bincount(members, minlength=nodes))[:-1]) if nodes else []
-
-
-def sampled_nodes(
+def node_splats(
     begins: np.ndarray, splats: np.ndarray, tuples: SplatTuples, totals: np.ndarray, nodes: np.ndarray, regions: int
 ) -> NodeSplats:
     """Return the splats of the nodes of some views, from the tuples of their sampled splats.
@@ -237,13 +151,6 @@ def sampled_nodes(
     members = np.empty(starts[-1], np.uint16)
     list_tuple_nodes(*[*parts, starts, members])
     return NodeSplats(begins, splats.astype(np.int32), starts, members, np.sqrt(totals))
-
-
-def by_node(starts: np.ndarray, members: np.ndarray, nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the offsets of each node's splats, and these splats, from the nodes of each splat."""
-    ones = np.ones(members.size, np.int8)
-    table = csr_array((ones, members, starts), shape=(starts.size - 1, nodes)).tocsc()
-    return table.indptr, table.indices
 
 
 def node_containers(
@@ -488,30 +395,24 @@ def _best_views(weights: np.ndarray) -> np.ndarray:
 
 
 @kernel
-def count_members(region, own_region, sizes):
-    """Add the number of splats of each region to ``sizes``."""
+def count_members(region, own_region, base, sizes):
+    """Add the number of splats of each region, from ``base`` on, to ``sizes``."""
     for k in range(region.size):
-        sizes[region[k]] += own_region[k]
+        sizes[region[k] - base] += own_region[k]
 
 
 @kernel
-def count_nodes(first, last, indptr, region, own_region, number, counts):
-    """Count the nodes of each of the splats ``first..last``, at index splat + 1."""
-    for j in range(first, last):
+def list_spaced(indptr, region, own_region, base, number, steps, at, rows):
+    """List the first, and each of ``steps`` [n] later, of the rows of each node, from ``at`` [n] on."""
+    counts = np.zeros(steps.size, np.int64)
+    for j in range(indptr.size - 1):
         for k in range(indptr[j], indptr[j + 1]):
-            if own_region[k] and number[region[k]] >= 0:
-                counts[j + 1] += 1
-
-
-@kernel
-def list_nodes(first, last, indptr, region, own_region, number, starts, members):
-    """List the nodes of each of the splats ``first..last``, from ``starts`` on."""
-    for j in range(first, last):
-        at = starts[j]
-        for k in range(indptr[j], indptr[j + 1]):
-            if own_region[k] and number[region[k]] >= 0:
-                members[at] = number[region[k]]
-                at += 1
+            n = number[region[k] - base]
+            if own_region[k] and n >= 0:
+                if counts[n] % steps[n] == 0:
+                    rows[at[n]] = j
+                    at[n] += 1
+                counts[n] += 1
 
 
 @kernel

@@ -21,9 +21,9 @@ denominators, ``has_feature`` and total weight do not change. There are no tuned
 
 **Levels are separate where they disagree.** A whole and its part may have different vectors, and both are correct:
 their sum is neither, and at every border objects with the same vector on two levels would outvote the others. Where
-masks of parts and wholes differ (`NodeVectors.levels_disagree`), p, c, r, s and all sums are computed among the
-regions of one level, and each level keeps its weight at each splat. Cells of grids are one level. Levels that agree
-are compared together, as each adds an observation, which matters with few views.
+masks of parts and wholes differ (`NodeVectors.levels_disagree`), the step runs once a level, with W of this level
+alone, so each level keeps its weight at each splat. Cells of grids are one level. Levels that agree are compared
+together, as each adds an observation, which matters with few views.
 
 A splat of one view does not change. A region without direction (a zero vector, or the mean itself) has c_jm = 0, and
 if no region of the scene has a direction, nothing changes.
@@ -48,7 +48,7 @@ views.
 block of splats). From the scene they need c, r and the r_m: sums over all splats, by pieces (`SceneConsistency`).
 """
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -58,30 +58,17 @@ from torch import Tensor
 
 from liftcore.runtime.jit import kernel
 from liftcore.runtime.memory import zeros
-from liftcore.runtime.one_thread import one_thread
-from liftcore.runtime.progress import Progress, silent
 from liftcore.solve.closed_form import morton_codes
-from liftcore.solve.codebook import Codebook
 from liftcore.solve.directions import RegionDirections
 from liftcore.solve.shared_rows import compare_rows, flat_table
 from liftcore.solve.sums import PieceSums, piece_sums
 from liftcore.values.region_weights import MEMORY_LIMIT, RegionWeights, row_blocks, run_each
-from liftcore.values.settings import DIRECTIONS
 
 BLOCK_ROWS, BLOCK_ENTRIES = 1 << 11, 1 << 15  # a splat has a sum per view
 POWERS = 1 << 12  # table size of powers of consensus; linear interpolation has a relative error of 3e-5 at most
 STEEP = np.float32(1 / 16)  # consensus below which interpolation is inaccurate; few entries are below
 NO_CONSENSUS = 1e-6  # of a splat's weight: a shorter r is the rounding error of inputs that cancel
 SHARPNESS = 4.0  # the largest value that costs correct masks at most .001 of accuracy in any scene (docs/method.md)
-
-
-@dataclass(frozen=True)
-class Reweighting:
-    """Factors and scores of a reweighting of W."""
-
-    factors: Tensor  # [nnz] f32, of each entry of W; the sums of rows do not change
-    confidence: Tensor  # [P] f32 in 0..1
-    reliability: float | None  # r, the median over regions; None without masks
 
 
 def mask_regions(levels: np.ndarray) -> Tensor | None:
@@ -116,87 +103,45 @@ def scale_weights(W: RegionWeights, factors: Tensor) -> RegionWeights:
     return replace(W, weight=torch.mul(W.weight, factors, out=factors))
 
 
-@one_thread()
-def reweighting_factors(
-    W: RegionWeights,
-    codebook: Codebook,
-    progress: Progress = silent,
-    *,
-    principal: int = DIRECTIONS,
-    means: Tensor | None = None,
-    threads: int | None = None,
-    masks: Tensor | None = None,
-    consensus: Tensor | None = None,
-    levels: np.ndarray | None = None,
-) -> Reweighting:
-    """Return the factor of each entry of W, for a scene whose W is in one piece.
-
-    Args:
-        W: of all views by rows of codebooks, on the CPU.
-        principal: directions in which regions are compared (`RegionDirections`). means: [P, 3] of the splats;
-            neighbours are processed together.
-        threads: None uses the cores that this process may use. The result is bitwise identical for any number.
-        masks: [M] bool, the regions with a reliability; None: none.
-        consensus: [nnz] f32 of each entry (`mask_consensus`).
-        levels: [M] i8, the level of each region in its view, -1 for cells of grids; None: one level.
-    """
-    block = BlockReweighter(W, means, threads, levels)
-    directions = RegionDirections.of_weights(W, codebook, principal, threads)
-    table = np.zeros((2, codebook.regions + block.levels))
-
-    def add(part: PieceSums) -> None:
-        table[:, part.places] += part.values
-
-    factors = block.cosines(directions, masks is not None, add)
-    scene = SceneConsistency.of(table, masks, block.level)
-    confidence = block.weigh(factors, scene, consensus)
-    progress("robust", 1, 1, "steps")
-    return Reweighting(factors, confidence, scene.reliability)
-
-
-def level_numbers(levels: np.ndarray | None, count: int) -> np.ndarray:
-    """Return the levels [M] i8 renumbered from 0 on, [M] i32; cells of grids, which have -1, are one level.
-
-    Args:
-        levels: None: one level. count: M.
-    """
-    if levels is None:
-        return np.zeros(count, np.int32)
-    return np.unique(levels, return_inverse=True)[1].reshape(-1).astype(np.int32)
-
-
 @dataclass(frozen=True)
 class SceneConsistency:
-    """Quantities of the whole scene that a step needs, of K levels."""
+    """Quantities of the whole scene that a step needs."""
 
-    mean_cosine: Tensor  # [K] f64, c, the mean cosine
+    mean_cosine: float  # c
     regions: Tensor  # [M] f32, r_m / r of each region; 1 for regions without a reliability
-    power: Tensor  # [K] f64, exponent of the consensus, SHARPNESS (1 - r)
-    reliability: float | None  # r, the median over all regions; None without masks
+    power: float  # exponent of the consensus, SHARPNESS (1 - r)
 
     @classmethod
-    def of(cls, sums: np.ndarray, mask: Tensor | None, level: np.ndarray) -> "SceneConsistency":
+    def of(cls, sums: np.ndarray, mask: Tensor | None) -> "SceneConsistency":
         """Compute from the sums of `BlockReweighter.cosines` over all splats.
 
         Args:
-            sums: [2, M + K] f64. mask: [M] bool, the regions with a reliability; None: none.
-            level: [M] i32, of each region.
+            sums: [2, M + 1] f64. mask: [M] bool, the regions with a reliability; None: none.
         """
-        confirmed, totals = torch.from_numpy(sums)
-        count = level.size
-        mean_cosine = torch.where(totals[count:] > 0, confirmed[count:] / totals[count:], 0.0)
-        regions, power = torch.ones(count, dtype=torch.float32), torch.ones(len(mean_cosine), dtype=torch.float64)
+        confirmed, total = sums[:, -1]
+        mean_cosine, regions = float(confirmed / total) if total > 0 else 0.0, torch.ones(sums.shape[1] - 1)
         if mask is None:
-            return cls(mean_cosine, regions, power, None)
-        has_sum = (totals[:count] > 0) & mask
-        reliable = torch.where(has_sum, confirmed[:count] / totals[:count], 0.0)
-        for number in range(len(mean_cosine)):
-            in_level = has_sum & torch.from_numpy(level == number)
-            median = float(reliable[in_level].median()) if in_level.any() else 0.0
-            power[number] = SHARPNESS * (1.0 - median)
-            if median > 0:
-                regions = torch.where(in_level, reliable / median, regions.double()).float()
-        return cls(mean_cosine, regions, power, float(reliable[has_sum].median()) if has_sum.any() else 0.0)
+            return cls(mean_cosine, regions, 1.0)
+        has_sum, reliable = _reliabilities(sums[:, :-1], mask)
+        median = median_reliability(sums[:, :-1], mask) or 0.0
+        if median > 0:
+            regions = torch.where(has_sum, reliable / median, regions.double()).float()
+        return cls(mean_cosine, regions, SHARPNESS * (1.0 - median))
+
+
+def _reliabilities(sums: np.ndarray, mask: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the regions of a mask that other views see, [M] bool, and r_m [M] f64, zero for others."""
+    confirmed, totals = torch.from_numpy(np.ascontiguousarray(sums))
+    has_sum = (totals > 0) & mask
+    return has_sum, torch.where(has_sum, confirmed / totals, 0.0)
+
+
+def median_reliability(sums: np.ndarray, mask: Tensor | None) -> float | None:
+    """Return r, the median over the regions [M] of a mask that other views see; None if there is none."""
+    if mask is None:
+        return None
+    has_sum, reliable = _reliabilities(sums, mask)
+    return float(reliable[has_sum].median()) if has_sum.any() else None
 
 
 class BlockReweighter:
@@ -206,33 +151,35 @@ class BlockReweighter:
         W: of all views by rows of codebooks, on the CPU; a row for each splat of the block.
         means: [n, 3] of these splats; neighbours, which read the same directions, are processed together.
         threads: None uses the cores that this process may use. The result is bitwise identical for any value.
-        levels: [M] i8, of each region of the scene, -1 for cells of grids; None: one level.
     """
 
-    def __init__(
-        self, W: RegionWeights, means: Tensor | None, threads: int | None, levels: np.ndarray | None = None
-    ) -> None:
+    def __init__(self, W: RegionWeights, means: Tensor | None, threads: int | None) -> None:
         self.W, self.threads = W, threads
-        self.level = level_numbers(levels, int(W.offsets[-1]))
-        self.levels = int(self.level.max(initial=0)) + 1
         self.view = torch.repeat_interleave(W.offsets.diff())
         self.rows = torch.nonzero(W.indptr.diff())[:, 0]
         if means is not None:
             self.rows = self.rows[torch.argsort(morton_codes(means[self.rows]))]
         self.blocks = row_blocks(W.indptr.diff()[self.rows].numpy(), BLOCK_ROWS, BLOCK_ENTRIES)
 
-    def cosines(self, directions: RegionDirections, by_region: bool, add: Callable[[PieceSums], None]) -> Tensor:
-        """Return ``c_jm`` of each entry, [nnz] f32.
+    @property
+    def shape(self) -> tuple[int, int]:
+        """The shape of the sums of `cosines`, [2, M + 1]."""
+        return 2, int(self.W.offsets[-1]) + 1
+
+    def cosines(self, directions: RegionDirections, by_region: bool) -> tuple[Tensor, Iterator[PieceSums]]:
+        """Return ``c_jm`` of each entry, [nnz] f32, complete once the sums are read.
 
         Args:
             by_region: True to compute the sums of reliability.
-            add: called with the sums of each piece, in order: ``W (1 - p) c`` and ``W (1 - p)`` of each region and,
-                at the places from M on, ``W c`` and ``W`` of each level.
+
+        Returns:
+            The cosines and the sums of each piece: ``W (1 - p) c`` and ``W (1 - p)`` of each region and, at place M,
+            ``W c`` and ``W``.
         """
         products, squares = self._entries(), self._entries()
         for columns in directions.slices():
             table, width = flat_table(directions.table(columns)), columns.stop - columns.start
-            arrays = [self._arrays(), table, width, products.numpy(), squares.numpy()]
+            arrays = [*self._arrays(), table, width, products.numpy(), squares.numpy()]
             blocks = [(self.rows[first:last].numpy(), *arrays) for first, last in self.blocks]
             run_each(compare_rows, blocks, self.threads)
         arrays = [*self._arrays(), products.numpy(), squares.numpy()]
@@ -240,30 +187,23 @@ class BlockReweighter:
         def add_rows(first: int, last: int, table: np.ndarray) -> None:
             tally(*[first, last, *arrays, by_region, table])
 
-        shape = 2, int(self.W.offsets[-1]) + self.levels
-        for part in piece_sums(add_rows, self.W.indptr.shape[0] - 1, shape, self.threads):
-            add(part)
-        return products
+        return products, piece_sums(add_rows, self.W.indptr.shape[0] - 1, self.shape, self.threads)
 
-    def weigh(self, cosines: Tensor, scene: SceneConsistency, consensus: Tensor | None) -> Tensor:
+    def weigh(self, cosines: Tensor, scene: SceneConsistency, consensus: Tensor | None, scores: np.ndarray) -> None:
         """Replace cosines by factors ``s ((1 - p) c_jm + p c) (r_m / r) q^power``, in place.
 
         Args:
             cosines: [nnz] f32, of `cosines`.
-            consensus: [nnz] f32 of each entry (`mask_consensus`); None: no consensus.
-
-        Returns:
-            [n] f32, the confidence of each splat.
+            consensus: [nnz] f32 of each entry (`liftcore.solve.consensus`); None: no consensus.
+            scores: [2, n] f64, to which ``sum W' c_jm`` and ``sum W`` of each splat are added.
         """
-        confidence = torch.zeros(self.W.indptr.shape[0] - 1, dtype=torch.float32)
         consensus = torch.zeros(0, dtype=torch.float32) if consensus is None else consensus  # as the kernel reads it
-        parts = cosines, scene.regions, consensus, confidence, scene.mean_cosine, scene.power
-        powers = ((np.arange(POWERS + 2) / POWERS) ** scene.power.numpy()[:, None]).astype(np.float32)
-        arrays = [*self._arrays(), *(part.numpy() for part in parts), powers]
+        powers = ((np.arange(POWERS + 2) / POWERS) ** scene.power).astype(np.float32)
+        parts = [part.numpy() for part in (cosines, scene.regions, consensus)]
+        arrays = [*self._arrays(), *parts, scores, scene.mean_cosine, scene.power, powers]
         # In the order of memory: nothing is shared by neighbours, unlike in `cosines`.
         blocks = [(first, last, *arrays) for first, last in self.W.blocks(BLOCK_ROWS, BLOCK_ENTRIES)]
         run_each(weigh_rows, blocks, self.threads)
-        return confidence
 
     def _entries(self) -> Tensor:
         """Return zeros for the entries of W, [nnz] f32."""
@@ -271,86 +211,110 @@ class BlockReweighter:
         return zeros(tuple(self.W.weight.shape), torch.float32, name="weights", in_file=2 * size > MEMORY_LIMIT)
 
     def _arrays(self) -> list[np.ndarray]:
-        """Return the arrays of W, and the view and level of each region."""
-        W = self.W
-        return [*(part.numpy() for part in (W.indptr, W.region, W.weight, self.view)), self.level]
+        """Return the arrays of W, and the view of each region."""
+        return [part.numpy() for part in (self.W.indptr, self.W.region, self.W.weight, self.view)]
+
+
+def confidence_of(scores: np.ndarray) -> Tensor:
+    """Return the confidence [n] f32 of splats from the scores of `BlockReweighter.weigh`; 0 without weight."""
+    agreement, total = scores
+    return torch.from_numpy(np.divide(agreement, total, out=np.zeros_like(total), where=total > 0)).float()
 
 
 @kernel
 def weigh_rows(
-    first_row, last_row, indptr, region, weight, view, level, cosines, reliable, consensus, confidence,
-    mean_cosine, power, powers,
-):  # fmt: skip
+    first_row,
+    last_row,
+    indptr,
+    region,
+    weight,
+    view,
+    cosines,
+    reliable,
+    consensus,
+    scores,
+    mean_cosine,
+    power,
+    powers,
+):
     """Compute `BlockReweighter.weigh` of rows ``first_row..last_row``.
 
-    Powers of consensus are interpolated in a table [K, n].
+    Powers of consensus are interpolated in a table [n].
     """
-    levels = mean_cosine.size
-    before, after, gain = np.empty(levels), np.empty(levels), np.empty(levels)
-    cosine_sums, view_shares = np.empty(levels), np.empty(levels)
     for row in range(first_row, last_row):
         first, last = indptr[row], indptr[row + 1]
-        if first == last:
-            continue
-        before[:] = after[:] = cosine_sums[:] = 0.0
+        before = after = cosine_sum = 0.0
         for k in range(first, last):
-            before[level[region[k]]] += weight[k]
+            before += weight[k]
+        inverse = 1.0 / before if before > 0.0 else 0.0
         k = first
         while k < last:
-            begin, v = k, view[region[k]]
-            view_shares[:] = 0.0
+            begin, v, view_share = k, view[region[k]], 0.0
             while k < last and view[region[k]] == v:
-                a = level[region[k]]
-                view_shares[a] += weight[k] * (1.0 / before[a] if before[a] > 0.0 else 0.0)
+                view_share += weight[k] * inverse
                 k += 1
+            share = min(view_share, 1.0)
             for n in range(begin, k):
-                a = level[region[n]]
-                share = min(view_shares[a], 1.0)
-                scaled = ((1.0 - share) * cosines[n] + share * mean_cosine[a]) * reliable[region[n]]
+                scaled = ((1.0 - share) * cosines[n] + share * mean_cosine) * reliable[region[n]]
                 if consensus.size > 0:
                     if consensus[n] > STEEP:
                         place = consensus[n] * np.float32(POWERS)
                         i = np.int64(place)
-                        scaled *= powers[a, i] + (place - np.float32(i)) * (powers[a, i + 1] - powers[a, i])
+                        scaled *= powers[i] + (place - np.float32(i)) * (powers[i + 1] - powers[i])
                     else:
-                        scaled *= consensus[n] ** np.float32(power[a])
-                after[a] += weight[n] * scaled
-                cosine_sums[a] += weight[n] * scaled * cosines[n]
+                        scaled *= consensus[n] ** np.float32(power)
+                after += weight[n] * scaled
+                cosine_sum += weight[n] * scaled * cosines[n]
                 cosines[n] = scaled
-        total = cosine_total = 0.0
-        for a in range(levels):
-            gain[a] = before[a] / after[a] if after[a] > 0.0 else 0.0
-            total += before[a]
-            cosine_total += gain[a] * cosine_sums[a]
+        gain = before / after if after > 0.0 else 0.0
+        scores[0, row] += gain * cosine_sum
+        scores[1, row] += before
         for n in range(first, last):
-            a = level[region[n]]
-            cosines[n] = cosines[n] * gain[a] if gain[a] > 0.0 else 1.0
-        confidence[row] = cosine_total / total if total > 0.0 else 0.0
+            cosines[n] = cosines[n] * gain if gain > 0.0 else 1.0
 
 
 @kernel
-def tally(first, last, indptr, region, weight, view, level, cosines, squares, by_region, sums):
-    """Replace products of the entries of some rows by cosines, and add these to the sums [2, M + K] f64."""
-    count = level.size
-    totals, view_shares = np.empty(sums.shape[1] - count), np.empty(sums.shape[1] - count)
+def tally(first, last, indptr, region, weight, view, cosines, squares, by_region, sums):
+    """Replace products of the entries of some rows by cosines, and add these to the sums [2, M + 1] f64."""
+    places = sums.shape[1] - 1
     for row in range(first, last):
-        totals[:] = 0.0
+        total = 0.0
         for k in range(indptr[row], indptr[row + 1]):
-            totals[level[region[k]]] += weight[k]
+            total += weight[k]
+        inverse = 1.0 / total if total > 0.0 else 0.0
         k = indptr[row]
         while k < indptr[row + 1]:
-            begin, v = k, view[region[k]]
-            view_shares[:] = 0.0
+            begin, v, view_share = k, view[region[k]], 0.0
             while k < indptr[row + 1] and view[region[k]] == v:
                 length = np.sqrt(squares[k])
                 cosine = cosines[k] / length if length > NO_CONSENSUS else np.float32(0.0)
                 cosines[k] = min(max(cosine, np.float32(0.0)), np.float32(1.0))
-                a = level[region[k]]
-                sums[0, count + a] += weight[k] * np.float64(cosines[k])
-                sums[1, count + a] += weight[k]
-                view_shares[a] += weight[k] * (1.0 / totals[a] if totals[a] > 0.0 else 0.0)
+                sums[0, places] += weight[k] * np.float64(cosines[k])
+                sums[1, places] += weight[k]
+                view_share += weight[k] * inverse
                 k += 1
+            other_share = max(1.0 - view_share, 0.0)
             for n in range(begin, k if by_region else begin):
-                other_share = max(1.0 - view_shares[level[region[n]]], 0.0)
                 sums[0, region[n]] += weight[n] * other_share * cosines[n]
                 sums[1, region[n]] += weight[n] * other_share
+
+
+def of_regions(W: RegionWeights, regions: np.ndarray) -> tuple[RegionWeights, Tensor]:
+    """Return W with the entries of some regions [M] bool alone, and the indices of these entries [n] i64."""
+    indptr, region = W.indptr.numpy(), W.region.numpy()
+    starts, entries = np.zeros_like(indptr), np.empty(np.count_nonzero(regions[region]), np.int64)
+    list_entries(indptr, region, regions, starts, entries)
+    index = torch.from_numpy(entries)
+    return replace(W, indptr=torch.from_numpy(starts), region=W.region[index], weight=W.weight[index]), index
+
+
+@kernel
+def list_entries(indptr, region, regions, starts, entries):
+    """List the entries of some regions [M] bool, and where those of each row begin."""
+    at = 0
+    for row in range(indptr.size - 1):
+        for k in range(indptr[row], indptr[row + 1]):
+            if regions[region[k]]:
+                entries[at] = k
+                at += 1
+        starts[row + 1] = at

@@ -24,7 +24,6 @@ import torch
 
 import liftcore as lc
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.solve.reweight import Reweighting, reweighting_factors
 from liftcore.values.views import NO_LABEL, ViewFeatures
 from tests.benchmarks.base import command_line, print_rows
 from tests.benchmarks.room import room_cameras, room_parts, room_splats
@@ -223,13 +222,8 @@ def unit(rows: np.ndarray) -> np.ndarray:
 @contextmanager
 def levels_together() -> Iterator[None]:
     """Have lifts judge all levels as one."""
-    with patch("liftcore.lifting.in_memory.reweighting_factors", without_level_numbers):
+    with patch("liftcore.lifting.pipeline.needs_separate_levels", lambda *_: False):
         yield
-
-
-def without_level_numbers(*arguments: Any, **keywords: Any) -> Reweighting:
-    """`reweighting_factors` without levels."""
-    return reweighting_factors(*arguments, **keywords | {"levels": None})
 
 
 def measured(kind: Kind) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import torch
 
-from liftcore.lifting import in_memory
+from liftcore.lifting import steps
 from liftcore.lifting.files import lift_files
 from liftcore.lifting.planning.plan import ENTRY_BYTES, Plan
 from liftcore.solve import reweight
@@ -72,7 +72,7 @@ def test_fine_maps_are_planned_with_their_many_weights(shared_data, fine_maps):
 
 
 def test_plan_has_room_for_what_reweighting_holds(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    arrays, originals = [], (reweight.zeros, in_memory.mask_consensus)
+    arrays, originals = [], (reweight.zeros, steps.region_shares)
 
     def array(*arguments: Any, **options: Any) -> torch.Tensor:
         arrays.append(originals[0](*arguments, **options))
@@ -86,7 +86,7 @@ def test_plan_has_room_for_what_reweighting_holds(shared_data: Path, monkeypatch
         return result
 
     monkeypatch.setattr(reweight, "zeros", array)
-    monkeypatch.setattr(in_memory, "mask_consensus", consensus)
+    monkeypatch.setattr(steps, "region_shares", consensus)
     scene, options = shared_data / "tabletop", {"view_stride": 6, "preset": "default"}
     plans = list[Plan]()
     certified(scene, scene / "features_hard.safetensors", options, plans.append)

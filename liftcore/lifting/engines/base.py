@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from liftcore.runtime.arguments import check_count
 from liftcore.runtime.one_line import one_line
@@ -11,9 +11,9 @@ from liftcore.runtime.one_line import one_line
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from liftcore.lifting.engines.blocks import Job
+    from liftcore.lifting.pieces import Pieces
 
-    Work = Callable[[Job, int, int | None], None]  # of a job, the number of a piece, and the threads for it
+    Work = Callable[[Any, int, int | None], None]  # of a lift, the number of a piece, and the threads for it
 
 
 class Engine(Protocol):
@@ -27,7 +27,7 @@ class Engine(Protocol):
         """A folder that all workers share, for lifts without a checkpoint; None: the system's temporary folder."""
         ...
 
-    def run(self, work: Work, job: Job, pieces: int) -> Iterator[int]:
+    def run(self, work: Work, job: Pieces, pieces: int) -> Iterator[int]:
         """Run ``work(job, piece, threads)`` for all pieces below ``pieces``; yield each finished one, in any order.
 
         Raises:
@@ -54,7 +54,7 @@ class LocalEngine:
     def __repr__(self) -> str:
         return one_line(self, f"threads={self.threads}")
 
-    def run(self, work: Work, job: Job, pieces: int) -> Iterator[int]:
+    def run(self, work: Work, job: Pieces, pieces: int) -> Iterator[int]:
         """See the protocol."""
         for piece in range(pieces):
             work(job, piece, self.threads)

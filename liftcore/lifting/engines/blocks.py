@@ -1,22 +1,22 @@
-"""A lift in blocks: the job that all workers receive, and its first step, W of a few views. All in files.
+"""A lift in blocks: the job that all workers receive, and its first steps, W of views and of blocks, all in files.
 
 **Weighing** (`weigh`) reads PIECE_VIEWS views. For each it writes a file of the codebook E of its regions and its
 sampled rays, and for all of them one file of ``W = A'^T S``. The rows of W are splats: a block of splats is
 contiguous, so that later steps open one file for PIECE_VIEWS views. A worker loads only the splats that these views
 can see.
 
-The later steps, `lifting.engines.steps`, read these files; their pieces are views or blocks of splats.
+`gather` writes W of a block of splats in all views. Later steps are those of every lift (`lifting.steps`).
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -24,8 +24,10 @@ from torch import Tensor
 
 from liftcore.errors import InvalidInput
 from liftcore.io.safetensors_file import map_tensors, write_tensors
-from liftcore.io.shards import ROWS, features_file
+from liftcore.io.shards import features_file, map_rows, shard_at, write_rows
 from liftcore.lifting.geometry import WeightRequest, weight_request
+from liftcore.lifting.pieces import Pieces, Shape
+from liftcore.lifting.steps import Saved, part_of, row_arrays, saved_as, weights_of
 from liftcore.lifting.warm_up import warm_up_lift
 from liftcore.raster import open_raster
 from liftcore.raster.base import RayRows, ViewWeights
@@ -34,74 +36,121 @@ from liftcore.runtime.one_thread import one_thread
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
-from liftcore.solve.codebook import ViewCodebook
+from liftcore.solve.codebook import Codebook, ViewCodebook
+from liftcore.solve.directions import RegionDirections, StoredDirections
 from liftcore.solve.rays import Readout, SampledRays
-from liftcore.solve.rows import SomeRows, gather_rows
+from liftcore.solve.rows import SomeRows, gather_rows, values_of
+from liftcore.solve.sums import PieceSums, pack_sums, unpack_sums
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.pack import Views, pair, read_features
 from liftcore.values.region_weights import RegionWeights
-from liftcore.values.settings import LiftSettings
 
 PIECE_VIEWS = 8  # some seconds of work, which is what is lost with a worker
 SELECTED = 1 << 22  # splats beyond which a worker loads only those that its views see: 1 GB in the raster
 STEP = 1 << 18  # splats that are tested together for it
 SCENE = "scene.safetensors"
+CODEBOOK = "codebook.safetensors"  # rows/v [M_v, F] and, where regions are tuples of rows, tuples/v [T_v, L] i32
 
 
-@dataclass(frozen=True)
-class Job:
-    """A lift in blocks, as every worker receives it. Paths are valid on all workers."""
+@dataclass(frozen=True, kw_only=True)
+class Job(Pieces):
+    """A lift in blocks, as every worker receives it: arrays are files, whose paths are valid on all workers."""
 
     folder: Path  # of the pieces
     packs: tuple[Path, ...]  # of the features
     cameras: Cameras
-    names: tuple[str, ...]  # of the views, in the order of the sums
-    settings: LiftSettings
     kernel: Kernel
-    splats: int  # P
-    channels: int  # F
-    dtype: torch.dtype = torch.float16  # of X
     selected: int = SELECTED
-    rows: int = ROWS  # of a block of splats: pieces of sums, and whole pages of X
-    step: int = 0  # of steps that run several times
-    related: bool = False  # True if tuples of masks are needed
-    usual_share: float | None = None  # the mean share of mask consensus; None where there is none
-    by_region: bool = False  # True if each region has one weight
-    levels_apart: bool = False  # True if regions are compared with those of their own level alone
 
     @property
-    def view_pieces(self) -> int:
-        """Pieces of views."""
-        return -(-len(self.names) // PIECE_VIEWS)
+    def means(self) -> Tensor:
+        return scene_of(self).means
 
     @property
-    def splat_pieces(self) -> int:
-        """Pieces of splats."""
-        return -(-self.splats // self.rows)
+    def codebook(self) -> Codebook:
+        path = self.folder / CODEBOOK
+        return _codebook(path, file_version(path), len(self.names))
 
     def view_file(self, number: int) -> Path:
         """Return the file of a view's codebook and sampled rays; ``number`` is of the view."""
-        return self.folder / f"view-{number:05}.safetensors"
-
-    def weights_file(self, piece: int) -> Path:
-        """Return the file of W of a piece of views."""
-        return self.piece_file("weights", piece)
+        return self.piece_file("view", number)
 
     def views_of(self, piece: int) -> range:
-        """Return the numbers of the views of a piece."""
         return range(PIECE_VIEWS * piece, min(PIECE_VIEWS * (piece + 1), len(self.names)))
 
-    def piece_file(self, step: str, number: int) -> Path:
-        """Return the file of a step of that piece."""
-        return self.folder / f"{step}-{number:05}.safetensors"
+    def piece_file(self, step: str, number: int | None) -> Path:
+        """Return the file of a step of that piece, or of a table."""
+        return self.folder / (f"{step}.safetensors" if number is None else f"{step}-{number:05}.safetensors")
 
     def features_file(self, number: int) -> Path:
         """Return the file of X of a block of splats."""
         return self.folder / "lift" / features_file(number)
 
-    def columns_file(self, number: int) -> Path:
-        """Return the file of the other columns of these splats."""
-        return self.folder / f"columns-{number:05}.safetensors"
+    def has(self, step: str, number: int) -> bool:
+        return self.piece_file(step, number).exists()
+
+    def load(self, step: str, number: int | None = None) -> dict[str, Any]:
+        path = self.piece_file(step, number)
+        return _table(path, file_version(path)) if number is None else map_tensors(path)[0]
+
+    def save(
+        self,
+        step: str,
+        number: int | None,
+        arrays: dict[str, Any],
+        sums: Iterable[PieceSums] = (),
+        shape: Shape | None = None,
+    ) -> None:
+        tensors = pack_sums(parts) if (parts := list(sums)) else {}
+        for name, part in arrays.items():
+            tensors[name] = part if isinstance(part, Tensor) else torch.from_numpy(part)
+        write_tensors(self.piece_file(step, number), tensors, {})
+
+    def sums(self, step: str) -> Iterator[PieceSums]:
+        return (part for number in range(self.splat_pieces) for part in unpack_sums(self.load(step, number)))
+
+    def drop(self, *steps: str) -> None:
+        """Keep the files, from which the lift resumes."""
+
+    def writable(self, array: np.ndarray) -> Tensor:
+        values = torch.from_numpy(array)
+        return values_of(values.shape[0], values.dtype).copy_(values)
+
+    def keep_directions(self, directions: RegionDirections) -> None:
+        directions.save(self.folder)
+
+    def directions(self) -> RegionDirections:
+        return StoredDirections(self.folder)
+
+    def new_features(self, piece: int) -> Tensor:
+        first, last = self.bounds(piece)
+        return torch.zeros(last - first, self.channels, dtype=self.dtype)
+
+    def save_features(self, piece: int, X: Tensor) -> None:
+        write_rows(self.features_file(piece), X)
+
+    def features(self) -> Tensor:
+        return torch.from_numpy(map_rows([shard_at(self.features_file(n)) for n in range(self.splat_pieces)]))
+
+    def samples(self) -> list[SampledRays]:
+        return [read_view(self.view_file(number)).sample for number in range(len(self.names))]
+
+
+@lru_cache(maxsize=4)
+def _table(path: Path, _version: tuple[int, int]) -> dict[str, np.ndarray]:
+    return map_tensors(path)[0]
+
+
+@lru_cache(maxsize=1)
+def _codebook(path: Path, _version: tuple[int, int], views: int) -> Codebook:
+    tensors = {name: torch.from_numpy(array) for name, array in map_tensors(path)[0].items()}
+    return Codebook([ViewCodebook(tensors[f"rows/{v}"], tensors.get(f"tuples/{v}")) for v in range(views)])
+
+
+def forget_files() -> None:
+    """Unmap the files of a lift: the disk frees the space of a deleted file only when nothing maps it."""
+    for cache in (_table, _codebook, mapped_scene, packs_at):
+        cache.cache_clear()
 
 
 class ViewFiles(NamedTuple):
@@ -114,18 +163,6 @@ class ViewFiles(NamedTuple):
     blind: bool  # True if its rays hit no splat
 
 
-class WeightBlock(NamedTuple):
-    """W of a piece of views: a row a splat, with the entries of its views in order."""
-
-    splats: np.ndarray  # [n] i32 ascending
-    starts: np.ndarray  # [n + 1] i64
-    region: np.ndarray  # [nnz] i32, counted from the piece's first
-    weight: np.ndarray  # [nnz] f32
-    total_weight_splats: np.ndarray  # [m] i32 ascending
-    total_weight_starts: np.ndarray  # [m + 1] i64
-    total_weight: np.ndarray  # [e] f32, of each view that sees the splat
-
-
 # ---- weighing
 
 
@@ -136,14 +173,14 @@ def weigh(job: Job, piece: int, threads: int | None) -> None:
     Raises:
         InvalidFeatures: a view is malformed.
     """
-    if not job.weights_file(piece).exists():
+    if not job.has("weights", piece):
         numbers = [number for number in job.views_of(piece) if not job.view_file(number).exists()]
         if numbers:
             _weigh_views(job, numbers, threads)
         try:
             _write_weights(job, piece)
         except InvalidInput:
-            if not job.weights_file(piece).exists():  # else another worker has finished the same piece
+            if not job.has("weights", piece):  # else another worker has finished the same piece
                 raise
     for number in job.views_of(piece):
         _entries_file(job, number).unlink(missing_ok=True)
@@ -292,14 +329,9 @@ def _write_weights(job: Job, piece: int) -> None:
 
     starts, (region, weight) = gather_rows(entries, splats.size, [torch.int32, torch.float32])
     total_weight_starts, (sums,) = gather_rows(total_weight, hit_splats.size, [torch.float32])
-    tensors = {
-        "splats": splats,
-        "starts": starts,
-        "total_weight_splats": hit_splats,
-        "total_weight_starts": total_weight_starts,
-    }
-    tensors = {name: torch.from_numpy(array) for name, array in tensors.items()}
-    write_tensors(job.weights_file(piece), tensors | {"region": region, "weight": weight, "total_weight": sums}, {})
+    arrays = {"splats": splats, "starts": starts, "region": region, "weight": weight}
+    arrays |= {"hit_splats": hit_splats, "hit_starts": total_weight_starts, "total_weight": sums}
+    job.save("weights", piece, arrays)
 
 
 def _union(parts: list[Tensor], count: int) -> np.ndarray:
@@ -310,6 +342,32 @@ def _union(parts: list[Tensor], count: int) -> np.ndarray:
     return np.flatnonzero(present).astype(np.int32)
 
 
-def read_weights(job: Job, piece: int) -> WeightBlock:
-    """Map W of a piece of views."""
-    return WeightBlock(**map_tensors(job.weights_file(piece))[0])
+# ---- W of blocks of splats
+
+
+def _weight_rows(job: Job, ends: tuple[int, int]) -> Iterator[SomeRows]:
+    """Iterate over the rows of W of a block in each piece of views, with one file open at a time."""
+    offsets = job.load("regions")["offsets"]
+    for piece in range(job.view_pieces):
+        arrays, base = job.load("weights", piece), np.int32(offsets[job.views_of(piece).start])
+        part = part_of(arrays["splats"], arrays["starts"], (arrays["region"], arrays["weight"]), ends)
+        yield SomeRows(part.rows, part.starts, [part.values[0] + base, part.values[1]])
+
+
+def _total_weight(job: Job, ends: tuple[int, int]) -> Tensor:
+    """Sum the total weight of a block [n] f32 over views, in their order."""
+    sums = np.zeros(ends[1] - ends[0])
+    for piece in range(job.view_pieces):
+        arrays = job.load("weights", piece)
+        part = part_of(arrays["hit_splats"], arrays["hit_starts"], (arrays["total_weight"],), ends)
+        np.add.at(sums, np.repeat(part.rows, np.diff(part.starts)), part.values[0].astype(np.float64))
+    return torch.from_numpy(sums).float()
+
+
+@saved_as("rows")
+def gather(job: Job, piece: int, threads: int | None) -> Saved:
+    """Save W of a block of splats in all views, its sums and total weight."""
+    ends = first, last = job.bounds(piece)
+    starts, values = gather_rows(lambda: _weight_rows(job, ends), last - first, (torch.int32, torch.float32))
+    W = weights_of(starts, values[0], values[1], job.load("regions")["offsets"])
+    return row_arrays(job, W, job.means[first:last], _total_weight(job, ends), threads)

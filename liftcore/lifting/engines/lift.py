@@ -1,8 +1,6 @@
-"""The driver of a lift in blocks, for scenes whose W or X does not fit one machine.
+"""The folder of a lift in blocks, for scenes whose W or X does not fit one machine: what workers need, and W of all.
 
-An engine runs the steps (`lifting.engines.steps`). The driver adds up their sums over the scene, and writes the
-totals for all workers. It holds tables of size M, a few columns of the splats, and the graph of objects; it
-copies codebooks a view at a time.
+An engine runs the steps. The driver copies codebooks a view at a time.
 """
 
 from __future__ import annotations
@@ -14,90 +12,46 @@ import secrets
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from liftcore.errors import InvalidSettings, Unavailable
-from liftcore.io.safetensors_file import map_tensors, write_tensors
-from liftcore.io.shards import ROWS, map_rows, shard_at, write_index
-from liftcore.lifting.base import LiftSteps, SplatSupport, WeightStatistics
+from liftcore.io.safetensors_file import write_tensors
+from liftcore.io.shards import ROWS, write_index
+from liftcore.lifting.algebra import WeightStatistics
 from liftcore.lifting.checkpoint import Checkpoint
-from liftcore.lifting.engines import steps
 from liftcore.lifting.engines.base import Engine, LocalEngine
-from liftcore.lifting.engines.blocks import PIECE_VIEWS, SCENE, SELECTED, Job, read_view, weigh, write_scene
+from liftcore.lifting.engines.blocks import (
+    CODEBOOK,
+    PIECE_VIEWS,
+    SCENE,
+    SELECTED,
+    Job,
+    forget_files,
+    gather,
+    read_view,
+    weigh,
+    write_scene,
+)
 from liftcore.lifting.inputs import LiftInputs
 from liftcore.lifting.planning.plan import Plan, plan_lift
 from liftcore.query.result import LiftResult, load_lift
 from liftcore.runtime.device import CPU, Device, choose_device
 from liftcore.runtime.folders import scratch_folder
-from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Timings
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
-from liftcore.solve.consensus import mean_share
-from liftcore.solve.diagnostics import ViewMeasures, join_measures, measure_view
-from liftcore.solve.directions import RegionDirections
-from liftcore.solve.objects import (
-    NodeVectors,
-    RegionObjects,
-    add_regions,
-    choose_nodes,
-    node_numbering,
-    number_objects,
-)
-from liftcore.solve.region_tree import RegionTree, region_tree
-from liftcore.solve.reweight import SceneConsistency, level_numbers, mask_regions
-from liftcore.solve.sums import sum_pieces, unpack_sums
-from liftcore.values.lift_views import LiftViews
 from liftcore.values.pack import NO_ROOM, Views, write_pack
 from liftcore.values.region_weights import MEMORY_LIMIT, MOST_REGIONS
-
-if TYPE_CHECKING:
-    from liftcore.lifting.engines.base import Work
+from liftcore.values.settings import LiftSettings
 
 PACKED = 64  # views of a pack
 PIECES = re.compile("blocks-[0-9a-f]{64}")  # the folder of the pieces of one lift
 PACKAGES = ("lifting", "raster", "scene", "solve", "values")  # whose code computes pieces
-
-
-@contextmanager
-def steps_in_blocks(
-    engine: Engine,
-    inputs: LiftInputs,
-    timings: Timings,
-    folder: Path | None = None,
-    *,
-    threads: int | None = None,
-    rows: int = ROWS,
-    selected: int = SELECTED,
-) -> Iterator[InBlocks]:
-    """Open the steps of a lift by an engine, where each piece is a file in a folder.
-
-    Args:
-        folder: that all workers share. An interrupted lift of packs resumes from the pieces there; None: a temporary
-            folder.
-        threads: of the driver; those of pieces are the engine's. None uses the cores that this process may use.
-        rows: splats of a block, whole pages of X. selected: splats of scenes that workers load as a whole.
-
-    Raises:
-        InvalidSettings: engine is of another type; or a step needs all rays or all features, as in
-            `LiftSettings.check_blocks`.
-        Unavailable: the disk of the folder is full, or workers cannot read it.
-    """
-    if not hasattr(engine, "run"):
-        hint = "LocalEngine() or RayEngine(address) makes one"
-        raise InvalidSettings("engine", expected="an engine, or None", got=repr(engine)[:80], hint=hint)
-    inputs.settings.check_blocks()
-    with _folder(folder or engine.scratch, permanent=folder is not None) as place, _in_words(place), one_thread():
-        try:
-            yield InBlocks(engine, place, inputs, timings, threads, rows, selected)
-        finally:
-            steps.forget_files()
 
 
 def plan_of_a_worker(plan: Plan) -> Plan:
@@ -197,176 +151,88 @@ def _facts(camera: Camera) -> list[Any]:
     return [camera.name, *size, camera.K.tolist(), camera.viewmat.tolist(), repr(camera.lens)]
 
 
-class InBlocks(LiftSteps[Job]):
-    """The steps by an engine; see the protocol. W is a job, which names its files, and X is mapped from shards."""
+@dataclass(frozen=True)
+class BlockFolder:
+    """The folder of a lift in blocks, and its engine."""
 
-    def __init__(
-        self,
-        engine: Engine,
-        folder: Path,
-        inputs: LiftInputs,
-        timings: Timings,
-        threads: int | None,
-        rows: int,
-        selected: int,
-    ) -> None:
-        self.engine, self.folder, self.inputs, self.timings = engine, folder, inputs, timings
-        self.threads, self.rows, self.selected = threads, rows, selected
+    engine: Engine
+    folder: Path  # that all workers share
+    rows: int = ROWS  # splats of a block, whole pages of X
+    selected: int = SELECTED  # splats of scenes that workers load as a whole
 
-    def run(self, stage: str, work: Work, job: Job, pieces: int) -> None:
-        """Run a step for all pieces, and report progress."""
-        for completed, _ in enumerate(self.engine.run(work, job, pieces), start=1):
-            self.timings.progress(stage, completed, pieces, "blocks")
-
-    def plan(self, views: LiftViews, device: Device) -> Plan:
-        probe = bool(views.features.paths)
-        if self.inputs.settings.device == "auto" and not isinstance(self.engine, LocalEngine):
+    def plan(self, inputs: LiftInputs, device: Device, threads: int | None) -> Plan:
+        """Plan the lift; `weigh` tells callers the part of a worker."""
+        probe = bool(inputs.views.features.paths)
+        if inputs.settings.device == "auto" and not isinstance(self.engine, LocalEngine):
             device = CPU  # workers may have other GPUs than this machine, or none
-        return plan_lift(
-            self.inputs.splats, views, self.inputs.settings, device, self.threads, in_workers=True, probe=probe
-        )
+        arguments = inputs.splats, inputs.views, inputs.settings, device, threads
+        return plan_lift(*arguments, in_workers=True, probe=probe)
 
-    def weigh(self, views: LiftViews, plan: Plan, on_plan: Callable[[Plan], None]) -> tuple[Job, WeightStatistics]:
+    def weigh(
+        self, inputs: LiftInputs, plan: Plan, on_plan: Callable[[Plan], None], timings: Timings
+    ) -> tuple[Job, WeightStatistics]:
+        """Compute W of the plan's views, by views and by blocks of splats; call ``on_plan`` before."""
         worker_plan = plan_of_a_worker(plan)
         on_plan(replace(worker_plan, warnings=(*worker_plan.warnings, *_lack_of_disk(self.folder, plan))))
-        with self.timings.step("share"):
-            job = self._share(views, plan)
+        with timings.step("share"):
+            job = self._share(inputs, plan)
         for completed, _ in enumerate(self.engine.run(weigh, job, job.view_pieces), start=1):
-            self.timings.progress("geometry", min(completed * PIECE_VIEWS, len(job.names)), len(job.names), "views")
-        with self.timings.stage("gather"):
-            statistics, settings = _share_regions(job, plan), job.settings
-            dtype = getattr(torch, settings.dtype)
-            if dtype == torch.float16 and not steps.codebook_of(job).fits_float16():
-                dtype = torch.float32
-            related = settings.finds_objects(statistics.masks) or (settings.robust and statistics.masks)
-            job = replace(job, dtype=dtype, related=related)
-            self._gather(job)
+            timings.progress("geometry", min(completed * PIECE_VIEWS, len(job.names)), len(job.names), "views")
+        with timings.stage("gather"):
+            statistics = _share_regions(job, plan)
+            for completed, _ in enumerate(self.engine.run(gather, job, job.splat_pieces), start=1):
+                timings.progress("gather", completed, job.splat_pieces, "blocks")
         return job, statistics
 
-    def _share(self, views: LiftViews, plan: Plan) -> Job:
+    def _share(self, inputs: LiftInputs, plan: Plan) -> Job:
         """Write the job's inputs for all workers, which all use the device of the plan."""
-        splats, source = self.inputs.splats, self.inputs.source_views
-        settings = self.inputs.settings.model_copy(update={"device": plan.device.kind})
-        packs = tuple(Path(path).resolve() for path in source.paths)
-        sizes = splats.count, views.features.channels
-        job = Job(self.folder, packs, views.cameras, views.names, settings, splats.kernel, *sizes)
-        job = replace(job, rows=self.rows, selected=self.selected)
+        splats, views, source = inputs.splats, inputs.views, inputs.source_views
+        job = Job(
+            settings=inputs.settings.model_copy(update={"device": plan.device.kind}), names=views.names,
+            splats=splats.count, channels=views.features.channels, view_pieces=-(-len(views.names) // PIECE_VIEWS),
+            rows=self.rows, folder=self.folder, packs=tuple(Path(path).resolve() for path in source.paths),
+            cameras=views.cameras, kernel=splats.kernel, selected=self.selected,
+        )  # fmt: skip
         job = replace(job, folder=_open_pieces(self.folder, _identity(job, splats)))
         if not (job.folder / SCENE).exists():
             write_scene(splats, job.folder / SCENE)
-        return job if packs else replace(job, packs=tuple(_packs(source, set(views.unpaired), job.folder)))
+        if job.packs:
+            return job
+        return replace(job, packs=tuple(_packs(source, set(views.unpaired), job.folder)))
 
-    def _gather(self, job: Job) -> None:
-        """Gather W by blocks of splats, and write the bounds of the curve that orders splats in space."""
-        if job.related:
-            self.run("gather", steps.relate, job, job.view_pieces)
-            sizes, groups = _share_tuples(job), steps.groups_of(job)
-            if job.settings.finds_objects(True):
-                nodes, other_masks = choose_nodes(groups, sizes)
-                steps.write_piece(job.folder / steps.NODES, {"nodes": nodes, "other_masks": other_masks})
-        self.run("gather", steps.gather, job, job.splat_pieces)
-        bounds = np.concatenate([part["bounds"] for part in _pieces(job, "rows")])
-        if bounds.size:
-            bounds = np.stack([bounds.min(axis=0), bounds.max(axis=0)])
-        steps.write_piece(job.folder / steps.CURVE, {"bounds": bounds})
-
-    def find_objects(self, W: Job) -> RegionObjects:
-        groups = steps.groups_of(W)
-        nodes, other_masks = (map_tensors(W.folder / steps.NODES)[0][name] for name in ("nodes", "other_masks"))
-        self.run("objects", steps.contain, W, W.view_pieces)
-        parts = [map_tensors(W.piece_file("contain", number))[0] for number in range(W.view_pieces)]
-        containers = np.concatenate([part["container"] for part in parts])
-        tree = region_tree(nodes, groups, containers, self.threads)
-        number = tree.parents.size
-        if number and other_masks.size:
-            self._label(W, 0, tree)
-            tree = add_regions(
-                tree, other_masks, (part for file in _pieces(W, "labels-0") for part in unpack_sums(file))
-            )
-        self._label(W, 1, tree)
-        labels, total_weight = _column(W, "labels-1", "labels"), _column(W, "rows", "total_weight")
-        weights = _sums(W, "labels-1", (1, number * groups.views))
-        numbers = node_numbering(labels, total_weight, tree)
-        return number_objects(labels, tree, numbers, weights.reshape(number, groups.views))
-
-    def _label(self, job: Job, step: int, tree: RegionTree) -> None:
-        steps.write_piece(job.folder / steps.TREE.format(step), vars(tree))
-        self.run("objects", steps.label, replace(job, step=step), job.splat_pieces)
-
-    def node_vectors(self, W: Job, objects: RegionObjects) -> NodeVectors:
-        codebook = steps.codebook_of(W)
-        return NodeVectors.of(codebook, _sums(W, "rows", (1, codebook.regions))[0], objects)
-
-    def compare_masks(self, W: Job) -> Job:
-        self.run("consensus", steps.share, W, W.view_pieces)
-        parts = [map_tensors(W.piece_file("share", number))[0]["shares"] for number in range(W.view_pieces)]
-        share_sum, share_count = np.sum(parts, axis=0)
-        return replace(W, usual_share=mean_share(int(share_sum), int(share_count)))
-
-    def reweight(self, W: Job, levels_apart: bool) -> tuple[Job, float | None]:
-        """See the protocol; the solve of each block applies the factors."""
-        W = replace(W, levels_apart=levels_apart)
-        codebook = steps.codebook_of(W)
-        region_mask = mask_regions(steps.mapped(W.folder / steps.REGIONS)["levels"])
-        totals = _sums(W, "rows", (1, codebook.regions))
-        entries = sum(part["region"].size for part in _pieces(W, "rows"))
-        principal = W.settings.robust_directions
-        RegionDirections(codebook, torch.from_numpy(totals[0]), entries, principal).save(W.folder)
-        level = level_numbers(steps.compared_levels(W), codebook.regions)
-        shape = 2, codebook.regions + int(level.max(initial=0)) + 1
-        self.run("robust", steps.compare, replace(W, by_region=region_mask is not None), W.splat_pieces)
-        scene = SceneConsistency.of(_sums(W, "cosines", shape), region_mask, level)
-        steps.write_scene_consistency(W, scene)
-        return W, scene.reliability
-
-    def solve(self, W: Job) -> tuple[Tensor, SplatSupport]:
-        self.run("solve", steps.solve, W, W.splat_pieces)
-        sums, total_weight = _column(W, "rows", "sums"), _column(W, "rows", "total_weight")
-        confidence = torch.from_numpy(_column(W, "columns", "confidence")) if W.settings.robust else None
-        return _mapped(W, W.features_file), SplatSupport(sums, torch.from_numpy(total_weight), confidence)
-
-    def compare_with_optimum(self, W: Job, X: Tensor, visible: np.ndarray) -> NoReturn:
-        """See the protocol; `LiftSettings.check_blocks` rejects settings that need it."""
-        raise AssertionError("the optimum needs all rays in one place")
-
-    def smooth(self, W: Job, X: Tensor, support: SplatSupport) -> NoReturn:
-        """See the protocol; `LiftSettings.check_blocks` rejects settings that need it."""
-        raise AssertionError("the graph of neighbours crosses blocks")
-
-    def aggregate(self, W: Job, X: Tensor) -> NoReturn:
-        """See the protocol; `LiftSettings.check_blocks` rejects settings that need it."""
-        raise AssertionError("clusters need all features in one place")
-
-    def measure(self, W: Job, X: Tensor) -> ViewMeasures:
-        """See the protocol: a view at a time."""
-        views = (read_view(W.view_file(number)) for number in range(len(W.names)))
-        return join_measures([measure_view(view.sample, X, view.codebook.rows) for view in views])
-
-    def deliver(self, W: Job, lift: LiftResult) -> LiftResult:
-        """See the protocol: a lift mapped from shards; their files may be deleted while it is open."""
+    @staticmethod
+    def deliver(job: Job, lift: LiftResult) -> LiftResult:
+        """Return a lift mapped from shards; their files may be deleted while it is open."""
         columns = {name: part for name, part in vars(lift).items() if isinstance(part, Tensor) and name != "features"}
-        write_index(W.folder / "lift", columns, W.splat_pieces, lift.metadata.model_dump_json())
-        return load_lift(W.folder / "lift")
+        write_index(job.folder / "lift", columns, job.splat_pieces, lift.metadata.model_dump_json())
+        return load_lift(job.folder / "lift")
 
 
-def _pieces(job: Job, step: str) -> Iterator[dict[str, np.ndarray]]:
-    """Iterate over the files of a step for blocks of splats, one mapped at a time."""
-    return (map_tensors(job.piece_file(step, number))[0] for number in range(job.splat_pieces))
+@contextmanager
+def block_folder(
+    engine: Engine, settings: LiftSettings, folder: Path | None = None, *, rows: int = ROWS, selected: int = SELECTED
+) -> Iterator[BlockFolder]:
+    """Open the folder of a lift by an engine, where each piece is a file.
 
+    Args:
+        folder: that all workers share. An interrupted lift of packs resumes from the pieces there; None: a temporary
+            folder.
+        rows, selected: as of `BlockFolder`.
 
-def _sums(job: Job, step: str, shape: tuple[int, int]) -> np.ndarray:
-    """Add up the sums in the files of a step."""
-    return sum_pieces((part for arrays in _pieces(job, step) for part in unpack_sums(arrays)), shape)
-
-
-def _column(job: Job, step: str, name: str) -> np.ndarray:
-    """Concatenate a column of all splats [P] from the files of a step."""
-    return np.concatenate([part[name] for part in _pieces(job, step)])
-
-
-def _mapped(job: Job, file: Callable[[int], Path]) -> Tensor:
-    """Map X [P, F] from the files of blocks."""
-    return torch.from_numpy(map_rows([shard_at(file(number)) for number in range(job.splat_pieces)]))
+    Raises:
+        InvalidSettings: engine is of another type; or a step needs all rays or all features, as in
+            `LiftSettings.check_blocks`.
+        Unavailable: the disk of the folder is full, or workers cannot read it.
+    """
+    if not hasattr(engine, "run"):
+        hint = "LocalEngine() or RayEngine(address) makes one"
+        raise InvalidSettings("engine", expected="an engine, or None", got=repr(engine)[:80], hint=hint)
+    settings.check_blocks()
+    with _folder(folder or engine.scratch, permanent=folder is not None) as place, _in_words(place):
+        try:
+            yield BlockFolder(engine, place, rows, selected)
+        finally:
+            forget_files()
 
 
 def _share_regions(job: Job, plan: Plan) -> WeightStatistics:
@@ -383,8 +249,8 @@ def _share_regions(job: Job, plan: Plan) -> WeightStatistics:
     if arrays["offsets"][-1] > MOST_REGIONS:
         got, hint = f"{arrays['offsets'][-1]} in {len(job.names)} views", "lift fewer views, or smaller maps"
         raise Unavailable("features", expected=f"at most {MOST_REGIONS} regions", got=got, hint=hint)
-    steps.write_piece(job.folder / steps.REGIONS, arrays)
-    write_tensors(job.folder / steps.CODEBOOK, _Books(job), {})
+    job.save("regions", None, arrays)
+    write_tensors(job.folder / CODEBOOK, _Books(job), {})
     return WeightStatistics(plan, arrays["levels"], entries, tuple(blind))
 
 
@@ -406,18 +272,3 @@ class _Books(Mapping[str, Tensor]):
     def __getitem__(self, name: str) -> Tensor:
         part, number = name.split("/")
         return getattr(read_view(self._job.view_file(int(number))).codebook, part)
-
-
-def _share_tuples(job: Job) -> np.ndarray:
-    """Write the tables of all views' tuples; return the count of splats in each region, [M] i64."""
-    bases, parents, members, sizes = [0], list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
-    for number in range(job.view_pieces):
-        part = map_tensors(job.piece_file("relate", number))[0]
-        piece_parents = part["parents"]
-        parents.append(np.where(piece_parents < 0, piece_parents, piece_parents + np.int32(bases[-1])))
-        members.append(part["members"].copy())
-        sizes.append(part["sizes"].copy())
-        bases.append(bases[-1] + piece_parents.size)
-    arrays = {"bases": np.array(bases[:-1]), "parents": np.concatenate(parents), "members": np.concatenate(members)}
-    steps.write_piece(job.folder / steps.TUPLES, arrays)
-    return np.concatenate(sizes)

@@ -19,7 +19,7 @@ from liftcore.runtime.one_line import one_line
 
 if TYPE_CHECKING:
     from liftcore.lifting.engines.base import Work
-    from liftcore.lifting.engines.blocks import Job
+    from liftcore.lifting.pieces import Pieces
 
 MAX_QUEUED = 1_000  # pieces that are submitted to Ray at a time
 RETRIES = 5  # of a piece whose worker or node died; a piece that fails more often is itself the cause
@@ -58,7 +58,7 @@ class RayEngine:
     def __repr__(self) -> str:
         return one_line(self, repr(self._address), f"cpus={self._cpus}", f"gpus={self._gpus}")
 
-    def run(self, work: Work, job: Job, pieces: int) -> Iterator[int]:
+    def run(self, work: Work, job: Pieces, pieces: int) -> Iterator[int]:
         """See `lifting.engines.base.Engine`."""
         ray = self._ray
         needs: dict[str, float] = {"num_cpus": self._cpus, "max_retries": RETRIES}

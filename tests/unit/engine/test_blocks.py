@@ -18,7 +18,7 @@ import liftcore as lc
 from liftcore.lifting import pipeline
 from liftcore.lifting.engines import blocks
 from liftcore.lifting.engines.base import LocalEngine
-from liftcore.lifting.engines.lift import steps_in_blocks
+from liftcore.lifting.engines.lift import block_folder
 from liftcore.lifting.inputs import LiftInputs
 from liftcore.lifting.planning.plan import Plan
 from liftcore.runtime.progress import Timings
@@ -92,8 +92,8 @@ def scene() -> dict[str, Any]:
 
 def in_blocks(engine: Any, scene: dict[str, Any], settings: LiftSettings, **keywords: Any) -> lc.LiftResult:
     inputs, timings = LiftInputs.of(**scene, preset=settings), Timings(keywords.pop("progress", None))
-    with steps_in_blocks(engine, inputs, timings, **{"rows": ROWS, "selected": 1000, **keywords}) as steps:
-        return pipeline.run(steps, inputs, timings, lambda _: None)
+    with block_folder(engine, settings, **{"rows": ROWS, "selected": 1000, **keywords}) as folder:
+        return pipeline.run(inputs, timings, lambda _: None, blocks=folder)
 
 
 def assert_same(left: lc.LiftResult, right: lc.LiftResult) -> None:

@@ -21,7 +21,7 @@ from liftcore.io.splats import labelled, read_places, read_splats, some_rows, wr
 from liftcore.io.spz import spz_blocks
 from liftcore.lifting import pipeline
 from liftcore.lifting.engines.base import LocalEngine
-from liftcore.lifting.engines.lift import steps_in_blocks
+from liftcore.lifting.engines.lift import block_folder
 from liftcore.lifting.files import lift_files
 from liftcore.lifting.inputs import LiftInputs
 from liftcore.lifting.planning.views import visibility
@@ -336,8 +336,8 @@ def test_a_lift_in_blocks_and_its_file_keep_the_origin(tmp_path: Path) -> None:
     settings = LiftSettings.of(preset="row-sum")
     in_memory = lc.lift(far_splats, Cameras(cameras), views, settings)
     inputs, timings = LiftInputs.of(far_splats, Cameras(cameras), views, settings), Timings()
-    with steps_in_blocks(LocalEngine(), inputs, timings, selected=9) as steps:
-        in_blocks = pipeline.run(steps, inputs, timings, lambda _: None)
+    with block_folder(LocalEngine(), settings, selected=9) as folder:
+        in_blocks = pipeline.run(inputs, timings, lambda _: None, blocks=folder)
     assert (
         torch.equal(in_memory.features, in_blocks.features) and in_memory.metadata.origin == in_blocks.metadata.origin
     )

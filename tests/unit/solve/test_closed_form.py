@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from liftcore.solve.closed_form import LONG, solve
+from liftcore.solve.closed_form import LONG
 from liftcore.values.region_weights import RegionWeights, stacked
+from tests.unit.solve.one_piece import solve
 from tests.unit.solve.sparse_views import codebook_of, defined, of_dense, random_view
 
 SPLATS = 700

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.compositing import CompositingParams, Weighting
-from liftcore.solve.closed_form import solve
 from liftcore.solve.codebook import Codebook, ViewCodebook, as_regions
 from liftcore.values.region_weights import RegionWeights, stacked
 from liftcore.values.views import NO_LABEL, FeatureGrid, Regions
 from tests.scenes import random_camera, random_splats
+from tests.unit.solve.one_piece import solve
 
 SIZE = 48
 RASTER = CpuRaster(random_splats(7, 60), threads=1)

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.solve.consensus import OBSERVES, PRIOR, mask_consensus
+from liftcore.solve.consensus import OBSERVES, PRIOR
 from liftcore.solve.membership import BELONGS, FAINT
-from liftcore.solve.reweight import SHARPNESS, reweighting_factors
+from liftcore.solve.reweight import SHARPNESS
 from liftcore.values.region_weights import RegionWeights, stacked
+from tests.unit.solve.one_piece import mask_consensus, reweighting_of
 from tests.unit.solve.sparse_views import codebook_of, dense, of_dense
 
 SPLATS = 60
@@ -193,7 +194,7 @@ def test_reliability_and_confidence_equal_their_definition(seed: int) -> None:
     masks[: int(W.offsets[seed % 3])] = False  # of some views, as those of grids
     books, q = books_of(W, seed), mask_consensus(W, levels)
     consensus = torch.from_numpy(q)
-    got = reweighting_factors(W, codebook_of(books), masks=masks, consensus=consensus)
+    got = reweighting_of(W, codebook_of(books), masks=masks, consensus=consensus)
     after, confidence, median = step_of(W, books, entries(W, q), masks.numpy())
     assert got.reliability == pytest.approx(median, rel=1e-4)
     np.testing.assert_allclose(entries(W, (W.weight * got.factors).numpy()), after, rtol=2e-3, atol=1e-5)
@@ -207,10 +208,10 @@ def test_a_region_with_a_wrong_word_loses_weight_everywhere() -> None:
     wrong = words[[1, 1, 2, 3]]  # of the last view's first region
     books = [words] * 4 + [wrong]
     without_reliability, with_reliability = (
-        reweighting_factors(W, codebook_of(books), masks=mask).factors for mask in (None, all_regions(W))
+        reweighting_of(W, codebook_of(books), masks=mask).factors for mask in (None, all_regions(W))
     )
     lying = int(W.offsets[4])
     assert float(with_reliability[W.region == lying].max()) <= float(without_reliability[W.region == lying].min())
-    got = reweighting_factors(W, codebook_of(books), masks=all_regions(W))
+    got = reweighting_of(W, codebook_of(books), masks=all_regions(W))
     assert got.confidence is not None
     assert float(got.confidence[15:].min()) > 0.5

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from liftcore.solve import objects
-from liftcore.solve.objects import CONTAINS, OBSERVES, RegionObjects, region_objects
+from liftcore.solve.objects import CONTAINS, OBSERVES, RegionObjects
 from liftcore.solve.region_tree import LEAST_VIEWS, MERGE_RATE
 from liftcore.values.region_weights import RegionWeights, stacked
+from tests.unit.solve.one_piece import region_objects
 from tests.unit.solve.sparse_views import dense, of_dense
 from tests.unit.solve.test_consensus import SPLATS, belonging, of_things, random_scene
 

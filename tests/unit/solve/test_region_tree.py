@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from liftcore.solve.codebook import Codebook, ViewCodebook
-from liftcore.solve.objects import NodeVectors, RegionObjects, object_facts, region_objects
+from liftcore.solve.objects import NodeVectors, RegionObjects, object_facts
 from liftcore.values.region_weights import RegionWeights, stacked
+from tests.unit.solve.one_piece import region_objects
 from tests.unit.solve.sparse_views import of_dense
 from tests.unit.solve.test_objects import objects_of
 

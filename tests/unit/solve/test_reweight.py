@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from liftcore.solve.directions import RegionDirections
-from liftcore.solve.reweight import NO_CONSENSUS, reweighting_factors, scale_weights
+from liftcore.solve.reweight import NO_CONSENSUS, scale_weights
 from liftcore.solve.shared_rows import LONG, MOST_COMPARED
 from liftcore.values.region_weights import RegionWeights, stacked
+from tests.unit.solve.one_piece import reweighting_of
 from tests.unit.solve.sparse_views import codebook_of, dense, of_dense
 
 
@@ -32,7 +33,7 @@ class Scene:
     def after(self, **options) -> list[np.ndarray]:
         """The weights of every view after the step, dense."""
         W = self.stacked()
-        consistency = scale_weights(W, reweighting_factors(W, codebook_of(self.books), **options).factors)
+        consistency = scale_weights(W, reweighting_of(W, codebook_of(self.books), **options).factors)
         matrix = dense(consistency, len(self.weights[0])).astype(np.float32)
         return np.split(matrix, W.offsets.numpy()[1:-1], axis=1)
 

@@ -1,0 +1,326 @@
+"""The steps of a lift from W to X; a step works on a piece of views, or on a block of splats (`lifting.pieces`).
+
+A step is a function ``(scene, piece, threads)`` that loads the arrays of earlier steps and saves its own. Sums over
+the scene are saved by pieces of splats (`liftcore.solve.sums`); `lifting.algebra` adds them up and saves the totals
+as tables. So the result is bitwise identical for any division of the scene.
+
+    step      piece of   saves
+    gather    splats     W of all views, a row a splat, its sums and total weight (in memory `lifting.in_memory`)
+    relate    views      the regions that their splats belong to, as tuples (`liftcore.solve.consensus`)
+    join      splats     the tuples of all views
+    contain   views      the regions that contain theirs (`liftcore.solve.objects`)
+    label     splats     the object of each splat, and its weight in other regions and in views
+    share     views      the consensus of other views about their entries (`liftcore.solve.consensus`)
+    compare   splats     cosines of regions with the other views (`liftcore.solve.reweight`)
+    solve     splats     X and confidence
+
+A worker holds one piece: W of some views or of a block, in mapped files where it is large, and tables of size M, of
+which those of codebooks and directions take at most TABLE_BYTES.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from functools import wraps
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from liftcore.lifting.pieces import Pieces, Shape
+from liftcore.runtime.one_thread import one_thread
+from liftcore.solve.closed_form import solve_rows
+from liftcore.solve.consensus import SplatTuples, along_curve, region_shares, splat_tuples, with_mean
+from liftcore.solve.directions import region_totals
+from liftcore.solve.membership import RegionGroups, memberships
+from liftcore.solve.objects import (
+    count_members,
+    node_containers,
+    node_labels,
+    node_shares,
+    node_splats,
+    sample_splats,
+    view_shares,
+)
+from liftcore.solve.region_tree import RegionTree
+from liftcore.solve.reweight import BlockReweighter, SceneConsistency, confidence_of, of_regions, scale_weights
+from liftcore.solve.rows import SomeRows, fill_rows, gather_rows, take_rows, values_of
+from liftcore.solve.sums import PieceSums
+from liftcore.values.region_weights import RegionWeights
+
+Saved = tuple[dict[str, Any], Iterable[PieceSums], Shape | None]  # the arguments of `Pieces.save` after the number
+Step = Callable[[Any, int, int | None], None]  # of `Pieces`
+
+
+def saved_as(name: str) -> Callable[[Callable[[Any, int, int | None], Saved]], Step]:
+    """Decorate a step: save what it computes of a piece by a name, unless that is done."""
+
+    def decorate(compute: Callable[[Any, int, int | None], Saved]) -> Step:
+        @wraps(compute)
+        @one_thread()
+        def work(scene: Pieces, piece: int, threads: int | None) -> None:
+            step = name.format(scene.turn)
+            if not scene.has(step, piece):
+                scene.save(step, piece, *compute(scene, piece, threads))
+
+        return work
+
+    return decorate
+
+
+def groups_of(scene: Pieces) -> RegionGroups:
+    """Return the view and the level of each region."""
+    table = scene.load("regions")
+    return RegionGroups.of(table["offsets"], table["levels"])
+
+
+def weights_of(starts: np.ndarray, region: Tensor, weight: Tensor, offsets: np.ndarray) -> RegionWeights:
+    """Make W, a row for each of ``starts``, without total weight."""
+    rows, begins = torch.arange(starts.size - 1, dtype=torch.int32), torch.from_numpy(starts)
+    return RegionWeights(rows, begins, region, weight, rows[:0], weight[:0], torch.from_numpy(offsets))
+
+
+def part_of(splats: np.ndarray, starts: np.ndarray, values: Iterable[np.ndarray], ends: tuple[int, int]) -> SomeRows:
+    """Select the rows of a part that are in a block, and their values."""
+    first, last = np.searchsorted(splats, ends)
+    span = slice(int(starts[first]), int(starts[last]))
+    return SomeRows(
+        splats[first:last] - ends[0], starts[first : last + 1] - span.start, [part[span] for part in values]
+    )
+
+
+# ---- pieces of views
+
+
+class ViewBlock(NamedTuple):
+    """The splats of a piece of views, and W of these views."""
+
+    base: int  # the first of their regions
+    splats: np.ndarray  # [n] i32 ascending
+    W: RegionWeights  # a row for each; regions are numbered over all views
+
+
+def view_block(scene: Pieces, piece: int) -> ViewBlock:
+    """Load W of a piece of views."""
+    arrays, numbers, offsets = scene.load("weights", piece), scene.views_of(piece), scene.load("regions")["offsets"]
+    base, region = int(offsets[numbers.start]), torch.from_numpy(arrays["region"])
+    if base:
+        region = values_of(region.shape[0], torch.int32)
+        np.add(arrays["region"], np.int32(base), out=region.numpy())
+    local_offsets = offsets[numbers.start : numbers.stop + 1] - base
+    W = weights_of(arrays["starts"], region, torch.from_numpy(arrays["weight"]), local_offsets)
+    return ViewBlock(base, arrays["splats"], W)
+
+
+@saved_as("relate")
+def relate(scene: Pieces, piece: int, threads: int | None) -> Saved:
+    """Save the memberships and tuples of the splats of some views, and the count of splats in their regions."""
+    block, groups = view_block(scene, piece), groups_of(scene)
+    own_region = memberships(block.W, groups, threads)
+    lengths = np.diff(block.W.indptr.numpy())
+    rows = np.flatnonzero(lengths)
+    rows = rows[along_curve(scene.means[torch.from_numpy(block.splats[rows]).long()])]  # so that tuples repeat
+    tuples = splat_tuples(block.W, own_region, groups, rows)
+    lengths[rows] = np.diff(tuples.starts)
+    _, numbers = take_rows(tuples.starts, np.argsort(rows), tuples.tuples)
+    sizes = np.zeros(int(block.W.offsets[-1]), np.int64)
+    count_members(block.W.region.numpy(), own_region, block.base, sizes)
+    arrays = {"splats": block.splats, "own_region": own_region, "sizes": sizes, "tuples": numbers}
+    arrays |= {"starts": np.concatenate([[0], np.cumsum(lengths)])}
+    return arrays | {"parents": tuples.parents, "members": tuples.members}, (), None
+
+
+def tuples_of(scene: Pieces, splats: np.ndarray) -> tuple[SplatTuples, np.ndarray]:
+    """Load the tuples of some splats [n] ascending in all views, and their totals t_j [n] f64."""
+    ends = np.searchsorted(splats, [scene.bounds(block)[0] for block in range(scene.splat_pieces)] + [scene.splats])
+    starts, totals = np.zeros(splats.size + 1, np.int64), np.zeros(splats.size)
+    for target in (None, "filled"):
+        tuples = values_of(int(starts[-1]) if target else 0, torch.int32).numpy()
+        for block, (first, last) in enumerate(pairwise(ends.tolist())):
+            if first == last:
+                continue
+            arrays, rows = scene.load("join", block), splats[first:last] - scene.bounds(block)[0]
+            if target is None:
+                starts[first + 1 : last + 1] = np.diff(arrays["starts"])[rows]
+                totals[first:last] = arrays["totals"][rows]
+            else:
+                tuples[starts[first] : starts[last]] = take_rows(arrays["starts"], rows, arrays["tuples"])[1]
+        if target is None:
+            np.cumsum(starts, out=starts)
+    table = scene.load("tuples")
+    return SplatTuples(starts, tuples, table["parents"], table["members"]), totals
+
+
+@saved_as("contain")
+def contain(scene: Pieces, piece: int, threads: int | None) -> Saved:
+    """Save the nodes that contain those of some views."""
+    block, groups, nodes = view_block(scene, piece), groups_of(scene), scene.load("nodes")["nodes"]
+    related = scene.load("relate", piece)
+    begins, rows = sample_splats(block.W, related["own_region"], related["sizes"], nodes, block.base)
+    is_sampled = np.zeros(block.splats.size, np.bool_)
+    is_sampled[rows] = True
+    local, numbers = np.flatnonzero(is_sampled), (np.cumsum(is_sampled) - 1)[rows]
+    tuples, totals = tuples_of(scene, block.splats[local])
+    table = node_splats(begins, numbers, tuples, totals, nodes, groups.view.size)
+    return {"container": node_containers(table, nodes, groups, threads)}, (), None
+
+
+@saved_as("share")
+def share(scene: Pieces, piece: int, threads: int | None) -> Saved:
+    """Save the consensus of other views about the entries of some views."""
+    block, groups, own_region = view_block(scene, piece), groups_of(scene), scene.load("relate", piece)["own_region"]
+    visible = np.flatnonzero(np.diff(block.W.indptr.numpy()))
+    bounds = torch.from_numpy(scene.load("curve")["bounds"])
+    order = along_curve(scene.means[torch.from_numpy(block.splats[visible]).long()], bounds)
+    tuples, totals = tuples_of(scene, block.splats[visible])
+    tuples = SplatTuples(*take_rows(tuples.starts, order, tuples.tuples), tuples.parents, tuples.members)
+    arguments = block.W, own_region, groups, visible[order], totals[order], tuples
+    shares = region_shares(*arguments, base=block.base, threads=threads)
+    arrays = {"splats": block.splats, "starts": block.W.indptr, "sums": shares.sums, "views": shares.views}
+    return arrays | {"shares": np.array([shares.share_sum, shares.share_count])}, (), None
+
+
+# ---- blocks of splats
+
+
+class SplatBlock(NamedTuple):
+    """W of a block of splats in all views."""
+
+    W: RegionWeights
+    means: Tensor  # [n, 3]
+
+
+def row_arrays(scene: Pieces, W: RegionWeights, means: Tensor, total_weight: Tensor, threads: int | None) -> Saved:
+    """Return what is saved of W of a block: its sums, total weight, bounds and, if read later, weights of regions."""
+    sums, visible = W.row_sums(), means[W.indptr.diff() > 0]
+    arrays = {"indptr": W.indptr, "region": W.region, "weight": W.weight, "sums": sums, "total_weight": total_weight}
+    ends = [visible.amin(dim=0), visible.amax(dim=0)] if visible.numel() else []
+    arrays["bounds"] = torch.stack(ends).double() if ends else torch.zeros(0, 3, dtype=torch.float64)
+    if not (scene.settings.robust or scene.settings.objects):
+        return arrays, (), None
+    return arrays, region_totals(W, threads), (1, int(W.offsets[-1]))
+
+
+def splat_block(scene: Pieces, piece: int) -> SplatBlock:
+    """Load W of a block of splats."""
+    arrays = scene.load("rows", piece)
+    region, weight = (torch.from_numpy(arrays[name]) for name in ("region", "weight"))
+    W = weights_of(arrays["indptr"], region, weight, scene.load("regions")["offsets"])
+    return SplatBlock(W, scene.means[slice(*scene.bounds(piece))])
+
+
+@saved_as("join")
+def join(scene: Pieces, piece: int, threads: int | None) -> Saved:
+    """Save the tuples of a block of splats in all views, and the sums of its rows of W."""
+    bases, ends = scene.load("tuples")["bases"], scene.bounds(piece)
+
+    def parts() -> Iterator[SomeRows]:
+        for number, base in enumerate(bases):
+            arrays = scene.load("relate", number)
+            part = part_of(arrays["splats"], arrays["starts"], [arrays["tuples"]], ends)
+            yield SomeRows(part.rows, part.starts, [part.values[0] + np.int32(base)])
+
+    starts, (tuples,) = gather_rows(parts, ends[1] - ends[0], (torch.int32,))
+    return {"starts": starts, "tuples": tuples, "totals": scene.load("rows", piece)["sums"]}, (), None
+
+
+@saved_as("labels-{}")
+def label(scene: Pieces, piece: int, threads: int | None) -> Saved:
+    """Save the smallest node of each splat, and the weight of nodes: at first in other regions, then in views."""
+    W, groups, tree = splat_block(scene, piece).W, groups_of(scene), RegionTree(**_tree(scene))
+    labels, number = node_labels(W, groups, tree, threads), tree.parents.size
+    if scene.turn == 0:
+        other_masks = scene.load("nodes")["other_masks"]
+        return {"labels": labels}, node_shares(W, labels, number, other_masks, threads), None
+    return {"labels": labels}, view_shares(W, groups, labels, number, threads), (1, number * groups.views)
+
+
+def _tree(scene: Pieces) -> dict[str, Any]:
+    names = "region", "parents", "confidence"
+    return {name: scene.load(f"tree-{scene.turn}")[name] for name in names}
+
+
+def compared_regions(scene: Pieces) -> list[np.ndarray]:
+    """Return the regions that are compared with each other, [M] bool each: all, or those of each level."""
+    levels = scene.load("regions")["levels"]
+    return (
+        [levels == level for level in np.unique(levels)] if scene.levels_apart else [np.ones(levels.size, np.bool_)]
+    )
+
+
+def by_level(scene: Pieces, W: RegionWeights, turns: Iterable[int]) -> Iterator[tuple[RegionWeights, Any]]:
+    """Yield W of compared regions alone, and the indices of its entries in W."""
+    parts = compared_regions(scene)
+    for turn in turns:
+        yield of_regions(W, parts[turn]) if scene.levels_apart else (W, slice(None))
+
+
+@saved_as("cosines-{}")
+def compare(scene: Pieces, piece: int, threads: int | None) -> Saved:
+    """Save the cosines of regions with their sums over the scene, of one level or of all."""
+    block, levels = splat_block(scene, piece), scene.load("regions")["levels"]
+    [(W, _)] = by_level(scene, block.W, [scene.turn])
+    reweighter = BlockReweighter(W, block.means, threads)
+    cosines, sums = reweighter.cosines(scene.directions(), by_region=bool((levels >= 0).any()))
+    return {"cosines": cosines}, sums, reweighter.shape
+
+
+def reweighted(
+    scene: Pieces, piece: int, block: SplatBlock, threads: int | None
+) -> tuple[RegionWeights, Tensor | None]:
+    """Compute W of a block after the robust step, and the confidence of splats [n]; None without the step."""
+    if not scene.settings.robust:
+        return block.W, None
+    scores, consensus = np.zeros((2, block.means.shape[0])), consensus_of(scene, piece, block.W, threads)
+    factors, turns = torch.empty(0), range(len(compared_regions(scene)))
+    for turn, (W, entries) in zip(turns, by_level(scene, block.W, turns), strict=True):
+        part = scene.writable(scene.load(f"cosines-{turn}", piece)["cosines"])
+        of_level = None if consensus is None else consensus[entries]
+        BlockReweighter(W, None, threads).weigh(part, scene_consistency(scene, turn), of_level, scores)
+        if turn == 0:
+            factors = part if len(turns) == 1 else values_of(block.W.weight.shape[0], torch.float32)
+        factors[entries] = part
+    return scale_weights(block.W, factors), confidence_of(scores)
+
+
+def consensus_of(scene: Pieces, piece: int, W: RegionWeights, threads: int | None) -> Tensor | None:
+    """Compute c_jm of the entries of a block [nnz] f32; None if no view has masks."""
+    if scene.usual_share is None:
+        return None
+    if scene.view_pieces == scene.splat_pieces == 1:  # the entries are in this order
+        arrays = scene.load("share", 0)
+        sums, views = scene.writable(arrays["sums"]), torch.from_numpy(arrays["views"])
+    else:
+        sums, views = (values_of(W.region.shape[0], dtype) for dtype in (torch.float32, torch.uint8))
+        files = (scene.load("share", number) for number in range(scene.view_pieces))
+        parts = (
+            part_of(arrays["splats"], arrays["starts"], (arrays["sums"], arrays["views"]), scene.bounds(piece))
+            for arrays in files
+        )
+        fill_rows(parts, W.indptr.numpy(), [sums.numpy(), views.numpy()])
+    with_mean(sums.numpy(), views.numpy(), scene.usual_share, threads)
+    return sums
+
+
+def scene_consistency(scene: Pieces, turn: int) -> SceneConsistency:
+    """Load the totals of the robust step, of one level or of all."""
+    arrays = scene.load(f"consistency-{turn}")
+    mean_cosine, power = arrays["numbers"].tolist()
+    return SceneConsistency(mean_cosine, torch.from_numpy(arrays["regions"]), power)
+
+
+@saved_as("columns")
+def solve(scene: Pieces, piece: int, threads: int | None) -> Saved:
+    """Save X of a block of splats, and their confidence."""
+    block = splat_block(scene, piece)
+    W, confidence = reweighted(scene, piece, block, threads)
+    sums, means = None if W is not block.W else torch.from_numpy(scene.load("rows", piece)["sums"]), block.means
+    del block
+    cosines = [f"cosines-{turn}" for turn in range(len(compared_regions(scene)))]
+    scene.drop("rows", "weights", "share", *cosines)  # in memory W is now that of the solve alone
+    X = scene.new_features(piece)
+    solve_rows(X, W, scene.codebook, sums=sums, means=means, threads=threads)
+    scene.save_features(piece, X)
+    return {} if confidence is None else {"confidence": confidence}, (), None

@@ -1,0 +1,105 @@
+"""The steps of a lift on W in one piece."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from liftcore.lifting import steps
+from liftcore.lifting.algebra import Algebra
+from liftcore.lifting.engines.base import LocalEngine
+from liftcore.lifting.geometry import Geometry
+from liftcore.lifting.in_memory import scene_of
+from liftcore.runtime.progress import silent
+from liftcore.solve.codebook import Codebook
+from liftcore.solve.directions import RegionDirections
+from liftcore.solve.objects import RegionObjects
+from liftcore.solve.reweight import BlockReweighter, SceneConsistency, confidence_of, median_reliability, of_regions
+from liftcore.solve.sums import sum_pieces
+from liftcore.values.region_weights import RegionWeights
+from liftcore.values.settings import DIRECTIONS, LiftSettings
+from tests.unit.solve.sparse_views import codebook_of
+
+
+@dataclass(frozen=True)
+class Reweighting:
+    """Factors and scores of the robust step."""
+
+    factors: Tensor  # [nnz] f32
+    confidence: Tensor  # [P] f32
+    reliability: float | None
+
+
+def algebra_of(
+    W: RegionWeights,
+    codebook: Codebook | None = None,
+    levels: np.ndarray | None = None,
+    means: Tensor | None = None,
+    threads: int | None = None,
+    memory_limit: int | None = None,
+    **settings: Any,
+) -> Algebra:
+    """Return the algebra of W, with codebooks of zeros if there is none."""
+    regions, splats = int(W.offsets[-1]), W.splats.shape[0]
+    codebook = codebook or codebook_of([torch.zeros(int(count), 1) for count in W.offsets.diff()])
+    geometry = Geometry(W, codebook, (), (), np.full(regions, -1, np.int8) if levels is None else levels)
+    means, names = torch.zeros(splats, 3) if means is None else means, tuple(map(str, range(len(codebook.views))))
+    scene = scene_of(geometry, means, LiftSettings.of(**settings), names, threads=threads, memory_limit=memory_limit)
+    return Algebra(scene, LocalEngine(threads), silent, threads)
+
+
+def mask_consensus(
+    W: RegionWeights, levels: np.ndarray, threads: int | None = None, means: Tensor | None = None
+) -> np.ndarray:
+    """Return c of every entry of W [nnz] f32."""
+    algebra = algebra_of(W, levels=levels, means=means, threads=threads)
+    algebra.compare_masks()
+    consensus = steps.consensus_of(algebra.scene, 0, steps.splat_block(algebra.scene, 0).W, threads)
+    assert consensus is not None
+    return consensus.numpy()
+
+
+def region_objects(W: RegionWeights, levels: np.ndarray, total_weight: np.ndarray) -> RegionObjects:
+    """Return the objects of W, numbered by total weight [P]."""
+    weights = torch.from_numpy(total_weight.astype(np.float32))
+    W = replace(W, total_weight_splats=torch.arange(weights.shape[0], dtype=torch.int32), total_weight=weights)
+    return algebra_of(W, levels=levels).find_objects()[0]
+
+
+def reweighting_of(
+    W: RegionWeights,
+    codebook: Codebook,
+    *,
+    principal: int = DIRECTIONS,
+    means: Tensor | None = None,
+    threads: int | None = None,
+    masks: Tensor | None = None,
+    consensus: Tensor | None = None,
+    levels: np.ndarray | None = None,
+) -> Reweighting:
+    """Return the factors of W; masks [M] bool are the regions with a reliability."""
+    totals = torch.from_numpy(np.bincount(W.region.numpy(), W.weight.numpy(), minlength=codebook.regions))
+    directions = RegionDirections(codebook, totals, W.region.shape[0], principal)
+    level_of = np.zeros(codebook.regions) if levels is None else levels
+    factors = torch.zeros(W.region.shape[0])
+    scores, sums = (np.zeros((2, count)) for count in (W.splats.shape[0], codebook.regions))
+    for level in np.unique(level_of):
+        part, entries = of_regions(W, level_of == level)
+        block = BlockReweighter(part, means, threads)
+        cosines, parts = block.cosines(directions, masks is not None)
+        table = sum_pieces(parts, block.shape)
+        sums += table[:, :-1]
+        scene = SceneConsistency.of(table, None if masks is None else masks & torch.from_numpy(level_of == level))
+        block.weigh(cosines, scene, None if consensus is None else consensus[entries], scores)
+        factors[entries] = cosines
+    return Reweighting(factors, confidence_of(scores), median_reliability(sums, masks))
+
+
+def solve(W: RegionWeights, codebook: Codebook, dtype: torch.dtype, **options: Any) -> Tensor:
+    """Return ``D^-1 W E`` [P, F]."""
+    name = str(dtype).removeprefix("torch.")
+    return algebra_of(W, codebook, preset="row-sum", dtype=name, **options).solve()[0]
