@@ -49,7 +49,7 @@ class InvalidRequest(ServiceError):
 
 
 class UnreadableBody(ServiceError):
-    """A body that cannot be parsed as JSON."""
+    """A body that cannot be parsed as JSON, or is a part of a file."""
 
     kind, status, title = "malformed-request", 400, "The request is malformed"
 

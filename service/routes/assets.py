@@ -13,7 +13,7 @@ import anyio
 from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as PathParameter
 
-from service.errors import InvalidRequest, TooLarge, UnsupportedMedia
+from service.errors import InvalidRequest, TooLarge, UnreadableBody, UnsupportedMedia
 from service.models import Asset, AssetKind
 from service.routes import BINARY, Caller, Deps, Parts, add_list, content_of, file_answer
 
@@ -97,7 +97,7 @@ async def receive_upload(request: Request, deps: Parts, sha256: str | None) -> A
 
 
 def require_file(request: Request) -> None:
-    """Require that a body is a plain file: neither compressed nor a part of a form."""
+    """Require that a body is a plain and whole file: neither compressed, nor a part of a form or of a file."""
     encodings = ", ".join(request.headers.getlist("content-encoding")).strip()
     media = request.headers.get("content-type", "")
     if encodings.lower() not in ("", "identity"):
@@ -106,6 +106,9 @@ def require_file(request: Request) -> None:
     if re.match(r"\s*multipart/", media, re.IGNORECASE):
         hint = "send it with curl -T FILE or --data-binary @FILE, as application/octet-stream"
         raise UnsupportedMedia("Content-Type", expected="the file itself as the body", got=media[:80], hint=hint)
+    if part := request.headers.get("content-range"):  # RFC 9110, 14.5: whoever takes no parts of PUT refuses them
+        hint = "send the file in one request, without Content-Range"
+        raise UnreadableBody("Content-Range", expected="a whole file", got=part[:80], hint=hint)
 
 
 async def check_upload(deps: Parts, kind: str, draft: Path, cameras: Asset | None = None) -> dict[str, Any]:

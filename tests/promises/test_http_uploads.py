@@ -184,6 +184,14 @@ def test_range_of_an_unknown_unit_is_the_whole(client: httpx.Client, order: dict
     assert (reply.status_code, reply.content) == (200, tiny.splats)
 
 
+def test_part_of_a_file_is_no_asset(client: httpx.Client, tiny: TinyScene) -> None:
+    part, before = tiny.splats[:-28], client.get("/assets").json()
+    header = {"Content-Range": f"bytes 0-{len(part) - 1}/{len(tiny.splats)}"}
+    problem = assert_problem(client.put("/assets/splats", content=part, headers=header), 400)
+    assert "in one request" in str(problem)
+    assert client.get("/assets").json() == before
+
+
 def test_range_beyond_the_file_is_416(client: httpx.Client, order: dict[str, Any], tiny: TinyScene) -> None:
     reply = client.get(f"/assets/{order['splats']}/content", headers={"Range": "bytes=999999-"})
     assert reply.status_code == 416
