@@ -187,7 +187,7 @@ def plan(order: Order, report: Reporter) -> dict[str, Any]:
 
 
 def _document(plan: Plan, names: Mapping[str, str]) -> dict[str, Any]:
-    warnings = [replace_names(warning, names) for warning in (*plan.warnings, *plan.input_warnings)]
+    warnings = [replace_names(warning, names) for warning in plan.warnings]
     return finite({"summary": list(plan.summary()), "warnings": warnings, **plan.facts()})
 
 

@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
     write_files(files, {"output": partial(result.save, progress=True)})
     (plan,) = plans
     warnings = result.metadata.diagnostics["warnings"]
-    document = {"out": str(options.output), **_summary(result), "warnings": [*plan.warnings, *warnings]}
+    document = {"out": str(options.output), **_summary(result), "warnings": [*plan.machine_warnings, *warnings]}
     new_warnings = [warning for warning in warnings if warning not in plan.input_warnings]  # the plan printed others
     lines = _lines(document | {"warnings": new_warnings}, options.verbose)
     reply(document, as_json=options.json, lines=lines)
@@ -151,9 +151,8 @@ def plan_lines(plan: Plan) -> Iterable[str]:
     yield from (f"  {line}" for line in rest)
     if plan.seconds is not None:
         yield f"  about {max(plan.seconds, 1):.0f} s to rasterize the views on this machine"
-    warnings = (*plan.warnings, *plan.input_warnings)
-    yield from (f"warning: {warning}" for warning in warnings)
-    if not warnings:
+    yield from (f"warning: {warning}" for warning in plan.warnings)
+    if not plan.warnings:
         yield "  healthy: no contradictions between the inputs"
 
 

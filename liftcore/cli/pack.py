@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 OPTIONS = (
-    "layout", "unlabelled", "encoder", "photos", "device", "names", "folders", "unannotated", "encoder_name",
-    "text_space", "normalised",
+    "layout", "map_fit", "unlabelled", "encoder", "photos", "device", "names", "folders", "unannotated",
+    "encoder_name", "text_space", "normalised",
 )  # options of `pack_folder`  # fmt: skip
 NAMES = {
     "normalised": "--no-normalised",
@@ -30,6 +30,11 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
     arrays = formats.add_parser("npy", parents=[shared], help="IMG.npy (.npz, .pt), one dense map a view")
     axes_help = "the order of the axes, [h, w, F] or [F, h, w]; leading axes of length 1 are removed"
     arrays.add_argument("--layout", choices=("hwc", "chw"), default="hwc", help=axes_help)
+    fit_help = (
+        "what the encoder's preprocessing did to photos of another shape than its maps: stretched them, padded them "
+        "with bars on both sides, or cropped their centre"
+    )
+    arrays.add_argument("--map-fit", choices=("stretch", "pad", "crop"), help=fit_help)
     masks = formats.add_parser(
         "masks", parents=[shared], help="IMG.npy, one vector a mask, with IMG.json (SAM), IMG_masks.npy or IMG.png"
     )
@@ -101,7 +106,11 @@ def run(options: argparse.Namespace) -> int:
     from liftcore import pack_folder
     from liftcore.evaluate import inspect_file
 
-    values = {name: value for name, value in vars(options).items() if name in OPTIONS}
+    values = {
+        name: value
+        for name, value in vars(options).items()
+        if name in OPTIONS and not (name == "map_fit" and value is None)
+    }
     with option_errors(NAMES):
         facts = pack_folder(options.folder, options.output, options.format, **values, progress=True)
     description = inspect_file(options.output, "features")

@@ -32,7 +32,7 @@ def run(options: argparse.Namespace) -> int:
         "seconds": plan.seconds,
         "device": device,
         "views": views,
-        "warnings": [*plan.warnings, *plan.input_warnings],
+        "warnings": list(plan.warnings),
     }
     reply(document, as_json=options.json, lines=plan.lines() if options.verbose else plan_lines(plan))
     return 0

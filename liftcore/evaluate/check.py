@@ -5,14 +5,17 @@ photos too, the edges of masks with those of the mirrored masks, and features as
 does.
 
 Photos of another shape than their cameras are found by their headers, and compared no further. If renders do not
-match their photos, two causes are tried: turned or mirrored photos, and positions in another scale. A cause is
-reported if it makes renders match their photos; else none is.
+match their photos, three causes are tried: turned or mirrored photos, intrinsics of a picture of another size, and
+positions in another scale. A cause is reported if it makes renders match their photos; else none is.
+
+What has nothing to compare is not wrong: renders that match their photos far better than an empty picture does, such
+as of one object on nothing; and masks whose borders lie where the photo has no edges.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,13 +45,14 @@ from liftcore.raster.base import Raster
 from liftcore.runtime.arguments import as_list, as_path
 from liftcore.runtime.device import CPU
 from liftcore.runtime.progress import Progress, shown_progress
-from liftcore.scene.cameras import Camera, Cameras
+from liftcore.scene.cameras import Camera, Cameras, intrinsics_advice, intrinsics_factor
 from liftcore.scene.compositing import CompositingParams
 from liftcore.scene.drawing import in_photo
 from liftcore.scene.render_mode import rendering_reason, rendering_warnings
 from liftcore.scene.splats import Splats
 from liftcore.scene.views import cameras_of_views, first_names
 from liftcore.solve.diagnostics import is_stretched, shape_warnings
+from liftcore.values.fit import FITS
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.pack import Views, pair, read_features
 from liftcore.values.settings import LiftSettings
@@ -57,7 +61,10 @@ from liftcore.values.views import FeatureGrid, Regions
 VIEWS = 12  # that are checked, evenly spread
 CONTROLS = 3  # photos of other views that a render is compared with
 LEAST_GAIN = 3.0  # dB, of a render over other views' photos to its own
+MATCHING = 30.0  # dB of a render to its photo, at which other views and the filled share of rays need not be asked
 SCALED_VIEWS = 4  # that are rendered again for each scale
+LEAST_LIKENESS_GAIN, MOST_VIEWS = 0.05, 0.75  # of a fit of maps over the one that is read, and of views that show it
+LEAST_BORDERS = 0.75  # of the photo's mean edge, under masks' borders or mirrored ones, below which nothing is told
 LEAST_EDGES = 1.1  # of the photo's edges under masks, over those under mirrored ones
 
 
@@ -158,12 +165,19 @@ def _check(
         row_sum = 1.0 - float(unfilled[name].mean())
         views.append(_against(name, row_sum, renders[name] if splats.sh is not None else None, pictures))
     in_view = visibility(splats, list(cameras.values()), trained).seen_share
-    wrong += _wrong_cameras(views, in_view)
-    wrong += _unlike_photos(views, pictures, renders, headers, _Scaled(raster, splats, cameras, trained, background))
+    if not _match(views, pictures, background):
+        scaled = _Scaled(raster, splats, cameras, trained)
+        unlike = _unlike_photos(views, pictures, renders, headers, scaled)
+        if not unlike or intrinsics_factor([cameras[name] for name in names]) is None:
+            wrong += _wrong_cameras(views, in_view)
+        wrong += unlike
     figures: dict[str, float] = {}
     if features is not None:
         figures, found_wrong = _check_features(features, cameras, files)
         paired_features = pair(features, cameras)[0]
+        fit_figures, wrong_fit = _fit_of_maps(paired_features, cameras, files)
+        figures |= fit_figures
+        found_wrong += wrong_fit
         notes += [
             f"features: {text}"
             for text in shape_warnings(paired_features, [cameras[v] for v in paired_features.views])
@@ -282,6 +296,14 @@ def _psnr(left: np.ndarray, right: np.ndarray) -> float:
     return float(-10 * np.log10(max(np.square(left - right, dtype=np.float64).mean(), 1e-10)))
 
 
+def _match(views: Sequence[ViewCheck], pictures: Mapping[str, np.ndarray], background: float) -> bool:
+    """Return True if each render matches its photo, and does so better than a picture of the background alone."""
+    psnrs = {view.view: view.psnr for view in views if view.psnr is not None}
+    empty_pictures = [_psnr(np.full_like(pictures[name], background), pictures[name]) for name in psnrs]
+    gains = [psnr - other for psnr, other in zip(psnrs.values(), empty_pictures, strict=True)]
+    return bool(psnrs) and min(psnrs.values()) >= MATCHING and _median(gains) >= LEAST_GAIN
+
+
 def _wrong_cameras(views: Sequence[ViewCheck], in_view: float) -> list[str]:
     wrong, row_sum = [], float(np.median([view.row_sum for view in views]))
     if row_sum < LEAST_ROW_SUM:
@@ -293,21 +315,35 @@ def _wrong_cameras(views: Sequence[ViewCheck], in_view: float) -> list[str]:
 
 @dataclass(frozen=True)
 class _Scaled:
-    """Renders of a scene with its cameras' positions times a factor."""
+    """Renders of a scene with its cameras' positions or intrinsics times a factor."""
 
     raster: Raster
     splats: Splats
     cameras: Cameras
     params: CompositingParams
-    background: float  # 0, black, or 1, white
 
-    def render(self, view: str, factor: float) -> np.ndarray:
-        """Render a view [H, W, 3] f32 in 0..1."""
+    def render(self, view: str, photo: np.ndarray, factor: float, *, intrinsics: bool = False) -> np.ndarray:
+        """Render a view [H, W, 3] f32 in 0..1; ``intrinsics`` multiplies these in place of the position."""
         camera, scale = self.cameras[view], np.ones((4, 4))
         scale[:3, 3] = factor
-        scaled_camera = camera.replace(viewmat=camera.viewmat * scale)
+        changes = {name: factor * getattr(camera, name) for name in ("fx", "fy", "cx", "cy")} if intrinsics else {}
+        scaled_camera = camera.replace(**(changes or {"viewmat": camera.viewmat * scale}))
         render, unfilled = _render(self.raster, self.splats, scaled_camera, self.params)
-        return (render + self.background * unfilled).clip(0.0, 1.0)
+        return (render + _background({view: render}, {view: unfilled}, {view: photo}) * unfilled).clip(0.0, 1.0)
+
+    def best(
+        self, floor: Mapping[str, float], pictures: Mapping[str, np.ndarray], factors: Iterable[float], **of: bool
+    ) -> tuple[float, float]:
+        """Return the largest median gain in dB over ``floor`` and other views' photos, and its factor."""
+        names, best = evenly_spaced(list(floor), SCALED_VIEWS), (0.0, 1.0)
+        for factor in factors:
+            gains = []
+            for name in names:
+                render = self.render(name, pictures[name], factor, **of)
+                control = [_psnr(render, photo) for photo in _controls(name, pictures)]
+                gains.append(_psnr(render, pictures[name]) - max(floor[name], *control, -np.inf))
+            best = max(best, (_median(gains), factor))
+        return best
 
 
 def _unlike_photos(
@@ -332,7 +368,11 @@ def _unlike_photos(
     finding = f"photos: renders are hardly more like their own photos ({_median(list(own_psnr.values())):.1f} dB)"
     finding = f"{finding} than like other views' ({gain:+.1f} dB)"
     floor = {name: max(psnrs[name]) for name in own_psnr}
-    cause = _turned_photos(floor, pictures, renders, headers) or _scaled_positions(floor, pictures, scaled)
+    cause = (
+        _scaled_intrinsics(floor, pictures, scaled)
+        or _turned_photos(floor, pictures, renders, headers)
+        or _scaled_positions(floor, pictures, scaled)
+    )
     unknown = "splats, cameras and photos are not of one scene in one frame, or photos and cameras not of each other"
     return [f"{finding}; {cause or unknown}"]
 
@@ -408,20 +448,19 @@ def _controls(name: str, pictures: Mapping[str, np.ndarray]) -> list[np.ndarray]
 
 def _scaled_positions(floor: Mapping[str, float], pictures: Mapping[str, np.ndarray], scaled: _Scaled) -> str:
     """Report the scale of the cameras' positions that makes renders match; empty if none does."""
-    names, best, scale = evenly_spaced(list(floor), SCALED_VIEWS), 0.0, 1.0
-    for factor in (*NEAR_SCALES, *FAR_SCALES):
-        gains = []
-        for name in names:
-            render = scaled.render(name, factor)
-            control = [_psnr(render, photo) for photo in _controls(name, pictures)]
-            gains.append(_psnr(render, pictures[name]) - max(floor[name], *control))
-        if _median(gains) > best:
-            best, scale = _median(gains), factor
-    if best < LEAST_GAIN:
+    gain, factor = scaled.best(floor, pictures, (*NEAR_SCALES, *FAR_SCALES))
+    if gain < LEAST_GAIN:
         return ""
-    return (
-        f"with positions times about {scale:g} they are {best:.1f} dB more so: cameras and splats are of other scales"
-    )
+    finding = f"with positions times about {factor:g} they are {gain:.1f} dB more so"
+    return f"{finding}: cameras and splats are of other scales"
+
+
+def _scaled_intrinsics(floor: Mapping[str, float], pictures: Mapping[str, np.ndarray], scaled: _Scaled) -> str:
+    """Report the size of a picture whose intrinsics make renders match; empty if none does."""
+    centred = intrinsics_factor([scaled.cameras[name] for name in floor])
+    if centred is None or (gain := scaled.best(floor, pictures, [centred], intrinsics=True)[0]) < LEAST_GAIN:
+        return ""
+    return f"with intrinsics times {centred:.4g} they are {gain:.1f} dB more so: {intrinsics_advice(centred)}"
 
 
 def _median(values: Sequence[float]) -> float:
@@ -443,8 +482,7 @@ def _check_features(
             labels = observed.labels[-1].numpy()
             size = (labels.shape[1], labels.shape[0])
             photo = _photo(files[name], size, size).mean(axis=2)
-            mirrored = max(_edges(labels[:, ::-1], photo), _edges(labels[::-1], photo))
-            rows.append((_edges(labels, photo), mirrored))
+            rows.append([_edges(flipped, photo) for flipped in (labels, labels[:, ::-1], labels[::-1])])
     figures, wrong = {}, unlike_maps(grids)
     if grids:
         figures_of_maps = smoothness(grids)
@@ -454,15 +492,62 @@ def _check_features(
             **figures_of_maps.readings,
         }
     if rows:
-        edges, mirrored = np.median(np.array(rows), axis=0).tolist()
+        edges, *flipped = np.median(np.array(rows), axis=0).tolist()
+        mirrored = max(flipped)
         figures |= {"edges": edges, "edges_of_mirrored": mirrored}
-        if edges < LEAST_EDGES * mirrored:
+        if edges < LEAST_EDGES * mirrored and mirrored >= LEAST_BORDERS:
             finding = f"edges of photos are {edges:.2f} of the mean under the masks' borders"
             control = f"{mirrored:.2f} under mirrored ones"
-            wrong.append(
-                f"features: {finding}, {control}: masks must be of these photos, upright, whole, not transposed"
-            )
+            cause = "masks must be of these photos, upright, whole, not transposed"
+            if mirrored >= LEAST_EDGES * edges:
+                cause = f"the masks are {TURN_NAMES[2 if mirrored == flipped[0] else 4]}"
+            wrong.append(f"features: {finding}, {control}: {cause}")
     return figures, wrong
+
+
+def _fit_of_maps(views: Views, cameras: Cameras, files: Mapping[str, Path]) -> tuple[dict[str, float], list[str]]:
+    """Measure by photos what was done to them, where maps have another shape: a figure a fit, and what is wrong."""
+    names = [
+        name
+        for name in views.views
+        if name in files and not views.is_regions(name) and cameras[name].lens is None
+        and is_stretched(views.map_size(name), cameras[name].photo_size)
+    ]  # fmt: skip
+    if not names:
+        return {}, []
+    names = evenly_spaced(names, VIEWS)
+    rows = [[_likeness(views.with_fit(fit), cameras[name], files[name]) for fit in FITS] for name in names]
+    likeness = np.array(rows, np.float64)
+    figures = {f"likeness_of_{fit}": _median(likeness[:, k].tolist()) for k, fit in enumerate(FITS)}
+    assumed = FITS.index(views.fit(names[0]) or "stretch")
+    best = int(np.argmax(np.median(likeness, axis=0)))
+    gains = likeness[:, best] - likeness[:, assumed]
+    if np.median(gains) < LEAST_LIKENESS_GAIN or (gains > 0).mean() < MOST_VIEWS:
+        return figures, []
+    finding = f"features: changes within maps follow the photos better ({figures[f'likeness_of_{FITS[best]}']:.2f}, "
+    finding += f"not {figures[f'likeness_of_{FITS[assumed]}']:.2f}) if these were made by {FITS[best]}, not by"
+    return figures, [
+        f"{finding} {FITS[assumed]}: pack them with --map-fit {FITS[best]} (in Python FeatureGrid(map, "
+        f"fit={FITS[best]!r}))"
+    ]
+
+
+def _likeness(views: Views, camera: Camera, file: Path) -> float:
+    """Correlate the changes between neighbouring cells of a map with those of its photo's colours under them."""
+    observed, window = views[camera.name], views.window(camera.name, camera)
+    assert isinstance(observed, FeatureGrid)
+    cells = torch.nn.functional.normalize(observed.grid.float(), dim=2).numpy()
+    image, (width, height) = read_image(file, camera.photo_size)[0], camera.photo_size
+    left, top, right, bottom = (0, 0, width, height) if window is None else window[2:]
+    across, down = image.width / width, image.height / height
+    box = left * across, top * down, right * across, bottom * down
+    size = cells.shape[1], cells.shape[0]
+    colours = np.asarray(image.resize(size, Image.Resampling.BOX, box=box), np.float32) / 255
+    changes = [
+        np.concatenate([np.linalg.norm(np.diff(values, axis=axis), axis=2).ravel() for axis in (0, 1)])
+        for values in (cells, colours)
+    ]
+    return float(np.corrcoef(*changes)[0, 1]) if min(map(np.ptp, changes)) > 0 else 0.0
 
 
 def _edges(labels: np.ndarray, photo: np.ndarray) -> float:

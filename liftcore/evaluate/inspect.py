@@ -239,6 +239,7 @@ def describe_packs(packs: Views) -> dict[str, Any]:
         "text_space": packs.text_space,
         "normalised": packs.normalised,
         "sizes": sorted({view.size for view in facts}),
+        "map_fit": ", ".join(sorted({fit for view in packs if (fit := packs.fit(view))})),
         "level_names": list(packs.level_names),
         "codebook_rows": sum(view.rows for view in facts),
         "norms": {"min": low, "max": high},
@@ -258,6 +259,8 @@ def _view_facts(view: ViewFeatures) -> _ViewFacts:
     levels, height, width = view.labels.shape
     unused = int((torch.bincount(view.labels.flatten() - NO_LABEL, minlength=rows + 1)[1:] == 0).sum())
     unlabelled = float((view.labels == NO_LABEL).float().mean())
+    if unlabelled == 1.0 and rows == zero == 1:  # the row that stands for none
+        rows = zero = unused = 0
     size = f"{levels} levels of {width}x{height}"
     is_single = bool((view.labels == view.labels[0, 0, 0]).all()) and unlabelled == 0.0
     return _ViewFacts(True, size, (width, height), rows, zero, unused, unlabelled, ends, is_single)

@@ -17,6 +17,7 @@ from liftcore.errors import InvalidFeatures, reading
 from liftcore.io.files import visible_files
 from liftcore.io.npy import ARRAYS, TENSORS, open_npy, read_floats
 from liftcore.scene.views import composed, without_image_suffix
+from liftcore.values.fit import Fit
 from liftcore.values.views import FeatureGrid, Regions, ViewFeatures
 
 PICKLED = (".pt", ".pth", ".pkl")
@@ -59,18 +60,22 @@ def folders_of(views: Iterable[str]) -> list[str]:
     return sorted({view.rpartition("/")[0] for view in views if "/" in view})
 
 
-def array_views(folder: Path, layout: Layout = "hwc") -> ViewFolder[FeatureGrid]:
+def array_views(folder: Path, layout: Layout = "hwc", fit: Fit | Literal[""] = "") -> ViewFolder[FeatureGrid]:
     """Open the grids of a folder of ``.npy``, ``.npz`` or ``.pt`` files [h, w, F], or [F, h, w] for layout ``chw``.
+
+    ``fit`` is that of all maps to their photos (`FeatureGrid`).
 
     Leading axes of length 1 are removed. ``IMG_fmap_CxHxW.pt``, as feature-3dgs writes it, is [F, h, w].
     """
     suffixes = (*ARRAYS, *TENSORS)
     files = npy_files(folder, *suffixes)
     image_suffixes = [f"{CHANNELS_FIRST}{suffix}" for suffix in suffixes]
-    return grids_of(files_by_view(files, folder, *image_suffixes, *suffixes), layout)
+    return grids_of(files_by_view(files, folder, *image_suffixes, *suffixes), layout, fit)
 
 
-def grids_of(files: Mapping[str, Path], layout: Layout = "hwc") -> ViewFolder[FeatureGrid]:
+def grids_of(
+    files: Mapping[str, Path], layout: Layout = "hwc", fit: Fit | Literal[""] = ""
+) -> ViewFolder[FeatureGrid]:
     """Open the grids of files of arrays by view."""
 
     def read(view: str) -> FeatureGrid:
@@ -88,7 +93,7 @@ def grids_of(files: Mapping[str, Path], layout: Layout = "hwc") -> ViewFolder[Fe
             )
             hint = f"{hint} token; where channels come first, array.reshape(F, h, w).transpose(1, 2, 0)"
             raise InvalidFeatures(f"view {view!r} grid", expected="a map [h, w, F] of a photo", got=got, hint=hint)
-        return FeatureGrid(grid, context=f"view {view!r}")
+        return FeatureGrid(grid, fit=fit, context=f"view {view!r}")
 
     return ViewFolder(files, read)
 

@@ -19,6 +19,7 @@ from liftcore.runtime.arguments import as_path, check_choice, check_text, one_of
 from liftcore.runtime.progress import Progress, shown_progress
 from liftcore.scene.views import IMAGE_SUFFIXES
 from liftcore.text import OWN_WORDS
+from liftcore.values.fit import FITS, Fit
 from liftcore.values.pack import read_features, write_pack
 
 if TYPE_CHECKING:
@@ -27,11 +28,16 @@ if TYPE_CHECKING:
 MAX_LISTED = 6  # phrases in a warning
 OPTIONS = {  # of each kind of files
     "langsplat": (),
-    "npy": ("layout",),
+    "npy": ("layout", "map_fit"),
     "masks": ("unlabelled", "encoder", "photos", "device"),
     "prompts": ("unlabelled", "names", "folders", "unannotated"),
 }
-CHOICES = {"layout": get_args(Layout), "folders": get_args(Folders), "unannotated": get_args(Unannotated)}
+CHOICES = {
+    "layout": get_args(Layout),
+    "map_fit": FITS,
+    "folders": get_args(Folders),
+    "unannotated": get_args(Unannotated),
+}
 LANGSPLAT_LEVELS = ("default", "s", "m", "l")  # SAM's masks, then subparts, parts and wholes
 NAMES = ("encoder", "text_space")  # of a pack
 
@@ -41,6 +47,8 @@ class PackOptions(TypedDict, total=False):
 
     layout: Layout
     """of ``npy``, the order of the axes: hwc or chw"""
+    map_fit: Fit
+    """of ``npy``, what the encoder's preprocessing did to photos (`liftcore.values.fit`): stretch, pad or crop"""
     unlabelled: int | None
     """of label pictures, the value of pixels without a mask; None: 0 for ``masks``, no value for ``prompts``"""
     encoder: str | None
@@ -92,7 +100,7 @@ def pack_folder(
         if kind == "langsplat":
             views: ViewFolder[Any] = langsplat_views(folder)
         elif kind == "npy":
-            views = array_views(folder, options.get("layout", "hwc"))
+            views = array_views(folder, options.get("layout", "hwc"), options.get("map_fit", ""))
         elif kind == "prompts":
             views, table, warnings = _prompt_views(folder, options)
             names = {"encoder": encoder_name or "masks by prompt", "text_space": OWN_WORDS, "normalised": True}

@@ -103,7 +103,7 @@ def lift(
         raise InvalidSettings("on_plan", expected="a function of the plan, or None", got=repr(on_plan)[:80])
     checkpoint = _open_checkpoint(checkpoint)
     log_once = WarningLog()
-    show_plan = on_plan or (lambda plan: log_once((*plan.warnings, *plan.input_warnings)))
+    show_plan = on_plan or (lambda plan: log_once(plan.warnings))
     with shown_progress(progress) as reporter, one_thread():
         timings = Timings(reporter)
         if engine is None:

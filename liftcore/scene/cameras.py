@@ -36,6 +36,8 @@ CAMERA_AXES = {  # convention -> the signs that turn a camera's axes into OpenCV
 }
 NAME_SHOWN = 40  # characters of a name, of its end, in what prints of a camera
 ROUNDING = 1e-6  # of the last row of a pose
+MIN_PIXELS = 8  # of a side, from which intrinsics of shares of the size are told from those in pixels
+OFF_CENTRE, SAME_CENTRE = 1.25, 0.05  # of principal points off the middle, and the spread of their places
 MIN_FOCAL, MAX_FOCAL = 1e-3, 1e9  # pixels; float64 squares of what they project stay finite
 MAX_OFF_CENTRE = 1e9  # pixels of the principal point
 MAX_REACH = 1e12  # scene units from the origin; float32 has no detail left long before
@@ -217,6 +219,13 @@ class Camera:
         intrinsics = (self.fx, self.fy, self.cx, self.cy)
         if not all(math.isfinite(value) for value in intrinsics) or self.fx <= 0 or self.fy <= 0:
             self._refuse("intrinsics", "finite fx, fy, cx, cy with positive focal lengths", str(intrinsics))
+        if (
+            min(self.width, self.height) >= MIN_PIXELS
+            and max(intrinsics[:2]) < MIN_PIXELS
+            and max(intrinsics[2:]) <= 1
+        ):
+            hint = f"multiply fx and cx by {self.width}, fy and cy by {self.height}"
+            self._refuse("intrinsics", "fx, fy, cx, cy in pixels", f"{intrinsics}, shares of the image's size", hint)
         if not (min(intrinsics[:2]) >= MIN_FOCAL and max(intrinsics[:2]) <= MAX_FOCAL):
             self._refuse("intrinsics", f"focal lengths in {MIN_FOCAL:g}..{MAX_FOCAL:g} pixels", str(intrinsics))
         if max(abs(self.cx), abs(self.cy)) > MAX_OFF_CENTRE:
@@ -233,16 +242,16 @@ class Camera:
         if error <= 2:
             error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
         if error > 1e-3 or np.linalg.det(rotation) < 0:
-            self._refuse_pose("a proper rotation", _what_it_is(rotation, error))
+            self._refuse_pose("a proper rotation", *_what_it_is(rotation, error))
         reach = float(np.abs(pose[:3, 3]).max())
         if reach > MAX_REACH:
             self._refuse_pose(f"a translation within {MAX_REACH:g}", f"{reach:.2g}")
 
-    def _refuse(self, part: str, expected: str, got: str) -> None:
-        raise InvalidCameras(f"camera {self.name!r} {part}", expected=expected, got=got)
+    def _refuse(self, part: str, expected: str, got: str, hint: str = "") -> None:
+        raise InvalidCameras(f"camera {self.name!r} {part}", expected=expected, got=got, hint=hint)
 
-    def _refuse_pose(self, expected: str, got: str) -> None:
-        raise InvalidPose(f"camera {self.name!r} pose", expected=expected, got=got)
+    def _refuse_pose(self, expected: str, got: str, hint: str = "") -> None:
+        raise InvalidPose(f"camera {self.name!r} pose", expected=expected, got=got, hint=hint)
 
     @property
     def fx(self) -> float:
@@ -308,11 +317,31 @@ def _pixels(side: Any) -> int:
         return 0
 
 
-def _what_it_is(matrix: np.ndarray, error: float) -> str:
+def _what_it_is(matrix: np.ndarray, error: float) -> tuple[str, str]:
+    """Describe a matrix that is no proper rotation, and say what to do."""
+    if error <= 1e-3:
+        hint = "negate one axis of the transform that was applied, such as a normalisation, for cameras and splats"
+        return "a matrix that mirrors (determinant -1)", hint
     scale = float(np.cbrt(np.linalg.det(matrix))) if np.abs(matrix).max() < MAX_REACH else 0.0
     if scale > 0 and np.abs(matrix @ matrix.T / scale**2 - np.eye(3)).max() < 1e-3:
-        return f"a rotation scaled by {scale:.3g}"
-    return f"a matrix off by {error:.2g}"
+        return f"a rotation scaled by {scale:.3g}", ""
+    return f"a matrix off by {error:.2g}", ""
+
+
+def intrinsics_factor(cameras: Sequence[Camera]) -> float | None:
+    """Return what brings all principal points to the middles of their images; None if they are there, or differ."""
+    shares = np.array([(2 * camera.cx / camera.width, 2 * camera.cy / camera.height) for camera in cameras])
+    share = float(np.median(shares)) if len(shares) else 1.0
+    is_off = share > 0 and not 1 / OFF_CENTRE < share < OFF_CENTRE and np.ptp(shares) < SAME_CENTRE * share
+    return 1 / share if is_off else None
+
+
+def intrinsics_advice(factor: float) -> str:
+    """Explain such a factor, and say what to do."""
+    return (
+        f"fx, fy, cx, cy are those of a picture of {1 / factor:.3g} times the size; multiply them by {factor:.4g} "
+        "or give the cameras that picture's width and height"
+    )
 
 
 class Cameras(Mapping[str, Camera]):

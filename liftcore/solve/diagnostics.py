@@ -274,21 +274,24 @@ TRANSPOSED = 1.2  # ratio of aspect errors from which rows and columns are taken
 def shape_warnings(packs: Views, views: Sequence[Camera]) -> list[str]:
     """Return warnings of maps whose aspect is far from their image's, or nearer with axes swapped, or is stretched.
 
-    Maps of any aspect are stretched over their image, as some encoders squeeze images into squares. These cannot be
-    distinguished from crops, so no lift is refused.
+    Maps of any aspect are stretched over their image unless their fit is recorded, as some encoders squeeze images
+    into squares. These cannot be distinguished from crops, so no lift is refused.
     """
     odd, stretched = [], []
     for camera in views:
         size = packs.map_size(camera.name)
         photo = camera.photo_size
+        if packs.fit(camera.name):  # it is said what was done to the photo
+            continue
         if _odd(size, photo):
             odd.append(camera)
         elif is_stretched(size, photo):
             stretched.append(camera)
     advice = {
         "of another shape than their images{}: check that they are [rows, columns], channels last": odd,
-        "of another aspect than their images{}, over which they are stretched: maps must cover the whole image, and "
-        "those of a centre crop do not": stretched,
+        "of another aspect than their images{}, over which they are stretched: say if the encoder's preprocessing "
+        "stretched the photos, or did pad or crop them (pack npy --map-fit, in Python FeatureGrid(map, fit=)); "
+        "splatlift check compares the three": stretched,
     }
     return [
         f"{len(cameras)} of {len(views)} views have maps {text.format(_shapes(packs, cameras[0]))}"

@@ -7,6 +7,7 @@ from typing import Any
 from liftcore.runtime.version import __version__
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
+from liftcore.values.fit import camera_of
 from liftcore.values.lift import LiftMetadata, landmarks_of
 from liftcore.values.lift_file import poses_of
 from liftcore.values.pack import Views, as_views, pair
@@ -46,7 +47,7 @@ class LiftViews:
 
     def __getitem__(self, number: int) -> tuple[Camera, ViewFeatures]:
         """Return the camera of the view of that number, and what it observes."""
-        return self.cameras[self.names[number]], self.features[self.names[number]]
+        return self.camera(number), self.features[self.names[number]]
 
     def __iter__(self) -> Iterator[tuple[Camera, ViewFeatures]]:
         """Return the views, one in memory at a time."""
@@ -73,5 +74,6 @@ class LiftViews:
         )
 
     def camera(self, number: int) -> Camera:
-        """Return the camera of the view of that number."""
-        return self.cameras[self.names[number]]
+        """Return the camera of what a view observes, by its number: of its photo, or of the part that a map shows."""
+        camera = self.cameras[self.names[number]]
+        return camera_of(self.features.window(self.names[number], camera), camera)

@@ -1,9 +1,10 @@
 """Views of features by name: from feature packs, from values in memory or from an iterator, behind one protocol.
 
 A feature pack is a ``.safetensors`` file of what 2D encoders saw: it can be mapped and holds no code. A view ``V``
-is either regions, ``V/labels`` [L, h, w] (u8 with 255 for none, i16 or i32 with -1) with ``V/codebook`` [M, F], or a
-grid, ``V/grid`` [h, w, F]. A pack may bring its words: ``embeddings`` [n, F] and the metadata ``words``, as a table
-of text embeddings has them; a lift of it needs no encoder for queries by these.
+is either regions, ``V/labels`` [L, h, w] (u8 with 255 for none, i16 or i32 with -1) with ``V/codebook`` [M, F], or
+a grid, ``V/grid`` [h, w, F], all of the ``map_fit`` in the metadata (`liftcore.values.fit`). A pack may bring its
+words: ``embeddings`` [n, F] and the metadata ``words``, as a table of text embeddings has them; a lift of it needs
+no encoder for queries by these.
 """
 
 import errno
@@ -29,6 +30,7 @@ from liftcore.runtime.torch_modes import callers_modes
 from liftcore.scene.cameras import FEWER_VIEWS, MAX_VIEWS, Camera
 from liftcore.scene.views import composed, require_name, require_pairs
 from liftcore.text.table import TableEncoder
+from liftcore.values.fit import Fit, Window, window_of
 from liftcore.values.lens import as_pinhole_sees, grid_sides
 from liftcore.values.views import MAX_CHANNELS, NO_LABEL, FeatureGrid, Regions, ViewFeatures
 
@@ -39,6 +41,7 @@ FEATURE_TYPES = ("F16", "F32", "BF16")
 PARTS = ("labels", "codebook", "grid")
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 TABLE = "embeddings"
+FIT = "map_fit"  # of the metadata: of the pack's grids
 MAX_TENSORS = 2 * MAX_VIEWS + 1  # of a pack: labels and a codebook a view, and its words
 
 
@@ -55,6 +58,8 @@ class _Source(Protocol):
 
     @property
     def specs(self) -> Mapping[str, TensorSpec]: ...  # by part: labels and codebook, or grid
+    @property
+    def fit(self) -> str: ...  # of a grid to its photo, "" for not recorded
     def read(self) -> ViewFeatures: ...
 
 
@@ -75,6 +80,7 @@ class Views(Mapping[str, ViewFeatures]):
     table: TableEncoder | None = None  # the packs' own words
     paths: tuple[Path, ...] = ()  # of the packs that it reads; () where views come from elsewhere
     _cameras: Mapping[str, Camera] = field(default_factory=dict, repr=False)
+    _fit: str = ""  # of all grids, in place of those that are recorded
     level_names: tuple[str, ...] = ()  # of region maps' levels, in their order; () where the packs name none
 
     @property
@@ -97,7 +103,17 @@ class Views(Mapping[str, ViewFeatures]):
             got = f"{features.codebook.shape[1]} in {view!r}"
             raise InvalidFeatures("features", expected=f"{self.channels} channels in every view", got=got)
         camera = self.seeing(view)
-        return features if camera is None else as_pinhole_sees(features, camera)
+        if camera is None:
+            return features
+        window = self.window(view, camera)
+        if window is not None and isinstance(features, FeatureGrid):
+            return FeatureGrid.unchecked(features.grid[window.rows, window.columns].contiguous(), features.fit)
+        return as_pinhole_sees(features, camera)
+
+    def window(self, view: str, camera: Camera) -> Window | None:
+        """Return what a map that was padded or cropped shows of its camera's photo; None of any other view."""
+        fit = self.fit(view)
+        return window_of(fit, self.map_size(view), camera.photo_size) if fit else None
 
     def is_regions(self, view: str) -> bool:
         """Return True if the view is a region map; else it is a grid."""
@@ -107,6 +123,9 @@ class Views(Mapping[str, ViewFeatures]):
         """Return the tensors of a view by part (labels and codebook, or grid), from the header alone."""
         specs = dict(self._find(view).specs)
         camera = self.seeing(view)
+        if camera is not None and (window := self.window(view, camera)) is not None:
+            sides = (part.stop - part.start for part in (window.rows, window.columns))
+            return {"grid": replace(specs["grid"], shape=(*sides, specs["grid"].shape[2]))}
         if camera is None or camera.lens is None:
             return specs
         if "grid" in specs:
@@ -114,6 +133,14 @@ class Views(Mapping[str, ViewFeatures]):
             return {"grid": replace(specs["grid"], shape=(*grid_sides(height, width, camera), channels))}
         levels = math.prod(specs["labels"].shape[:-2])
         return specs | {"labels": replace(specs["labels"], shape=(levels, camera.height, camera.width))}
+
+    def fit(self, view: str) -> str:
+        """Return the fit of a view's map to its photo; "" where it is not recorded, as of region maps."""
+        return self._fit if self._fit and not self.is_regions(view) else self._find(view).fit
+
+    def with_fit(self, fit: Fit) -> "Views":
+        """Return the same with another fit of all grids."""
+        return replace(self, _fit=fit)
 
     def map_size(self, view: str) -> tuple[int, int]:
         """Width and height of a view's labels or grid as they are stored, from the header alone."""
@@ -250,14 +277,22 @@ def _write(
     extra_tensors: Mapping[str, Tensor] = MappingProxyType({}),
 ) -> None:
     specs = [(name, value.dtype, tuple(value.shape)) for name, value in extra_tensors.items()]
+    fits = set[str]()
 
     def iterate_reported() -> Iterator[tuple[str, ViewFeatures]]:
         for count, (view, features) in enumerate(views.items(), start=1):
             yield view, features
+            fits.update([features.fit] if isinstance(features, FeatureGrid) else [])
             specs.extend((f"{view}/{part}", value.dtype, tuple(value.shape)) for part, value in _parts(features))
             progress("check", count, len(views), "views")
 
     _check_channels(iterate_reported())
+    if len(fits) > 1:
+        raise InvalidFeatures(
+            "views", expected="one fit of all maps of a pack", got=", ".join(map(repr, sorted(fits)))
+        )
+    if fits - {""}:
+        metadata = {**metadata, FIT: fits.pop()}
     header, offsets = safetensors_header(specs, metadata)
     if len(header) > MAX_HEADER_BYTES:
         raise InvalidFeatures("views", expected="fewer views in a pack", got=str(len(views)))
@@ -357,6 +392,11 @@ class _MemoryView:
             part: TensorSpec(TYPES[str(tensor.dtype)], tuple(tensor.shape)) for part, tensor in _parts(self.read())
         }
 
+    @property
+    def fit(self) -> str:
+        features = self.read()
+        return features.fit if isinstance(features, FeatureGrid) else ""
+
     def read(self) -> ViewFeatures:
         with callers_modes():
             features = self.views[self.name]
@@ -392,10 +432,14 @@ class _Stored:
         keys = {part: f"{self.name}/{part}" for part in PARTS}
         return {part: self.pack.specs[key] for part, key in keys.items() if key in self.pack.specs}
 
+    @property
+    def fit(self) -> str:
+        return self.pack.metadata.get(FIT, "") if "grid" in self.specs else ""
+
     def read(self) -> ViewFeatures:
         tensor = self.pack.handle.get_tensor
         if "grid" in self.specs:
-            return FeatureGrid(tensor(f"{self.name}/grid"), context=self.where)
+            return FeatureGrid(tensor(f"{self.name}/grid"), fit=cast("Any", self.fit), context=self.where)
         stored = tensor(f"{self.name}/labels")
         labels = stored.to(torch.int32)
         if stored.dtype == torch.uint8:

@@ -6,7 +6,7 @@ read by bilinear interpolation, four rows a pixel.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self, TypeVar
+from typing import Literal, Self, TypeVar
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from liftcore.errors import InvalidFeatures
 from liftcore.io.npy import without_unit_axes
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.splats import shared_tensor
+from liftcore.values.fit import FITS, Fit
 
 NO_LABEL = -1  # a pixel that a level leaves unlabelled
 DENSE_ROWS = 1 << 17  # of a view's codebook, beyond which a map is dense: near to a vector a pixel
@@ -77,7 +78,7 @@ class Regions:
         """Return regions of masks that may overlap, as those of SAM, with a vector each.
 
         A pixel under several masks has a label of each, on a level of its own: it reads all their vectors, and none
-        of them is lost. An empty mask is on no pixel.
+        of them is lost. An empty mask is on no pixel; masks [0, H, W] with vectors [0, F] are a view without labels.
 
         Args:
             masks: [M, H, W] of booleans, or a sequence of M of [H, W]; also [M, 1, H, W], as SAM's predictor gives
@@ -93,6 +94,9 @@ class Regions:
                 level overlap; or as the constructor has it.
         """
         argument = f"{context} masks".strip()
+        if not len(masks) and np.ndim(vectors) == 2 and not len(vectors):  # nothing was found in this view
+            size = np.shape(masks)[-2:] if np.ndim(masks) >= 3 else (1, 1)
+            return cls(np.full(size, NO_LABEL, np.int32), np.zeros((1, vectors.shape[1]), np.float32))
         try:
             tensors = [mask for mask in masks if isinstance(mask, Tensor)] if isinstance(masks, Sequence) else []
             planes = (torch.stack(tensors) if tensors else shared_tensor(masks)).cpu()
@@ -139,6 +143,8 @@ class FeatureGrid:
 
     Args:
         grid: [h, w, F] of floats, as the codebook of `Regions`. Maps [F, h, w] of torch are ``permute(1, 2, 0)``.
+        fit: of the map to its photo, ``stretch``, ``pad`` or ``crop`` (`liftcore.values.fit`): what the encoder's
+            preprocessing did to the photo. "": not known, read as ``stretch``, with a warning where shapes differ.
         context: text before the argument's name in errors, such as a view.
 
     Raises:
@@ -147,23 +153,31 @@ class FeatureGrid:
 
     grid: Tensor
     """[h, w, F] f16 or f32"""
+    fit: Fit | Literal[""]
+    """of the map to its photo; "" for not known"""
 
-    def __init__(self, grid: Array, *, context: str = "") -> None:
+    def __init__(self, grid: Array, *, fit: Fit | Literal[""] = "", context: str = "") -> None:
         cells = _features(grid, "h, w, F", f"{context} grid".strip())
+        if fit not in ("", *FITS):
+            expected = f"one of {', '.join(FITS)}"
+            raise InvalidFeatures(f"{context} fit".strip(), expected=expected, got=repr(fit)[:80])
         object.__setattr__(self, "grid", cells)
+        object.__setattr__(self, "fit", fit)
 
     def __repr__(self) -> str:
-        return one_line(self, f"{list(self.grid.shape)} {_dtype_name(self.grid)}", f"on {self.grid.device}")
+        dtype = _dtype_name(self.grid)
+        return one_line(self, f"{list(self.grid.shape)} {dtype}", self.fit, f"on {self.grid.device}")
 
     def cpu(self) -> Self:
         """Return the same with its tensor on the CPU."""
-        return self.unchecked(self.grid.cpu())
+        return self.unchecked(self.grid.cpu(), self.fit)
 
     @classmethod
-    def unchecked(cls, grid: Tensor) -> Self:
+    def unchecked(cls, grid: Tensor, fit: Fit | Literal[""] = "") -> Self:
         """Return a grid of a tensor that is right by how it was made."""
         instance = object.__new__(cls)
         object.__setattr__(instance, "grid", grid)
+        object.__setattr__(instance, "fit", fit)
         return instance
 
     @property

@@ -16,7 +16,7 @@ from PIL import Image
 
 from tests.promises.command_line import run
 from tests.promises.scenes import look_at, random_grid, random_splats, write_pack
-from tests.promises.tiny_files import write_lift
+from tests.promises.tiny_files import write_files, write_lift
 from tests.tiny_scene import SPLATS_A_CLUSTER
 
 CLUSTER = np.repeat(np.arange(3), SPLATS_A_CLUSTER)
@@ -69,6 +69,44 @@ def test_check_names_cameras_and_maps_of_others(sheet: Path, tmp_path: Path) -> 
     few = {"v0": photos["v0"], "stranger": photos["v1"]}
     report = evaluate.check_scene(splats, cameras, few)
     assert "3 cameras have none" in report.notes[0] and "1 have no camera: 'stranger'" in report.notes[1]
+
+
+def photos_of(splats: lc.Splats, cameras: lc.Cameras, folder: Path) -> Path:
+    """Write renders on black of splats of degree 0 as photos."""
+    assert splats.sh is not None
+    colours = (0.5 + 0.28209479 * splats.sh[:, 0]).clamp(0, 1)
+    for name, image in lc.render(splats, cameras, colours).items():
+        Image.fromarray((255 * image.numpy().clip(0, 1)).round().astype(np.uint8)).save(folder / f"{name}.png")
+    return folder
+
+
+def test_check_calls_nothing_wrong_that_has_nothing_to_compare(tmp_path: Path) -> None:
+    files = write_files(tmp_path)
+    splats, cameras = lc.read_splats(files["splats"]), lc.read_cameras(files["cameras"])
+    assert evaluate.check_scene(splats, cameras, photos_of(splats, cameras, tmp_path), files["features"]).wrong == ()
+    object_splats = splats[CLUSTER == 1]  # of one object on nothing, seen from nearly one place
+    far = lc.Cameras([camera.replace(fx=9.0, fy=9.0) for camera in cameras.values()])
+    assert evaluate.check_scene(object_splats, far, photos_of(object_splats, far, tmp_path)).wrong == ()
+
+
+def test_check_names_intrinsics_of_a_picture_of_another_size(sheet: Path) -> None:
+    splats, cameras = lc.read_splats(sheet / "splats.ply"), lc.read_cameras(sheet / "cameras.json")
+    sides = ("fx", "fy", "cx", "cy")
+    third = lc.Cameras(
+        [camera.replace(**{side: getattr(camera, side) / 3 for side in sides}) for camera in cameras.values()]
+    )
+    (text,) = evaluate.check_scene(splats, third, sheet / "photos").wrong
+    assert "with intrinsics times" in text and "a picture of 0.33" in text and "share a frame" not in text
+
+
+def test_check_names_mirrored_masks(sheet: Path, tmp_path: Path) -> None:
+    masks = {}
+    for path in sorted((sheet / "photos").iterdir()):
+        bright = np.asarray(Image.open(path).convert("L")) > 110
+        masks[path.stem] = lc.Regions(bright[:, ::-1].astype(np.int32), np.eye(2, dtype=np.float32))
+    files = sheet / "splats.ply", sheet / "cameras.json", sheet / "photos"
+    wrong = evaluate.check_scene(*files, write_pack(tmp_path / "p.safetensors", masks)).wrong
+    assert any("the masks are mirrored left to right" in text for text in wrong), wrong
 
 
 Change = Callable[[np.ndarray], np.ndarray]

@@ -188,10 +188,10 @@ def test_plan_warns_of_splats_with_activated_opacities_and_scales(scene):
     splats = random_splats(3, 200, spread=1.5)
     opacities, scales = torch.sigmoid(splats.opacity_logits), splats.log_scales.exp()
     plan = lc.plan(replace(splats, opacity_logits=opacities, log_scales=scales), cameras, views)
-    warnings = plan.input_warnings
+    warnings = plan.warnings
     assert any("no logits" in text for text in warnings) and any("no logarithms" in text for text in warnings)
     assert plan.available_views == len(views)
-    assert not any("as if they were no" in text for text in lc.plan(splats, cameras, views).input_warnings)
+    assert not any("as if they were no" in text for text in lc.plan(splats, cameras, views).warnings)
 
 
 @contextmanager

@@ -173,7 +173,8 @@ class BlockFolder:
     ) -> tuple[Job, WeightStatistics]:
         """Compute W of the plan's views, by views and by blocks of splats; call ``on_plan`` before."""
         worker_plan = plan_of_a_worker(plan)
-        on_plan(replace(worker_plan, warnings=(*worker_plan.warnings, *_lack_of_disk(self.folder, plan))))
+        lacks = (*worker_plan.machine_warnings, *_lack_of_disk(self.folder, plan))
+        on_plan(replace(worker_plan, machine_warnings=lacks))
         with timings.step("share"):
             job = self._share(inputs, plan)
         for completed, _ in enumerate(self.engine.run(weigh, job, job.view_pieces), start=1):

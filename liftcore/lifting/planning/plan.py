@@ -29,7 +29,7 @@ from liftcore.runtime.memory import check_disk, free_memory, lack_of_disk
 from liftcore.runtime.one_line import one_line
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import silent
-from liftcore.scene.cameras import Camera, Cameras, distortion_warning
+from liftcore.scene.cameras import Camera, Cameras, distortion_warning, intrinsics_advice, intrinsics_factor
 from liftcore.scene.compositing import TILE
 from liftcore.scene.render_mode import rendering_reason, rendering_warnings
 from liftcore.scene.splats import Splats
@@ -72,7 +72,11 @@ def scene_warnings(
 ) -> tuple[str, ...]:
     """Return warnings of splats and cameras, and of the lenses of ``views``."""
     rendering = rendering_warnings(splats.render_mode, settings.compositing.antialiased, splats.kernel)
-    return *splats.warnings, *rendering, *cameras.warnings, *distortion_warning(views)
+    factor = intrinsics_factor(views)
+    off_centre = (
+        () if factor is None else (f"cameras: their centres are off all images': {intrinsics_advice(factor)}",)
+    )
+    return *splats.warnings, *rendering, *cameras.warnings, *distortion_warning(views), *off_centre
 
 
 @dataclass(frozen=True)
@@ -84,7 +88,7 @@ class Plan:
     rendering: str  # the reason of ``antialiased``: a file, a trainer or a setting
     splats: int  # P
     views: tuple[str, ...]  # that will be lifted, in the order of the sums
-    left_out: tuple[str, ...]  # that the settings' coverage or view_cosine leaves out
+    left_out: tuple[str, ...]  # of those with features and a camera, by the settings
     available_views: int  # views with features and a camera, also those that the settings leave out
     view_cosine: float | None  # expected, of the views' features to those of all, if the setting chose views
     seen_share: float  # of the splats, that some view can see, before occlusion
@@ -97,7 +101,7 @@ class Plan:
     device: Device  # of rasterization and solve
     features_room: int | None  # bytes of this machine's memory that X may take today; None for no limit
     seconds: float | None  # estimate for the geometry of all views on this machine now; None for few views
-    warnings: tuple[str, ...]  # of this machine, today
+    machine_warnings: tuple[str, ...]  # of this machine, today
     input_warnings: tuple[str, ...]  # of splats, cameras and features; the diagnostics of the lift have them too
 
     @property
@@ -108,8 +112,13 @@ class Plan:
     def __repr__(self) -> str:
         views = f"{len(self.views)} of {self.available_views} views"
         memory = f"{self.memory_bytes / 2**30:.1f} GiB"
-        warnings = f"{len(self.warnings) + len(self.input_warnings)} warnings"
+        warnings = f"{len(self.warnings)} warnings"
         return one_line(self, f"{self.splats} of {self.kernel}", views, f"{self.channels} channels", memory, warnings)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """All warnings: of the machine, then of the inputs."""
+        return (*self.machine_warnings, *self.input_warnings)
 
     @property
     def memory(self) -> Mapping[str, int]:
@@ -169,7 +178,7 @@ class Plan:
         yield f"  {channels}"
         parts = ", ".join(f"{name} {size / MIB:.0f}" for name, size in self.memory.items())
         yield f"  {memory} ({parts})"
-        yield from (f"warning: {warning}" for warning in (*self.warnings, *self.input_warnings))
+        yield from (f"warning: {warning}" for warning in self.warnings)
 
 
 @one_thread()
@@ -227,7 +236,7 @@ def plan_lift(
         rendering=rendering_reason(splats.render_mode, antialiased),
         splats=splats.count,
         views=tuple(names),
-        left_out=tuple(name for name in views.names if name not in lifted),
+        left_out=tuple(name for name in features.views if name not in lifted),
         available_views=len(features),
         view_cosine=expected,
         seen_share=visible.seen_share,
@@ -240,7 +249,7 @@ def plan_lift(
         device=device,
         features_room=features_room(phases, free),
         seconds=seconds,
-        warnings=(*short, *check_memory(phases, free), *check_weights(in_files)),
+        machine_warnings=(*short, *check_memory(phases, free), *check_weights(in_files)),
         input_warnings=(
             *scene_warnings(splats, views.cameras, cameras, settings),
             *shape_warnings(features, cameras),
