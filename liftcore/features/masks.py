@@ -9,13 +9,15 @@ In a label picture where 0 means unlabelled, as in most programs, value v is mas
 (255, 65535), value v is mask v. A mistake between these would shift every mask by one, so with 0 for unlabelled the
 largest value must be the number of vectors.
 
+A view whose arrays or lists are empty, in which nothing was found, has no label.
+
 Masks that overlap become levels of labels without overlap (`label_levels`).
 
 segment-anything's ``SamAutomaticMaskGenerator`` and SA-1B store a list of objects whose ``segmentation`` is run
 lengths (`liftcore.features.mask_files`), as the document or under ``annotations``. Mask k is item k of the list.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +32,7 @@ from liftcore.values.views import NO_LABEL, Regions, label_levels
 VECTORS = ".npy"
 ARRAY, RUNS, PICTURE = "_masks.npy", ".json", ".png"
 ZIPPED_ARRAY = "_masks.npz"
+UNLABELLED = np.full((1, 1, 1), NO_LABEL, np.int32)
 OVERLAP = "move photos to another folder than their masks"
 
 
@@ -55,9 +58,7 @@ def labels_alone(path: Path, unlabelled: int = 0) -> tuple[np.ndarray, int]:
     """Read labels [L, h, w] i32 of a view's masks without vectors, -1 for none, and the number of masks."""
     with reading(path, InvalidFeatures, "masks"):
         labels, rows = _labels(path, None, unlabelled)
-        if not rows:
-            raise ValueError("one mask or more, got none; remove views without masks")
-        return Regions(labels, np.zeros((rows, 1), np.float32), context=str(path)).labels.numpy(), rows
+        return Regions(labels, np.zeros((max(rows, 1), 1), np.float32), context=str(path)).labels.numpy(), rows
 
 
 def mask_views(
@@ -74,7 +75,7 @@ def mask_views(
 
         def add_masks(view: str) -> Regions:
             labels, _ = _labels(by_view[view], len(mask_vectors[view]), unlabelled)
-            return Regions(labels, mask_vectors[view], context=f"view {view!r}")
+            return _regions(labels, mask_vectors[view], mask_vectors.values(), view)
 
         return ViewFolder(by_view, add_masks)
     arrays = npy_files(folder, VECTORS, ZIPPED_ARRAY)
@@ -98,9 +99,16 @@ def mask_views(
         codebook = read_floats(vectors[view], "M, F")
         with reading(masks[view], InvalidFeatures, "masks"):
             labels, _ = _labels(masks[view], len(codebook), unlabelled)
-        return Regions(labels, codebook, context=f"view {view!r}")
+        return _regions(labels, codebook, (read_floats(path, "M, F") for path in vectors.values()), view)
 
     return ViewFolder(vectors, read, masks.values())
+
+
+def _regions(labels: np.ndarray, codebook: np.ndarray, all_vectors: Iterable[np.ndarray], view: str) -> Regions:
+    """Return the regions of a view; without a mask those of a row of zeros, as wide as the vectors of other views."""
+    if not len(codebook):
+        codebook = np.zeros((1, next((rows.shape[1] for rows in all_vectors if len(rows)), 0)), np.float32)
+    return Regions(labels, codebook, context=f"view {view!r}")
 
 
 def _pictures(folder: Path) -> list[Path]:
@@ -117,8 +125,12 @@ def _labels(path: Path, rows: int | None, unlabelled: int) -> tuple[np.ndarray, 
         return _picture_labels(path, rows, unlabelled)
     if path.suffix.lower() == RUNS:
         masks = _stored_masks(path, rows)
-        return label_levels(masks, str(path)), len(masks)
-    stored = _planes(open_array(path, kinds=NUMBERS + "b"))
+        return (label_levels(masks, str(path)) if masks else UNLABELLED), len(masks)
+    stored = open_array(path, kinds=NUMBERS + "b")
+    if not stored.size:
+        _check_count(0, rows)
+        return UNLABELLED, 0
+    stored = _planes(stored)
     if stored.dtype.kind != "b":
         ids = whole_numbers(stored)
         return ids, int(ids.max()) + 1
@@ -145,7 +157,7 @@ def _picture_labels(path: Path, rows: int | None, unlabelled: int) -> tuple[np.n
     if rows is not None and unlabelled == 0 and high != rows:
         hint = "give the value of unlabelled pixels with --unlabelled (255, 65535), in Python unlabelled="
         raise ValueError(f"values 1..{rows} for {rows} vectors, and 0 for none, got values up to {high}; {hint}")
-    if rows is not None and high >= rows and unlabelled:
+    if rows is not None and count > rows and unlabelled:
         expected = f"values 0..{rows - 1} for {rows} vectors, and {unlabelled} for none"
         hint = "if 0 means unlabelled and value 1 has the first vector, give --unlabelled 0, in Python unlabelled=0"
         raise ValueError(f"{expected}, got the value {high}; {hint}")

@@ -128,8 +128,21 @@ _VIDEO = FileKind(
 _MESH = FileKind(None, "a mesh", TRAINED)
 _CLOUD = FileKind(None, "a point cloud", TRAINED)
 _ARCHIVE = FileKind(None, "an archive", UNPACK)
-_ARRAY = FileKind(
-    None, "a NumPy array", "of features, 'splatlift pack npy' makes a pack of a folder of them; of splats, export PLY"
+_PACK_ARRAYS = "of features, 'splatlift pack npy' makes a pack of a folder of them"
+_ARRAY = FileKind(None, "a NumPy array", f"{_PACK_ARRAYS}; of splats, export PLY")
+_ARRAYS = FileKind(None, "NumPy arrays (.npz)", f"save each as .npy; {_PACK_ARRAYS}")
+_OF_ARRAYS = {  # by the kind that was expected, what to do with arrays in its place
+    "cameras": "of VGGT give the COLMAP model (demo_colmap.py writes it), of others a transforms.json of the poses; "
+    "in Python Camera(viewmat, K, width, height) takes them as they are",
+    "table": "make a table in Python, a row a word: safetensors.numpy.save_file({'embeddings': array}, "
+    "'table.safetensors', {'words': json.dumps(words)})",
+    "features": f"save each as .npy; {_PACK_ARRAYS}",
+    "masks": f"save each as .npy; {_PACK_ARRAYS}",
+}
+_TILES = FileKind(
+    None,
+    "a tileset of 3D Tiles, which lists the tiles of a scene for a map",
+    "give the splats, a .glb of its tiles, and the cameras that they were trained with",
 )
 # By the bytes at a place of a file. Of two that fit the first counts.
 _MAGIC: tuple[tuple[int, bytes, FileKind], ...] = (
@@ -189,7 +202,9 @@ def wrong_kind(
     if identified.kind == kind or not identified.recognised:
         return None
     hint = identified.hint
-    if identified.kind is not None or (kind == "splats" and identified.splats):
+    if identified in (_ARRAY, _ARRAYS) or identified.format is SplatFormat.CHECKPOINT:
+        hint = _OF_ARRAYS.get(kind, hint)
+    elif identified.kind is not None or (kind == "splats" and identified.splats):
         hint = _replacement_hint(Path(path), identified, kind) or hint
     return fault(argument or str(path), expected=expected or kind, got=identified.name, hint=hint)
 
@@ -201,8 +216,6 @@ def _replacement_hint(path: Path, identified: FileKind, kind: str) -> str:
         if path.is_dir():
             return f"give {path / first}"
         return f"unzip it and give {first}"
-    if identified.format is SplatFormat.CHECKPOINT and kind in ("features", "masks", "table"):
-        return "save its arrays as .npy files ('splatlift pack npy' makes packs of those), or as safetensors"
     hints = {
         ("features", "photos"): "'splatlift encode IMAGES -o PACK' makes a feature pack of photos",
         ("features", "masks"): "masks to judge by have no vectors; 'splatlift pack' makes feature packs",
@@ -394,6 +407,7 @@ def _object_rules(document: dict[str, Any], path: Path) -> Iterator[FileKind | N
     is_gltf = "asset" in keys and keys & {"buffers", "accessors", "scenes", "meshes"}
     has_splats = "KHR_gaussian_splatting" in str(document.get("extensionsUsed", ""))
     yield (_splats_as(SplatFormat.GLTF) if has_splats else _GLTF) if is_gltf else None
+    yield _TILES if keys >= {"root", "geometricError"} else None
     hint = "'splatlift pack prompts' makes a feature pack of its folder"
     yield FileKind(None, "masks as JSON (COCO)", hint) if keys >= {"annotations", "images"} else None
     yield _BY_SUFFIX.get(path.suffix.lower())
@@ -440,8 +454,7 @@ def _of_names_in_zip(names: list[str], head_of: Callable[[str], bytes]) -> Itera
     yield _splats_as(SplatFormat.SOG) if sog_folder(names) is not None else None
     yield _splats_as(SplatFormat.CHECKPOINT) if any(name.endswith("/data.pkl") for name in names) else None
     yield _USD if names[0].lower().endswith((".usd", ".usda", ".usdc")) else None
-    hint = "save each as .npy; 'splatlift pack npy' makes a feature pack of them"
-    yield FileKind(None, "NumPy arrays (.npz)", hint) if suffixes == {".npy"} else None
+    yield _ARRAYS if suffixes == {".npy"} else None
     splats = _splat_files(names, lambda name: _begins_with_splats(head_of(name)))
     is_cameras = any(CAMERA_FILES.search(name.replace("\\", "/")) for name in names)
     yield FileKind("cameras", "a zip of cameras", splats=splats) if is_cameras else None

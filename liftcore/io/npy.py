@@ -39,7 +39,8 @@ def open_npy(path: Path, kinds: str = NUMBERS) -> np.ndarray:
             size = handle.seek(0, 2)
             handle.seek(0)
             dtype = _check_header(handle, size, path, kinds)
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
+            is_empty = handle.tell() == size  # which cannot be mapped
+        array = np.load(path, mmap_mode=None if is_empty else "r", allow_pickle=False)
         return _widened(array) if dtype == BFLOAT16 else array
     except OSError as error:
         got = f"one that does not open ({error.strerror})"
@@ -57,7 +58,7 @@ def _check_header(handle: IO[bytes], size: int, path: Path, kinds: str) -> np.dt
     if dtype.hasobject or (dtype.kind not in kinds and not (dtype == BFLOAT16 and "f" in kinds)):
         got = "Python objects, which may run code" if dtype.hasobject else str(dtype)
         raise InvalidFeatures(str(path), expected="an array of numbers", got=got, hint=HINT)
-    if any(side < 1 for side in shape) or handle.tell() + math.prod(shape) * dtype.itemsize != size:
+    if any(side < 0 for side in shape) or handle.tell() + math.prod(shape) * dtype.itemsize != size:
         expected = f"{dtype} {list(shape)} as its header says"
         raise InvalidFeatures(str(path), expected=expected, got=f"a file of {size} bytes", hint=HINT)
     return dtype
@@ -130,9 +131,11 @@ def without_unit_axes(stored: Values, dimensions: int) -> Values:
 def read_floats(path: Path, axes: str) -> np.ndarray:
     """Read an array of floats with axes such as "M, F": f16, or f32 if it is stored wider; perhaps not finite.
 
-    Leading axes of length 1 are removed.
+    Leading axes of length 1 are removed. Rows "M, F" may be none, [0, 0] whatever the file's shape.
     """
     stored = open_array(path)
+    if not stored.size and axes == "M, F":
+        return np.zeros((0, 0), np.float32)
     array = without_unit_axes(stored, len(axes.split()))
     if array.ndim == 3 and array.shape[1] == 1 and axes == "M, F":  # a vector each of M batches of one
         array = array[:, 0]

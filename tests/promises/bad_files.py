@@ -64,6 +64,13 @@ def zipped(members: dict[str, bytes]) -> bytes:
     return content.getvalue()
 
 
+def array_file(array: np.ndarray) -> bytes:
+    """Return the bytes of a .npy file."""
+    content = io.BytesIO()
+    np.save(content, array)
+    return content.getvalue()
+
+
 def zip_of_zeros(first: tuple[str, bytes], name: str, megabytes: int) -> bytes:
     """Return a zip of a member and so many zeros, made a megabyte at a time."""
     content = io.BytesIO(zipped(dict([first])))
@@ -345,6 +352,10 @@ CAMERA_FILES = [
     ("beyond every float", cameras_json().replace(b"30.0", b"1e999"), "finite"),
     ("4,000 digits", cameras_json().replace(b"30.0", b"9" * 4000), "finite"),
     ("scaled pose", with_pose(np.diag([2.0, 2, 2, 1]).tolist()), "scaled by 2"),
+    ("mirroring pose", with_pose(np.diag([1.0, -1, 1, 1]).tolist()), "mirrors (determinant -1)"),
+    ("intrinsics by the size", with_camera(fl_x=0.94, fl_y=1.25, cx=0.5, cy=0.5), "multiply fx and cx by 32"),
+    ("VGGT's predictions", zipped({"extrinsic.npy": b"\x93NUMPY", "intrinsic.npy": b"\x93NUMPY"}), "COLMAP model"),
+    ("3D Tiles", b'{"asset": {"version": "1.1"}, "geometricError": 1, "root": {}}', "tileset"),
     ("crooked pose", with_pose(np.diag([4.0, 2, 1, 1]).tolist()), "proper rotation"),
     ("pose of three rows", with_pose([*EYE[:3], [1]]), "4x4"),
     ("pose of another scale", with_pose((2 * np.eye(4)).tolist()), "last row"),
@@ -434,6 +445,8 @@ def table_of(words: Any, rows: Any = ((1.0,),)) -> bytes:
 TABLE_FILES = [
     ("empty", b"", "empty file"),
     ("features", save(REGIONS), "features"),
+    ("vectors alone", array_file(np.eye(3)), "safetensors.numpy.save_file({'embeddings': array}"),
+    ("tensor alone", zipped({"archive/data.pkl": b"\x80\x02."}), "safetensors.numpy.save_file({'embeddings': array}"),
     ("no words", tensors(4, **WORD), "words"),
     ("zeros", table_of(["a"], [[0.0]]), "zero"),
     ("NaN", table_of(["a"], [[np.nan]]), "finite"),

@@ -81,6 +81,9 @@ def crop_vectors(
         side = encoder.pixels.shorter
         image, readings[view] = read_image(photos[view], labels.shape[:0:-1])
         crops = (prepare(crop, encoder.pixels, side) for crop in _crops(np.asarray(image), labels, rows, side))
+        if not rows:
+            vectors[view] = np.zeros((0, 0), np.float16)
+            continue
         batches = (torch.stack(list(islice(crops, BATCH))) for _ in range(0, rows, BATCH))
         features = torch.cat([encoder.encode(batch) for batch in batches])
         check_finite(features, f"vectors of the masks of {view!r}")
