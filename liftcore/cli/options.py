@@ -275,10 +275,12 @@ def view_of(options: argparse.Namespace, *pictures: str) -> Any:
         InvalidQuery: a picture without a view, or a file of several cameras without ``--view``.
         InvalidCameras, NotFound: the file has no camera, or no camera of that name.
     """
-    picture_options = " and ".join(f"--{name}" for name in pictures)
     if options.camera is None:
-        if options.view is None and any(getattr(options, name) for name in pictures):
-            raise InvalidQuery(picture_options, expected="a view to render", got="no --view and no --camera")
+        picture_options = [f"--{name}" for name in pictures if getattr(options, name)]
+        if options.view is None and picture_options:
+            raise InvalidQuery(
+                " and ".join(picture_options), expected="a view to render", got="no --view and no --camera"
+            )
         return options.view
     from liftcore import read_cameras
 

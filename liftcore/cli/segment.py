@@ -93,7 +93,7 @@ def encoder_and_words(
     words = None
     if path is not None:
         try:
-            lines = path.read_text(encoding="utf-8").splitlines()
+            lines = path.read_text(encoding="utf-8-sig").splitlines()
         except (OSError, UnicodeDecodeError) as error:
             raise InvalidQuery(option, expected="a file of words, one a line", got=str(error)[:120]) from None
         words = list(dict.fromkeys(line.strip() for line in lines if line.strip()))

@@ -35,6 +35,10 @@ if TYPE_CHECKING:  # these load torch
 
 MOST_SAMPLED = 1 << 14  # splats of which a rough mean is computed
 MOST_OF_OBJECT = 512  # splats of an object, likewise
+TRANSFER = (
+    "edited splats need a lift of their own, which 'splatlift transfer LIFT EDITED --splats LIFTED -o NEW' makes of "
+    "this one (in Python lift.transferred)"
+)
 MOST_PIXELS = 1 << 26  # of a picture: 67 million take a minute of one core and 2 GB
 
 
@@ -375,7 +379,7 @@ class OpenedLift:
         if splats not in (None, len(self.features)):
             raise InvalidLift(
                 str(self.path), expected=f"a row for each of its {splats} splats", got=f"{len(self.features)} rows",
-                hint="crop the splats with their lift, or lift the cropped splats again",
+                hint=TRANSFER,
             )  # fmt: skip
 
     @cached_property
@@ -508,10 +512,11 @@ class OpenedLift:
                 str(self.path), expected=f"its {role} at {path}, or beside the lift", got="nothing there",
                 hint=f"{option}move the {role} back or beside the lift",
             )  # fmt: skip
+        remedy = f"restore them; {TRANSFER}" if role == "splats" else "restore them, or lift again"
         note = f" ({FRAME_FILE} beside them counts too)" if role == "cameras" else ""
         raise InvalidLift(
             str(self.path), expected=f"the {role} that were lifted at {path}", got="a file with another SHA-256",
-            hint=f"the {role} changed since the lift{note}: {option}restore them, or lift again",
+            hint=f"the {role} changed since the lift{note}: {option}{remedy}",
         )  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from PIL import Image
 from tests.promises.command_line import contents, error_line, run
 from tests.promises.scenes import write_pack
 from tests.promises.tiny_files import write_files, write_lift
-from tests.tiny_scene import HEIGHT, SPLATS_A_CLUSTER, WIDTH, WORDS
+from tests.tiny_scene import HEIGHT, SPLATS_A_CLUSTER, WIDTH, WORDS, ply, splat_rows
 
 CLUSTER = np.repeat(np.arange(3), SPLATS_A_CLUSTER)
 
@@ -61,7 +61,7 @@ REFUSALS = {  # words behind the lift -> what the line says
     "query --like splat:60": "splat:60: expected a splat in 0..59, got 60",
     "query --like nowhere": "--like: expected",
     "query --like splat:0 --threshold high": "threshold: expected",
-    "query --like splat:0 --mask {m}.png": "--mask and --attention and --overlay: expected a view",
+    "query --like splat:0 --mask {m}.png": "--mask: expected a view",
     "query --like splat:0 --camera {c} --mask {m}.png": "--camera: expected one camera, got 3 of them",
     "query --like splat:0 --scores {m}.csv": "ending in .npy",
     "query --like splat:0 --object {m}.sog": "splat-transform",
@@ -175,6 +175,19 @@ def test_words_to_a_lift_without_words_are_refused(space: str, message: str, tmp
     result.save(tmp_path / "lift.safetensors")
     line = error_line("query", tmp_path / "lift.safetensors", "mug")
     assert message in line and "--like" in line
+
+
+def test_edited_splats_are_sent_to_transfer(lift: Path, table: list[object], tmp_path: Path) -> None:
+    rows = splat_rows()
+    for edited in (rows[10:], rows @ np.diag([*[-1] * 2, *[1] * 12])):
+        (tmp_path / "edited.ply").write_bytes(ply(edited.astype(np.float32)))
+        question = ["query", lift, "apple", *table, "--splats", tmp_path / "edited.ply", "--objects"]
+        assert "splatlift transfer" in error_line(*question)
+
+
+def test_words_of_a_file_with_a_byte_order_mark_are_read(lift: Path, table: list[object], tmp_path: Path) -> None:
+    (tmp_path / "words.txt").write_text("apple\nlamp\n", encoding="utf-8-sig")
+    assert run("segment", lift, *table, "--words", tmp_path / "words.txt").out.startswith("2 of 2 words found")
 
 
 @pytest.mark.slow
