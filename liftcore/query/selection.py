@@ -13,9 +13,10 @@ Then the objects of the region graph (`liftcore.solve.objects`) correct the sele
 
 - An object that is mostly selected may be **added as a whole**: its other splats had wrong masks. As it may be two
   objects by mistake, the rest of it must be nearer to its selected part than to any other object, in features; else
-  only those splats of the rest are added for which this holds. Where less than `MOSTLY_SELECTED` is selected, all of
-  the rest is added or none, and no other object's best word may be nearer to it, both as cosines and about the
-  scene's mean.
+  only those splats of the rest are added for which this holds. A rest of many splats, though of little weight, must
+  also have the query's word among its nearest, as it may be a larger thing that few rays see; else it is added splat
+  by splat likewise. Where less than `MOSTLY_SELECTED` is selected, all of the rest is added or none, and no other
+  object's best word may be nearer to it, both as cosines and about the scene's mean.
 - An object of which less than `PARTLY_SELECTED` is selected is **removed** where this part, too, is nearer to the
   object's own best word than to the query's: masks show that the part belongs to the object. What is visible through
   an object, or was merged with it by mistake, has its own word as the nearest and stays.
@@ -175,10 +176,15 @@ def correct_by_objects(
         members = objects == target
         part, rest = (scene.mean_of(np.flatnonzero(members & side)) for side in (selected, ~selected))
         rest_rows = np.flatnonzero(members & ~selected)
-        if len(other_means) and _about(scene, other_means, rest).max() >= _about(scene, part[None], rest)[0]:
+        is_other = len(other_means) and _about(scene, other_means, rest).max() >= _about(scene, part[None], rest)[0]
+        is_large = len(rest_rows) > (1 - MOSTLY_SELECTED) * members.sum()
+        is_odd = is_large and competitors.count_nearer_means(scene, rest[None])[0] > competitors.nearer_limit
+        if is_other or (is_odd and shares[target] >= MOSTLY_SELECTED):
             if shares[target] < MOSTLY_SELECTED:
                 continue
             rest_rows = _nearest_to(scene, rest_rows, means[has_mean], int(has_mean[:target].sum()))
+            if is_odd:
+                rest_rows = rest_rows[competitors.count_nearer(scene, rest_rows) <= competitors.nearer_limit]
         elif shares[target] < MOSTLY_SELECTED and _nearer_both_ways(scene, words, competitors.directions, rest):
             continue
         corrected[rest_rows] = True
