@@ -18,7 +18,7 @@ from pathlib import Path, PurePosixPath
 
 from liftcore.errors import InvalidCameras, Unavailable
 from liftcore.io.colmap import MODEL_FILES, has_model, is_whole, model_files, read_colmap, read_image_names
-from liftcore.io.files import BROKEN_ZIP, is_system_file, open_regular, open_zip
+from liftcore.io.files import BROKEN_ZIP, first_bytes, is_system_file, open_regular, open_zip
 from liftcore.io.inria import parse_inria
 from liftcore.io.json_file import read_json
 from liftcore.io.kinds import wrong_kind
@@ -127,7 +127,7 @@ def _read(path: Path) -> Cameras:
         got = f"a file that does not open ({error.strerror})"
         raise InvalidCameras(str(path), expected=FORMATS, got=got) from None
     if start[:1] not in (b"[", b"{"):
-        got = f"a file that begins with {start[:8]!r}" if start else "an empty file"
+        got = f"a file that begins with {first_bytes(start)}" if start else "an empty file"
         hint = "of a COLMAP model give the folder, or a zip of its cameras.* and images.* together"
         raise InvalidCameras(str(path), expected=FORMATS, got=got, hint=hint)
     return source.read()

@@ -35,6 +35,12 @@ _END64 = struct.Struct("<4sQ2H2L4Q")
 LFS_HINT = "run 'git lfs pull' in the repository where it lies"
 
 
+def first_bytes(head: bytes) -> str:
+    """Return the first bytes of a file for a message: text in quotes, else hexadecimal numbers."""
+    text = head[:8].decode("latin1")
+    return repr(text) if text.isascii() and text.isprintable() else head[:8].hex(" ")
+
+
 def is_system_file(path: PurePath) -> bool:
     """Return True if a path, relative to a folder, or a folder on the way is hidden or of the operating system.
 

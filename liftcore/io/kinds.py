@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 
 from liftcore.errors import InvalidInput
 from liftcore.io.colmap import MODEL_FILES
-from liftcore.io.files import BROKEN_ZIP, LFS_HINT, LFS_POINTER, is_system_file, open_regular, open_zip
+from liftcore.io.files import BROKEN_ZIP, LFS_HINT, LFS_POINTER, first_bytes, is_system_file, open_regular, open_zip
 from liftcore.io.ply import MAX_HEADER_BYTES, cloud_without_splats
 from liftcore.io.shards import INDEX
 from liftcore.io.sog import META, is_sog_document, sog_folder
@@ -285,7 +285,7 @@ def _file_rules(path: Path, head: bytes, size: int) -> Iterator[FileKind | None]
     yield replace(_PICTURE, name="a picture of a SOG", hint=f"give {meta}") if is_part else None
     yield by_content
     yield _BY_SUFFIX.get(suffix)
-    yield FileKind(None, f"a file that begins with {head[:8]!r}", recognised=False)
+    yield FileKind(None, f"a file that begins with {first_bytes(head)}", recognised=False)
 
 
 def _splats_as(splat_format: SplatFormat) -> FileKind:

@@ -18,7 +18,7 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 
 from liftcore.errors import InvalidInput
-from liftcore.io.files import open_regular, whole_file
+from liftcore.io.files import first_bytes, open_regular, whole_file
 from liftcore.runtime.mapping import map_anonymous
 
 DTYPES = {
@@ -77,7 +77,7 @@ def check_header(path: Path, name: str, fault: type[InvalidInput], *, expected: 
             hint="save its arrays as .npy files ('splatlift pack npy' makes packs of those), or as safetensors",
         )
     if len(start) < _START or start[8:] != b"{":
-        got = f"a file that begins with {start!r}" if start else "an empty file"
+        got = f"a file that begins with {first_bytes(start)}" if start else "an empty file"
         raise fault(name, expected=expected, got=got, hint=hint)
     if length > MAX_HEADER_BYTES:
         raise fault(name, expected=f"a header of at most {MAX_HEADER_BYTES} bytes", got=f"{length} bytes")
