@@ -13,8 +13,6 @@ from liftcore.cli.segment import encoder_and_words
 from liftcore.errors import InvalidQuery
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from liftcore import Catalogue, Scene, TextEncoder
     from liftcore.models import SceneTree
 
@@ -34,65 +32,40 @@ def add_arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """List the objects, and write the requested files."""
+    """List the objects, or all nodes of the tree, and write the requested files."""
+    if options.tree and (options.csv or options.features):
+        option = "--csv" if options.csv else "--features"
+        raise InvalidQuery(option, expected="the list of objects", got="--tree", hint="--json has the tree")
     files = {"csv": options.csv} if options.csv else {}
     from liftcore import Scene
 
     scene = Scene(options.lift, splats=options.splats, world=world_of(options))
     check_outputs(files, options, scene)
-    if options.tree:
-        return _tree(options, scene)
-    encoder, catalogue = named_catalogue(options, scene)
-    answer = catalogue.summary(features=options.features)
-    document: dict[str, Any] = {"encoder": None if encoder is None else encoder.name}
-    document["answer"] = answer.model_dump(mode="json")
-    exports: dict[str, Any] = {"csv": partial(scene.export, source=catalogue)}
-    if options.into:
-        for scene_object in catalogue.objects:
-            name = f"object-{scene_object.id}"
-            files[name] = options.into / f"{name}.ply"
-            exports[name] = partial(scene.export, source=scene_object.id)
-        check_outputs(files, options, scene)
-    document["files"] = write_files(files, exports)
-    reply(document, as_json=options.json, lines=_lines(document))
-    return 0
-
-
-def named_catalogue(options: argparse.Namespace, scene: Scene) -> tuple[TextEncoder | None, Catalogue]:
-    """Return the objects of a lift, named by ``--vocabulary`` or the words of the encoder, and that encoder."""
     encoder, words = _vocabulary(options, scene)
-    return encoder, scene.catalogue(words, encoder=encoder)
+    exports: dict[str, Any] = {}
+    if options.tree:
+        answer = scene.tree(words, encoder=encoder)
+        names = {node.id: "-".join(["object", *map(str, node.path)]) for node in answer.nodes}
+    else:
+        catalogue = scene.catalogue(words, encoder=encoder)
+        answer = catalogue.summary(features=options.features)
+        names = {entry.id: f"object-{entry.id}" for entry in catalogue.objects}
+        exports["csv"] = partial(scene.export, source=catalogue)
+    if options.into:
+        files |= {name: options.into / f"{name}.ply" for name in names.values()}
+        exports |= {name: partial(scene.export, source=number) for number, name in names.items()}
+        check_outputs(files, options, scene)
+    document: dict[str, Any] = {"encoder": None if encoder is None else encoder.name}
+    document |= {"answer": answer.model_dump(mode="json"), "files": write_files(files, exports)}
+    lines = [document["answer"]["explanation"], *lines_of(document)]
+    reply(document, as_json=options.json, lines=lines)
+    return 0
 
 
 def named_tree(options: argparse.Namespace, scene: Scene) -> Catalogue | SceneTree:
     """Return the named objects of a lift, with parts and groups if the lift has them."""
     encoder, words = _vocabulary(options, scene)
     return (scene.catalogue if scene.node is None else scene.tree)(words, encoder=encoder)
-
-
-def _tree(options: argparse.Namespace, scene: Scene) -> int:
-    """List the nodes of the tree, and write the requested files."""
-    encoder, words = _vocabulary(options, scene)
-    if options.csv or options.features:
-        option = "--csv" if options.csv else "--features"
-        raise InvalidQuery(option, expected="the list of objects", got="--tree", hint="--json has the tree")
-    answer = scene.tree(words, encoder=encoder)
-    files, exports = dict[str, Any](), dict[str, Any]()
-    for node in answer.nodes if options.into else ():
-        name = "-".join(["object", *map(str, node.path)])
-        files[name] = options.into / f"{name}.ply"
-        exports[name] = partial(scene.export, source=node.id)
-    check_outputs(files, options, scene)
-    document: dict[str, Any] = {"encoder": None if encoder is None else encoder.name}
-    document |= {"answer": answer.model_dump(mode="json"), "files": write_files(files, exports)}
-    reply(document, as_json=options.json, lines=_lines(document))
-    return 0
-
-
-def _lines(document: dict[str, Any]) -> Iterable[str]:
-    answer = document["answer"]
-    yield answer["explanation"]
-    yield from lines_of(document)
 
 
 def _vocabulary(options: argparse.Namespace, scene: Scene) -> tuple[TextEncoder | None, list[str]]:
