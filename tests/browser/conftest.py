@@ -66,18 +66,6 @@ def server(chromium: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Iter
         yield PageServer(address, job["id"], folder / "data", client)
 
 
-@pytest.fixture
-def other_lift(server: PageServer) -> Iterator[str]:
-    """Another lift of the same scene."""
-    client = server.client
-    lift_document = client.get(f"/lifts/{server.lift}").json()
-    order = {name: lift_document[name] for name in ("splats", "cameras", "features")}
-    order["settings"] = {"preset": "tikhonov"}
-    job = wait_for_end(client, client.post("/lift", json=order).headers["location"])["id"]
-    yield job
-    assert client.delete(f"/jobs/{job}?with_lift=true").status_code == 204
-
-
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Chromium]:
     with sync_playwright() as playwright, launch(playwright.chromium) as chromium:

@@ -27,19 +27,6 @@ SOG_FILE = Path(__file__).parents[1] / "data" / "splats" / "degree1.sog"
 OPEN = "globalThis.splatlift && !document.querySelector('#panel-bring').hidden"
 SHORTEST = "(budget => { budget.add(new Option('10')); budget.value = '10'; })(document.querySelector('#budget'))"
 LONG = 1200.0  # seconds, for what runs a job on a busy machine, kernels and all
-# Answers to the first two questions for single assets are kept back until `held` lets them go.
-HELD_ANSWERS = """(() => {
-  const ask = fetch;
-  let count = 0;
-  globalThis.held = [];
-  globalThis.fetch = async (address, how) => {
-    const asset = String(address).includes('/assets/sha256:') && count++ < 2;
-    const answer = await ask(address, how);
-    if (asset) await new Promise(late => held.push(late));
-    return answer;
-  };
-})()"""
-POINT = "document.querySelector('#chart .point')"
 
 
 @pytest.fixture
@@ -64,8 +51,6 @@ def empty(browser: Browser, files: dict[str, Path], tmp_path: Path) -> Iterator[
 
 def test_dropped_files_are_planned_compared_and_cancelled(empty: Browser, files: dict[str, Path]) -> None:
     empty.drop([files[kind] for kind in ("splats", "cameras", "features")])
-    empty.until("!document.querySelector('#plan-it').disabled")
-    empty.press("#plan-it")
     empty.until("document.querySelector('#plan').textContent.includes('60 splats')")
     assert empty.value("fetch('jobs').then(reply => reply.json()).then(({jobs}) => jobs.length)") == 0
     empty.value(SHORTEST)  # which the page does not offer
@@ -80,20 +65,12 @@ def test_dropped_files_are_planned_compared_and_cancelled(empty: Browser, files:
     empty.until("splatlift.uploads.followedJobs.size === 0")  # the list is as it stays
     assert empty.value("fetch('jobs').then(reply => reply.json()).then(({jobs}) => jobs.length)") == 2
     empty.press("#jobs .job:last-child .actions button")
-    empty.until(f"document.querySelector('#chart').open && {POINT}")
+    empty.until("document.querySelector('#chart').open && document.querySelector('#chart img').naturalWidth")
     assert empty.violations() == {}
-    runs = empty.value("splatlift.uploads.chart.runs.map(run => run.name)")
-    labels = empty.value(
-        "[...document.querySelectorAll('#chart .point')].map(point => point.getAttribute('aria-label'))"
-    )
-    assert len(labels) == len(runs) and all(label.startswith(name) for name, label in zip(runs, labels, strict=True))
-    empty.value(f"{POINT}.dispatchEvent(new Event('click'))")  # its lift, which is made anew
+    settings = empty.value("[...splatlift.uploads.chart.tradeoff.runs].sort((a, b) => a.cpu_s - b.cpu_s)[0].settings")
+    empty.press("#chart-runs button")  # its lift, which is made anew
     empty.until(READY, LONG)
-    name_of = "({preset, quality}) => [preset, quality].join()"
-    assert (
-        empty.value(f"[splatlift.uploads.chart.runs[0], splatlift.lift].map(one => one.settings).map({name_of})")
-        == [empty.value(f"({name_of})(splatlift.lift.settings)")] * 2
-    )
+    assert settings.items() <= empty.value("splatlift.lift.settings").items()
 
 
 def test_lift_file_asks_for_what_it_was_made_of_and_opens(
@@ -101,8 +78,7 @@ def test_lift_file_asks_for_what_it_was_made_of_and_opens(
 ) -> None:
     (tmp_path / "brought.safetensors").write_bytes(server.client.get(f"/lifts/{server.lift}/features").content)
     empty.drop([tmp_path / "brought.safetensors"])
-    empty.until("document.querySelector('.file .state')?.textContent.includes('(cameras)')")
-    assert "(splats) and" in text_of(empty, ".file .state") and "(cameras)" in text_of(empty, ".file .state")
+    empty.until("document.querySelector('.file.bad .state')?.textContent.includes('This lift needs its splats')")
     empty.drop([files["splats"], files["cameras"]])
     empty.until(READY)
     ask(empty, "lamp")
@@ -134,18 +110,15 @@ def test_folder_of_a_sog_and_cameras_is_sent_as_two_files(
     assert f"{read_splats(SOG_FILE).count} splats" in text_of(empty, "#sent")
 
 
-def test_files_are_still_there_after_the_page_is_loaded_again(empty: Browser, files: dict[str, Path]) -> None:
-    empty.drop([files["splats"], files["cameras"]])
-    empty.until("document.querySelectorAll('.file.done').length === 2")
-    empty.value("XMLHttpRequest.prototype.send = () => {}")  # what is sent from here on never arrives
-    empty.drop([files["features"]])
-    empty.until("document.querySelectorAll('#sent .file').length === 3")
-    empty.value("location.reload()")
-    empty.until("document.querySelector('.file.bad .state')?.textContent.includes('drop the file again')")
-    assert "features.safetensors" in text_of(empty, ".file.bad .name")
-    empty.drop([files["features"]])
-    empty.until("!document.querySelector('#lift-it').disabled")
-    assert empty.value("document.querySelectorAll('#sent .file').length") == 3
+def test_wrong_file_leaves_the_good_one(empty: Browser, files: dict[str, Path], tmp_path: Path) -> None:
+    (tmp_path / "broken.ply").write_bytes(files["splats"].read_bytes()[:-40])
+    empty.drop([files["splats"]])
+    empty.until("document.querySelector('.file.done')")
+    empty.drop([tmp_path / "broken.ply"])
+    empty.until("document.querySelector('.file.bad')")
+    assert text_of(empty, ".file.done .name") == "splats.ply"
+    empty.press(".file.done .actions button")  # it is shown before it is lifted
+    empty.until("splatlift.viewer?.draft && splatlift.viewer.count === 60")
 
 
 def test_scenes_that_others_make_and_delete_are_followed(empty: Browser, files: dict[str, Path]) -> None:
@@ -186,9 +159,6 @@ def test_lift_takes_a_name_and_photos(browser: Browser, server: PageServer, tmp_
     browser.press("#view-after")
     browser.until("document.querySelector('#layer-words').textContent === 'This view has no photo.'")
     assert browser.value("document.querySelector('#over').hidden") is True
-    browser.press("#panel-look input[value=total_weight]")
-    browser.until("document.querySelector('#layer-words').textContent.endsWith('This layer is shown in 3D only.')")
-    assert browser.value("document.querySelector('#over').hidden") is True
 
 
 def test_strangers_files_become_an_object_that_lights_up(browser: Browser, tmp_path: Path) -> None:
@@ -203,7 +173,7 @@ def test_strangers_files_become_an_object_that_lights_up(browser: Browser, tmp_p
         page.choose_files("#files", [tmp_path / "broken.ply", scene / "cameras.json"])
         page.until("document.querySelector('.file.bad')")
         assert "broken.ply" in text_of(page, ".file.bad .name")
-        assert "It must be" in text_of(page, ".file.bad .state") and "got" in text_of(page, ".file.bad .state")
+        assert "expected" in text_of(page, ".file.bad .state") and "got" in text_of(page, ".file.bad .state")
         assert page.value("document.querySelector('#lift-it').disabled") is True
         page.press(".file.bad .away")
         page.drop([scene / "point_cloud.ply", scene / "features.safetensors"])

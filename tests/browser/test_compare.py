@@ -10,7 +10,7 @@ from .looking import AMBER, READY, ask, columns, text_of
 
 pytestmark = pytest.mark.slow
 COMPARE = "#panel-ask [data-compare]"
-BOTH_SETTLED = "splatlift.comparison.scene && splatlift.comparison.left.settled && splatlift.viewer.settled"
+BOTH_SETTLED = "splatlift.comparison.isLoaded && splatlift.comparison.left.settled && splatlift.viewer.settled"
 PLACES = "[splatlift.viewer, splatlift.comparison.left].map(side => side.place3d)"
 SAME_PLACE = "(([one, other]) => one.every((value, axis) => Math.abs(value - other[axis]) < 1e-6))"
 SHARED = f"{BOTH_SETTLED} && {SAME_PLACE}({PLACES})"

@@ -1,6 +1,5 @@
 // Editing of a selection with a brush or a box, in 3D and in the photo view.
 import { byId, el, plural, notify } from "./dom.js";
-import { sourceObject } from "./objects.js";
 import { call, fetchJson, patch, post, problemText } from "./service.js";
 
 const TERM = /^selection:([0-9a-f]{16})$/;
@@ -17,7 +16,7 @@ export class SelectionEditor {
     this.build();
     this.listenTo(byId("scene"), () => this.areaIn3d());
     this.listenTo(byId("picture"), () => this.areaInView());
-    byId("by-hand").addEventListener("click", () => this.createSelection());
+    byId("by-hand").addEventListener("click", () => (this.selection ? this.setOpen(true) : this.createSelection()));
   }
 
   build() {
@@ -26,14 +25,13 @@ export class SelectionEditor {
     this.sideButtons = [false, true].map(removes => button(removes ? "Remove" : "Add", () => { this.removes = removes; this.render(); }));
     this.stepButtons = { undo: button("Undo", () => this.step(-1), { title: "Ctrl+Z" }), redo: button("Redo", () => this.step(1), { title: "Ctrl+Shift+Z" }) };
     const size = el("input", { type: "range", min: 3, max: 60, value: BRUSH_RADIUS, ariaLabel: "Size of the brush", on: { input: event => { this.brushRadius = Number(event.target.value); } } });
-    this.splitButton = button("Split", () => this.objects.split(this.selection), { title: "The other splats of the object become another object" });
     this.throughBox = el("input", { type: "checkbox" });
     this.nameField = el("input", { type: "text", className: "name", maxLength: 100, ariaLabel: "Name of the selection", on: { change: () => this.rename() } });
     const group = (name, ...parts) => el("span", { className: "row", role: "group", ariaLabel: name }, ...parts);
     byId("hand").append(this.nameField, group("Tool", ...Object.values(this.toolButtons), size), group("Operation", ...this.sideButtons),
       el("label", { title: "Also select the splats behind" }, this.throughBox, " through"),
       group("Grow or shrink by neighbouring splats", button("Grow", () => this.edit({ operation: "grow" })), button("Shrink", () => this.edit({ operation: "shrink" }))),
-      this.splitButton, group("History", ...Object.values(this.stepButtons)), button("Done", () => { this.setTool(null); byId("hand").hidden = true; }));
+      group("History", ...Object.values(this.stepButtons)), button("Done", () => this.setOpen(false)));
     this.strokeDrawing = document.createElementNS(SVG, "svg");
     this.strokeDrawing.id = "stroke";
     byId("stage").append(this.strokeDrawing);
@@ -42,10 +40,10 @@ export class SelectionEditor {
   // After each change of the questions: load their selection, if they are one.
   async followQuestion() {
     const id = TERM.exec(this.query.current?.sets.length === 1 ? this.query.current.sets[0] : "")?.[1];
-    byId("by-hand").hidden = Boolean(id) || !this.query.current?.answer;
-    if (!id) { this.selection = null; this.setTool(null); byId("hand").hidden = true; return; }
+    if (!id) { this.selection = null; this.setOpen(false); return; }
     if (this.selection?.id === id) return;
     this.selection = { id };
+    this.setOpen(true);
     try {
       const selection = await fetchJson(`/lifts/${this.query.lift.id}/selections/${id}`);
       if (this.selection?.id === id) this.setSelection(selection);
@@ -55,8 +53,14 @@ export class SelectionEditor {
   setSelection(selection) {
     this.selection = selection;
     this.objects.setSelection(selection);
-    byId("hand").hidden = false;
     this.render();
+  }
+
+  // Show the bar of tools, or the button that opens it again.
+  setOpen(isOpen) {
+    byId("hand").hidden = !isOpen;
+    byId("by-hand").hidden = isOpen || !this.query.current?.answer;
+    if (!isOpen && this.tool) this.setTool(null);
   }
 
   // Make a selection of the current question.
@@ -141,7 +145,6 @@ export class SelectionEditor {
     const { selection } = this;
     if (selection?.version) {
       this.nameField.value = selection.name;
-      this.splitButton.hidden = !sourceObject(selection).length || selection.step === selection.first;
       this.nameField.title = plural(selection.count, "splat");
       this.stepButtons.undo.disabled = selection.step <= selection.first;
       this.stepButtons.redo.disabled = selection.step >= selection.last;

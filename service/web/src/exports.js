@@ -1,5 +1,5 @@
 // The panel Export: files of the current question or labels, and the same query for curl and Python.
-import { byId, copyText, el, notify } from "./dom.js";
+import { byId, copyText, el, notify, plural } from "./dom.js";
 import { questionLabel } from "./query.js";
 import { queryString } from "./question.js";
 import { storedKey, download, downloadBlob, problemText } from "./service.js";
@@ -36,7 +36,9 @@ export class ExportPanel {
     if (format === "masks" && (listedObjects.length <= MAX_EXPORTS || !ofObjects)) notify("Masks of all views take some time.");
     try {
       await download("/query/export", "labels", body).catch(problem => (problem.argument === "encoder" ? download("/query/export", "labels", { lift: lift.id, format, of: "objects" }) : Promise.reject(problem)));
-      notify("The file is saved.");
+      const hidden = this.objects.items.filter(object => object.hidden).length;
+      const rest = !ofObjects ? "" : body.of === "questions" ? ` Left out: what is hidden (${hidden}) and the background.` : hidden ? ` ${plural(hidden, "hidden object")} included.` : "";
+      notify(`The file is saved.${rest}`);
     } catch (problem) {
       notify(problemText(problem), true);
     }

@@ -1,6 +1,5 @@
 // The kind of a file by its name and content, which is known before anything is sent.
-import { unzip, Zip, ZipPassThrough } from "fflate";
-import { colmapViews } from "./colmap.js";
+import { Zip, ZipPassThrough } from "fflate";
 import kindTable from "../kinds.json" with { type: "json" }; // of liftcore.io.kinds: suffixes that are sent, and descriptions of others
 
 const MAX_HEADER_BYTES = 32 << 20; // bytes of a safetensors header that are read here
@@ -10,7 +9,6 @@ const CAMERAS = new RegExp(kindTable.cameras);
 const INRIA = /(^|\/)cameras\.json$/; // which the service reads as a file, not in a ZIP
 const PACK = /\.safetensors$/i;
 const SOG = /(^|[^\w-])(lod-meta\.json|means_[lu]\.webp)/; // files of an unbundled or streamed SOG
-const MAX_ZIP_BYTES = 512e6; // bytes of a ZIP whose cameras are drawn
 const PHOTO = /\.(jpe?g|png)$/i;
 const suffix = name => /\.[^.]*$/.exec(name.toLowerCase())?.[0] ?? "";
 const isSplats = name => kindTable.kinds[suffix(name)] === "splats";
@@ -19,8 +17,8 @@ const joinNames = names => `${names.slice(0, -1).join(", ")}${names.length > 1 ?
 // The suffixes of a kind as text.
 export const suffixes = kind => joinNames(Object.keys(kindTable.kinds).filter(ending => kindTable.kinds[ending] === kind));
 
-// The {kind} of a file, null if it cannot be sent, then with a `reason` if one is known; for a lift file also the assets
-// that it `needs`: [{kind, id, name}]. The service checks the content again.
+// The {kind} of a file, null if it cannot be sent, then with a `reason` if one is known. The service checks the content
+// again.
 export async function kindOf(file) {
   const kind = kindTable.kinds[suffix(file.name)] ?? null;
   const other = kind ? null : kindTable.others[suffix(file.name)];
@@ -42,11 +40,7 @@ async function safetensors(file) {
   try {
     const length = Number(new DataView(await file.slice(0, 8).arrayBuffer()).getBigUint64(0, true));
     const { __metadata__: entries, ...tensors } = JSON.parse(await file.slice(8, 8 + Math.min(length, MAX_HEADER_BYTES)).text());
-    const metadata = entries?.splatlift;
-    if (!metadata) return { kind: Object.keys(tensors).join() === "embeddings" ? "table" : "features" };
-    const { splats, cameras } = JSON.parse(metadata);
-    const need = (kind, { sha256, path }) => ({ kind, id: `sha256:${sha256}`, name: path.split(/[\\/]/).at(-1) });
-    return { kind: "lift", needs: [need("splats", splats), need("cameras", cameras)] };
+    return { kind: entries?.splatlift ? "lift" : Object.keys(tensors).join() === "embeddings" ? "table" : "features" };
   } catch {
     return { kind: "features" }; // the check of the upload reports the error
   }
@@ -115,53 +109,4 @@ export async function zipPhotos(files) {
   if (!photos.length) return files;
   const name = photos.length > 1 ? `${photos.length} photos.zip` : `${photos[0].name}.zip`;
   return [...files.filter(file => !photos.includes(file)), await zipFiles(photos.map(file => ({ path: file.name, file })), name)];
-}
-
-// The cameras of a file in the frame of the splats, for drawing: of Inria's cameras.json, transforms.json or a COLMAP
-// model, also in a ZIP; [] for other files, which the service alone can read.
-export async function camerasOf(file) {
-  try {
-    if (/\.zip$/i.test(file.name)) return file.size > MAX_ZIP_BYTES ? [] : await zippedCameras(file);
-    return /\.json$/i.test(file.name) ? camerasOfDocument(JSON.parse(await file.text())) : [];
-  } catch {
-    return []; // the check of the upload reports the error
-  }
-}
-
-async function zippedCameras(file) {
-  const content = new Uint8Array(await file.arrayBuffer());
-  const parts = await new Promise((resolve, reject) => {
-    unzip(content, { filter: ({ name }) => CAMERAS.test(name) && !/dataparser_/.test(name) }, (problem, files) => (problem ? reject(problem) : resolve(files)));
-  });
-  const documents = Object.keys(parts).filter(name => name.endsWith(".json"));
-  const views = colmapViews(parts);
-  return views.length || !documents.length ? views : camerasOfDocument(JSON.parse(new TextDecoder().decode(parts[documents[0]])));
-}
-
-function camerasOfDocument(cameras) {
-  if (Array.isArray(cameras)) return cameras.filter(frame => frame.rotation && frame.position).map(frame => view(frame.rotation, frame.position, frame));
-  return (cameras.frames ?? []).map(frame => {
-    const matrix = frame.transform_matrix;
-    const { w, h, fl_x: fx, fl_y: fy } = { ...cameras, ...frame };
-    return view(matrix.slice(0, 3).map(row => [row[0], -row[1], -row[2]]), matrix.slice(0, 3).map(row => row[3]), { width: w, height: h, fx, fy: fy ?? fx });
-  }).filter(frame => frame.fx > 0);
-}
-
-// A view from a camera's axes in the world, as columns, and its position.
-function view(axes, position, { width, height, fx, fy, img_name: name }) {
-  const rows = [0, 1, 2].map(column => axes.map(row => row[column]));
-  return { name, width, height, fx, fy, viewmat: [...rows.map(row => [...row, -row.reduce((sum, value, axis) => sum + value * position[axis], 0)]), [0, 0, 0, 1]] };
-}
-
-// Names of files, which the service does not store: this browser stores the last ones.
-const MAX_NAMES = 300; // files and jobs whose names are kept
-const NAMES_KEY = "splatlift-names";
-const storedNames = () => { try { return JSON.parse(localStorage.getItem(NAMES_KEY)) ?? {}; } catch { return {}; } };
-export const nameOf = id => storedNames()[id];
-
-export function rememberName(id, name) {
-  if (!name) return;
-  try {
-    localStorage.setItem(NAMES_KEY, JSON.stringify(Object.fromEntries([...Object.entries(storedNames()).filter(([key]) => key !== id), [id, name]].slice(-MAX_NAMES))));
-  } catch { /* this browser stores nothing */ }
 }

@@ -127,11 +127,6 @@ export class LabelPanel {
     return this.isShown ? this.layer : null;
   }
 
-  // The visible words with their colours, for a legend.
-  legendEntries() {
-    return this.isShown ? this.segmentation.named_words.filter(({ value }) => this.isVisible(value)).map(({ word, colour }) => [word, hex(colour)]) : [];
-  }
-
   // The positions of labels, as boxes of size zero.
   boxes() {
     const pickedBox = this.pickedPlace?.point && this.pickedPlace.words.length && !byId("panel-name").hidden

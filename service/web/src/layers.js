@@ -1,7 +1,6 @@
 // The panel Layers: layers of colours in 3D and in photo views, the list of views, and the photo view, which needs no
 // WebGL.
 import { byId, el, fillSelect, notify } from "./dom.js";
-import { eachEdgePixel } from "./masks.js";
 import { fetchBytes, fetchJson, readNpy, fetchPicture, problemText } from "./service.js";
 
 const PAGE_SIZE = 1000; // views of a request
@@ -9,15 +8,12 @@ const LAYERS = {
   rgb: "The colours of the splats.",
   pca: "The first three principal components of the features as red, green and blue. Similar colours are similar features.",
   cluster: "A colour for each cluster of the aggregation. Grey splats are in no cluster.",
-  total_weight: "The total weight of each splat over all views, on a logarithmic scale.",
   confidence: "The confidence of each splat's feature, by the regions of other views.",
   photo: "The photo of the view, if one was uploaded.",
   depth: "The depth of the splats.",
 };
-const SCALE_ENDS = { total_weight: ["low", "high"], confidence: ["low", "high"], depth: ["far", "near"] }; // dark and bright
-const MODES = ["scene", "both", "view"];
+const SCALE_ENDS = { confidence: ["low", "high"], depth: ["far", "near"] }; // dark and bright
 const CLICK_DISTANCE = 5; // pixels that the pointer may move during a click
-const RENDERED_LAYERS = ["rgb", "pca", "cluster", "confidence", "depth"]; // layers that the service renders
 
 export class LayerPanel {
   // onChange(): colours or the link must be updated. flyToView(view): move the camera. onExample(term, less): a box or a
@@ -42,10 +38,6 @@ export class LayerPanel {
     return document.querySelector("input[name=layer]:checked").value;
   }
 
-  get layerTitle() {
-    return document.querySelector("input[name=layer]:checked + span").textContent;
-  }
-
   // Load the views of a lift: the first page now, the others in the background.
   async setLift(lift, viewName) {
     this.lift = lift;
@@ -57,8 +49,8 @@ export class LayerPanel {
     byId("layer-cluster").hidden = !clusters;
     byId("layer-confidence").hidden = !lift.settings?.robust;
     byId("layer-photo").hidden = !lift.photos;
-    let { views, next } = await fetchJson(`/lifts/${lift.id}/views?limit=${PAGE_SIZE}`);
-    this.views = views;
+    const { views, next } = await fetchJson(`/lifts/${lift.id}/views?limit=${PAGE_SIZE}`);
+    this.views = views.filter(({ lifted }) => lifted);
     this.listViews(viewName);
     if (next !== null) this.loadMoreViews(lift, next);
   }
@@ -68,7 +60,7 @@ export class LayerPanel {
       while (next !== null) {
         const page = await fetchJson(`/lifts/${lift.id}/views?limit=${PAGE_SIZE}&cursor=${next}`);
         if (lift !== this.lift) return;
-        this.views.push(...page.views);
+        this.views.push(...page.views.filter(({ lifted }) => lifted));
         next = page.next;
       }
       this.listViews(this.view?.name);
@@ -78,7 +70,7 @@ export class LayerPanel {
   }
 
   listViews(viewName) {
-    fillSelect(byId("view"), this.views.map(({ name, lifted }) => [name, lifted ? name : `${name} (not lifted)`]), viewName);
+    fillSelect(byId("view"), this.views.map(({ name }) => [name, name]), viewName);
     this.view = this.views.find(view => view.name === byId("view").value) || this.views[0] || null;
   }
 
@@ -99,7 +91,7 @@ export class LayerPanel {
   }
 
   setMode(mode) {
-    this.mode = this.fallback ? "view" : MODES.includes(mode) ? mode : "scene"; // a link may have any value
+    this.mode = this.fallback || mode === "view" ? "view" : "scene"; // a link may have any value
     if (this.mode === "scene" && ["depth", "photo"].includes(this.layerName)) this.setLayer("rgb"); // these layers exist in photo views alone
     byId("stage").dataset.mode = this.mode;
     document.querySelector(`input[name=mode][value=${this.mode}]`).checked = true;
@@ -154,13 +146,11 @@ export class LayerPanel {
     };
     const address = new URLSearchParams({ lift: this.lift.id, view: this.view.name });
     const overlay = this.layerName === "photo" ? this.view.photo && `/lifts/${this.lift.id}/photo?view=${encodeURIComponent(this.view.name)}`
-      : RENDERED_LAYERS.includes(this.layerName) && this.layerName !== "rgb" ? `/render?${address}&channel=${this.layerName}` : null;
-    byId("layer-words").textContent = this.layerName === "photo" && !this.view.photo ? "This view has no photo."
-      : this.mode === "view" && ![...RENDERED_LAYERS, "photo"].includes(this.layerName) ? `${LAYERS[this.layerName]} This layer is shown in 3D only.` : LAYERS[this.layerName];
+      : this.layerName !== "rgb" ? `/render?${address}&channel=${this.layerName}` : null;
+    byId("layer-words").textContent = this.layerName === "photo" && !this.view.photo ? "This view has no photo." : LAYERS[this.layerName];
     byId("picture-box").classList.add("busy");
     try {
-      const examples = this.examples?.() || [];
-      await Promise.all([showPicture("render", `/render?${address}&channel=rgb`), showPicture("over", overlay), this.drawMask(request), this.masks?.drawOutlines(this.view.name, examples)]);
+      await Promise.all([showPicture("render", `/render?${address}&channel=rgb`), showPicture("over", overlay), this.drawMask(request)]);
       this.drawMarks();
     } catch (problem) {
       if (request === this.requestNumber) notify(problemText(problem), true);
@@ -247,7 +237,6 @@ export class LayerPanel {
     const pixel = this.pixel(event);
     if (!pixel || !event.detail) return;
     if (box) this.onExample(`${this.view.name}:box:${box}`, event.shiftKey);
-    else if (this.masks?.isPicking) this.masks.pickAt(this.view.name, ...pixel, event.shiftKey);
     else this.onPlace(`${this.view.name}:${pixel}`, event.shiftKey, event.altKey);
   }
 }
@@ -261,4 +250,14 @@ export function veilMask(mask, [r, g, b]) {
   for (let index = 0; index < data.length; index += 4) if (data[index] < 128) out.data.set([8, 10, 14, 190], index);
   eachEdgePixel(mask, index => out.data.set([r, g, b, 255], 4 * index));
   return out;
+}
+
+// Call visit with each pixel of a white mask that touches a black one or the border of the picture.
+function eachEdgePixel({ data, width, height }, visit) {
+  const inside = pixel => data[4 * pixel] > 127;
+  for (let pixel = 0; pixel < width * height; pixel += 1) {
+    const x = pixel % width;
+    if (inside(pixel) && (!x || x === width - 1 || pixel < width || pixel >= width * (height - 1)
+      || !inside(pixel - 1) || !inside(pixel + 1) || !inside(pixel - width) || !inside(pixel + width))) visit(pixel);
+  }
 }

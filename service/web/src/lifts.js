@@ -1,17 +1,16 @@
-// The list of lifts, with names and buttons to open, compare and delete them.
+// The list of lifts, with names and buttons to open and delete them.
 import { ago, byId, formatCount, el, notify, confirmButton } from "./dom.js";
-import { nameOf } from "./files.js";
 import { patch, remove, problemText } from "./service.js";
 
-export const liftTitle = lift => lift.name || `${nameOf(lift.id) ?? `${formatCount(lift.count)} splats`}, ${ago(lift.created)}`;
+export const liftTitle = lift => lift.name || `Scene without a name, ${ago(lift.created)}`;
 
 const SPACES = { none: "no text encoder", prompts: "prompts of the lift", "": "unknown text encoder" };
 export const textSpaceLabel = ({ text_space: name }) => SPACES[name] || "text queries";
 
 export class LiftList {
-  // onOpen(id): open a lift. onCompare(id): show it beside the open one. onChange(): a lift was named or deleted.
-  constructor({ onOpen, onCompare, onChange }) {
-    Object.assign(this, { onOpen, onCompare, onChange });
+  // onOpen(id): open a lift. onChange(): a lift was named or deleted.
+  constructor({ onOpen, onChange }) {
+    Object.assign(this, { onOpen, onChange });
   }
 
   render(lifts, openId) {
@@ -25,7 +24,6 @@ export class LiftList {
       el("span", { className: "state" }, `${formatCount(lift.count)} splats \u00b7 ${lift.view_count} views \u00b7 ${textSpaceLabel(lift)} \u00b7 ${ago(lift.created)}`),
       el("span", { className: "actions" },
         lift.id === openId ? el("span", { className: "quiet" }, "Open") : el("button", { type: "button", on: { click: () => this.onOpen(lift.id) } }, "Open"),
-        openId && lift.id !== openId ? el("button", { type: "button", className: "only-3d", "aria-label": `Compare with the lift of ${ago(lift.created)}`, on: { click: () => this.onCompare(lift.id) } }, "Compare") : null,
         confirmButton("Delete", () => remove(`/jobs/${lift.id}?with_lift=true`).then(() => this.onChange()))))));
   }
 

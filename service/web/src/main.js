@@ -6,7 +6,6 @@ import { byId, formatCount, el, fillSelect, formatBytes, notify } from "./dom.js
 import { SelectionEditor } from "./editor.js";
 import { LiftList, liftTitle } from "./lifts.js";
 import { LayerPanel, veilMask } from "./layers.js";
-import { MaskPicker } from "./masks.js";
 import { LabelPanel } from "./labels.js";
 import { COLOURS, rgb } from "./painter.js";
 import { fetchBytes, fetchJson, storedKey, onAvailability, onUnauthorized, fetchPicture, useKey, problemText } from "./service.js";
@@ -16,7 +15,6 @@ import { ObjectList } from "./objects.js";
 import { MAX_SPLATS, ROW_BYTES, Viewer, webgl } from "./viewer.js";
 
 const PAGE_SIZE = 100; // lifts to choose from
-const MAX_PREVIEW_BYTES = 800e6; // bytes of a splat file that is drawn before it is uploaded
 const KEY_ANGLE = Math.PI / 24; // radians that an arrow key turns the camera
 const DOUBLE_CLICK_TIME = 260; // ms between the clicks of a double click
 const POSTER_WIDTH = 960; // pixels of the poster, a rendered picture that is shown until the splats are drawn
@@ -31,7 +29,7 @@ let viewer = null;
 let openRequest = 0; // number of the last request to open a lift; replies to older ones are dropped
 let isOpening = true; // while a lift is opened
 
-const query = new QueryPanel({ onChange: onQueryChange, flyToBox: box => viewer?.toBox(box) });
+const query = new QueryPanel({ onChange: onQueryChange, ownNames: () => objects.ownNames(), flyToBox: box => viewer?.toBox(box) });
 const layers = new LayerPanel({
   onChange: () => { repaint(); link(); },
   flyToView: view => viewer?.goToView(view),
@@ -45,31 +43,32 @@ const labels = new LabelPanel({
   onShow: () => query.reset(true),
   findSimilar: term => { showTab("ask"); query.askExample(term, false); },
 });
-const masks = new MaskPicker({
-  onExample: (term, less) => { showTab("ask"); query.askExample(term, less); },
-  onReplace: (old, term) => query.replaceExample(old, term),
-});
+let hiddenSplats = null; // of objects that are hidden
 const objects = new ObjectList({
   namesByTerm,
+  onHide: splats => { hiddenSplats = splats; if (viewer?.mesh) viewer.hide(splats); },
   selectedSets: () => query.current?.sets || [],
   selectSets: sets => query.askSets(sets),
   flyToBox: (box, view) => (layers.mode === "view" ? layers.goToView(view) : viewer?.toBox(box, layers.views.find(({ name }) => name === view))),
 });
 const exporter = new ExportPanel({ query, layers, labels, objects, takePicture: screenPicture });
 const uploads = new UploadPanel({
-  onOpen: id => open(id, true), onDelete: () => refreshLifts(), openLiftId: () => lift?.id ?? null, onRaise: () => showTab("bring"), preview,
+  onOpen: id => open(id, true), onDelete: () => refreshLifts(), openLiftId: () => lift?.id ?? null, onRaise: () => showTab("bring"), showFile,
 });
 const comparison = new Comparison({
   viewer: () => viewer,
   createViewer: createPlainViewer,
+  hiddenSplats: () => hiddenSplats,
   currentLink: () => String(linkParameters()),
-  onChange: () => { comparison.describeRight(query.questions, lift); link(); },
+  onChange: () => { comparison.describeRight(query.questions); link(); },
 });
 const lifts = new LiftList({
   onOpen: id => open(id, true),
   onChange: () => refreshLifts(),
-  onCompare: async id => { if (!comparison.link) comparison.showLeft(linkParameters()); await open(id, true); },
 });
+byId("name-lift").addEventListener("click", () => nameLift(byId("lift-name").hidden));
+byId("lift-name").addEventListener("change", () => lifts.renameLift(lift, byId("lift-name").value.trim()).then(() => nameLift(false)));
+byId("lift-name").addEventListener("keydown", event => event.key === "Escape" && nameLift(false));
 const share = new SharePanel();
 const editor = new SelectionEditor({ query, questionLabel, layers, objects, viewer: () => (viewer?.mesh ? viewer : null) });
 
@@ -78,7 +77,6 @@ layers.maskSource = view => {
   if (!question?.answer || !query.paintedQuestions().some(painted => painted.question === question)) return labels.mapSource(view);
   return { path: `/query/mask?${query.requestParameters(question, { view })}`, paint: mask => veilMask(mask, rgb(question.colour)) };
 };
-layers.masks = masks;
 layers.examples = () => query.questions.flatMap(({ like, unlike }) => [...like.map(term => ({ term })), ...unlike.map(term => ({ term, unlike: true }))]);
 
 let viewTimer = 0;
@@ -89,11 +87,10 @@ function onQueryChange() {
   if (query.questions.length) labels.hideLabels();
   objects.render();
   editor.followQuestion();
-  masks.listRegions(layers.examples());
   repaint();
   if (!sliderTimer) link();
   exporter.render();
-  comparison.describeRight(query.questions, lift);
+  comparison.describeRight(query.questions);
   const state = query.current?.answer ? `${query.requestParameters(query.current)}` : labels.isShown ? JSON.stringify([labels.vocabulary, ...labels.selectedValues]) : "";
   clearTimeout(viewTimer);
   if (state !== paintedState) viewTimer = setTimeout(() => { paintedState = state; layers.drawView(); }, 150); // the slider moves often
@@ -240,37 +237,53 @@ async function refreshLifts() {
   const { lifts: list, next } = await fetchJson(`/lifts?limit=${PAGE_SIZE}`);
   const isUnlisted = lift && !list.some(({ id }) => id === lift.id);
   byId("lift-label").hidden = !list.length;
+  byId("name-lift").hidden = !lift;
   const choices = [...list, ...(isUnlisted && next ? [lift] : [])].map(entry => [entry.id, liftTitle(entry)]);
   fillSelect(byId("lift"), lift ? choices : [["", "Choose a scene"], ...choices], lift?.id ?? "");
   lifts.render(list, lift?.id);
   if (isUnlisted && !next) { // it was deleted
-    lift = null;
-    comparison.end();
-    viewer?.clear();
-    setLift(null);
+    closeLift();
     notify("The open scene was deleted.");
   }
-  if (!lift && !isOpening && list.length) open(list[0].id); // such as the first lift, once its job has ended
+  if (!lift && !isOpening && !viewer?.draft && list.length) open(list[0].id); // such as the first lift, once its job has ended
   byId("empty").hidden = Boolean(list.length || viewer?.draft);
   document.body.classList.toggle("no-lifts", !list.length);
   return list;
 }
 
+// Show the field for the name of the open scene in place of the choice.
+function nameLift(isNaming) {
+  byId("lift-name").hidden = !isNaming;
+  byId("lift").hidden = isNaming;
+  if (!isNaming) return;
+  byId("lift-name").value = lift.name ?? "";
+  byId("lift-name").focus();
+}
+
+function closeLift() {
+  openRequest += 1;
+  isOpening = false;
+  lift = null;
+  viewer?.clear();
+  byId("poster").hidden = true;
+  setLift(null);
+  exporter.render();
+}
+
 async function open(id, fresh = false) {
   const request = ++openRequest;
   isOpening = true;
-  let parameters = !fresh && [null, id].includes(startParameters.get("lift")) ? startParameters : new URLSearchParams();
+  const parameters = !fresh && [null, id].includes(startParameters.get("lift")) ? startParameters : new URLSearchParams();
   showProblem(null);
   try {
     showLoading("Opening the lift");
     const newLift = await fetchJson(`/lifts/${id}`);
     if (request !== openRequest) return;
-    if (fresh && lift) parameters = comparison.sharedParameters(newLift) ?? parameters;
     lift = newLift;
     byId("empty").hidden = true;
     document.body.classList.remove("no-lifts");
     setLift(lift);
-    byId("mask").hidden = byId("outline").hidden = true;
+    byId("mask").hidden = true;
     refreshLifts().catch(problem => notify(problemText(problem), true));
     share.setLift(lift).catch(problem => notify(problemText(problem), true));
     if (fresh) showTab("ask");
@@ -305,8 +318,10 @@ async function open(id, fresh = false) {
 
 // Open a lift in the panels; null closes it.
 function setLift(newLift) {
+  hiddenSplats = null;
   query.setLift(newLift);
-  for (const panel of [objects, labels, masks]) panel.setLift(newLift).catch(problem => notify(problemText(problem), true));
+  comparison.setLift(newLift);
+  for (const panel of [objects, labels]) panel.setLift(newLift).catch(problem => notify(problemText(problem), true));
 }
 
 // Place the camera of the link or of the first view, and show a rendered picture until the splats are drawn.
@@ -330,6 +345,7 @@ async function loadSplats(content, parameters) {
   if (!viewer) return;
   showLoading("Unpacking the splats");
   await viewer.load(content);
+  if (hiddenSplats) viewer.hide(hiddenSplats);
   if (!viewer.hasFocus) placeCamera(parameters); // now the centre of the scene is known
 }
 
@@ -383,17 +399,19 @@ function fallBack() {
   layers.setMode("view");
 }
 
-// Draw dropped splats if no scene is open.
-async function preview(file, cameras) {
-  if (lift || layers.fallback || file.size > MAX_PREVIEW_BYTES) return;
+// Show a file of splats in place of the scene, before it is lifted.
+async function showFile(file) {
+  if (layers.fallback) return;
   try {
+    closeLift();
+    showLoading(null);
     viewer ||= createViewer();
-    await viewer?.showPreview(new Uint8Array(await file.arrayBuffer()), file.name, cameras);
-    if (lift || !viewer) return;
+    await viewer.showFile(new Uint8Array(await file.arrayBuffer()), file.name);
     byId("empty").hidden = true;
     byId("stage").classList.add("ready");
   } catch (problem) {
-    console.warn(problem); // the service reads more formats than this page draws
+    console.warn(problem);
+    notify("The service reads more formats than this page draws: lift it to see it.", true);
   }
 }
 
@@ -407,16 +425,9 @@ async function showWarnings(target) {
 }
 
 // Describe the scene in the panel of layers.
-async function describeScene() {
-  const facts = [`${formatCount(lift.count)} splats`, `${lift.channels} channels`, `${lift.views.length} views lifted`];
-  if (viewer?.mesh && viewer.count < lift.count) facts[0] = `${formatCount(viewer.count)} of ${formatCount(lift.count)} splats shown (1 in ${Math.ceil(lift.count / MAX_SPLATS)})`;
-  byId("about").textContent = facts.join(" \u00b7 ");
-  try {
-    const { counts } = await fetchJson(`/assets/${lift.splats}`);
-    const kernel = lift.settings.kernel && lift.settings.kernel !== "auto" ? lift.settings.kernel : counts.kernel;
-    const note = { "2dgs": "2D Gaussians are drawn as thin 3D Gaussians", dbs: "beta kernels are drawn as Gaussians of similar size" }[kernel];
-    if (note && !layers.fallback) byId("about").textContent = [...facts, note].join(" \u00b7 ");
-  } catch { /* the note is optional */ }
+function describeScene() {
+  const drawn = viewer?.mesh && viewer.count < lift.count ? `${formatCount(viewer.count)} of ${formatCount(lift.count)} splats shown (1 in ${Math.ceil(lift.count / MAX_SPLATS)})` : `${formatCount(lift.count)} splats`;
+  byId("about").textContent = `${drawn} \u00b7 ${lift.channels} channels \u00b7 ${lift.views.length} views lifted`;
 }
 
 function listenToPointer(canvas, target) {
@@ -470,48 +481,25 @@ function handleKey(event, target) {
   event.preventDefault();
 }
 
-// A picture of the view with a legend below it: words with their colours, and the name of the layer.
+// A picture of the view as it is shown.
 async function screenPicture() {
-  const pictures = layers.mode !== "view" && viewer ? [await viewer.completeCanvas()] : [byId("render"), byId("over"), byId("mask"), byId("outline")].filter(picture => !picture.hidden);
-  const [width, height] = [pictures[0].naturalWidth ?? pictures[0].width, pictures[0].naturalHeight ?? pictures[0].height];
-  const legend = [...query.paintedQuestions().map(({ question }) => [questionLabel(question), question.colour]), ...labels.legendEntries(), ...(layers.layerName === "rgb" ? [] : [[layers.layerTitle, null]])];
-  const canvas = document.createElement("canvas");
+  const pictures = layers.mode !== "view" && viewer ? [await viewer.completeCanvas()] : [byId("render"), byId("over"), byId("mask")].filter(picture => !picture.hidden);
+  const canvas = Object.assign(document.createElement("canvas"), { width: pictures[0].naturalWidth ?? pictures[0].width, height: pictures[0].naturalHeight ?? pictures[0].height });
   const context = canvas.getContext("2d");
-  const size = Math.max(14, Math.round(width / 60));
-  const font = `${size}px Inter, sans-serif`;
-  context.font = font;
-  const items = [];
-  let [x, y] = [size, height + size * 1.5];
-  for (const [name, colour] of legend) {
-    const itemWidth = context.measureText(name).width + size * (colour ? 2.6 : 1.2);
-    if (x > size && x + itemWidth > width) [x, y] = [size, y + size * 1.7];
-    items.push([name, colour, x, y]);
-    x += itemWidth;
-  }
-  Object.assign(canvas, { width, height: legend.length ? Math.ceil(y + size) : height });
-  context.fillStyle = stageColour();
-  context.fillRect(0, 0, canvas.width, canvas.height);
   for (const picture of pictures) {
-    context.globalAlpha = picture === pictures[0] ? 1 : Number(picture.style.opacity || 1);
-    context.drawImage(picture, 0, 0, width, height);
-  }
-  Object.assign(context, { globalAlpha: 1, font, textBaseline: "middle" });
-  for (const [name, colour, left, middle] of items) {
-    context.fillStyle = colour ?? "#edf0f4";
-    if (colour) context.fillRect(left, middle - size / 2, size, size);
-    context.fillStyle = "#edf0f4";
-    context.fillText(name, left + (colour ? size * 1.5 : 0), middle);
+    context.globalAlpha = Number(picture.style.opacity || 1);
+    context.drawImage(picture, 0, 0, canvas.width, canvas.height);
   }
   return new Promise(resolve => canvas.toBlob(resolve, "image/png"));
 }
 
-// Undo and redo joined or split objects, else edits of the selection, else questions.
+// Undo and redo edits of the selection, else questions.
 addEventListener("keydown", event => {
   const key = event.key.toLowerCase();
   if (!["z", "y"].includes(key) || !(event.ctrlKey || event.metaKey) || event.target.matches("input[type=text], textarea")) return;
   event.preventDefault();
   const by = key === "y" || event.shiftKey ? 1 : -1;
-  if (!objects.stepHistory(by, editor.selection) && !editor.step(by)) history.go(by);
+  if (!editor.step(by)) history.go(by);
 });
 
 // Keys of the page, while no text is typed.
@@ -565,7 +553,7 @@ byId("forget").hidden = !storedKey();
 darkScheme.addEventListener("change", () => { viewer?.background(stageColour()); comparison.left?.background(stageColour()); repaint(); query.drawBars(); });
 
 // For tests and for the console of the browser.
-Object.assign(globalThis, { splatlift: { query, layers, uploads, exporter, objects, labels, masks, editor, comparison, get viewer() { return viewer; }, get lift() { return lift; }, label: questionLabel, COLOURS } });
+Object.assign(globalThis, { splatlift: { query, layers, uploads, exporter, objects, labels, editor, comparison, get viewer() { return viewer; }, get lift() { return lift; }, label: questionLabel, COLOURS } });
 
 async function begin() {
   if (layers.fallback) fallBack();

@@ -2,7 +2,7 @@
 import { byId, formatCount, el, percent, plural, notify } from "./dom.js";
 import { countFrom, drawHistogram, histogram, passing } from "./histogram.js";
 import { COLOURS, rgb } from "./painter.js";
-import { changedFields, defaultFields, linkFields, notation, readFields, queryString } from "./question.js";
+import { changedFields, defaultFields, linkFields, readFields, queryString } from "./question.js";
 import { fetchBytes, fetchJson, readNpy, problemText } from "./service.js";
 import { Completions } from "./completions.js";
 
@@ -12,15 +12,13 @@ const MAX_SCENE_WORDS = 24; // words of the scene's objects
 const OBJECTS_DELAY = 350; // ms from the slider's last move to the request for objects
 
 export class QueryPanel {
-  // onChange(): colours, boxes or the link must be updated. flyToBox(box): move the camera.
-  constructor({ onChange, flyToBox }) {
-    Object.assign(this, { onChange, flyToBox, questions: [], activeIndex: 0, objectIndex: -1, negatives: [], showsHeat: false, requestNumber: 0, lift: null });
+  // onChange(): colours, boxes or the link must be updated. flyToBox(box): move the camera. ownNames(): names that people
+  // gave to objects.
+  constructor({ onChange, flyToBox, ownNames }) {
+    Object.assign(this, { onChange, flyToBox, ownNames, questions: [], activeIndex: 0, objectIndex: -1, negatives: [], showsHeat: false, requestNumber: 0, lift: null });
     byId("query").addEventListener("submit", event => { event.preventDefault(); this.fromForm(); });
-    Object.assign(byId("example"), { maxLength: notation.maxLength });
-    this.completions = new Completions(text => this.suggestWords(text));
+    this.completions = new Completions(async text => ({ words: [...this.ownNames().filter(({ word }) => word.toLowerCase().startsWith(text.toLowerCase())).map(({ word }) => ({ word, typed: word })), ...(await this.suggestWords(text)).words] }));
     byId("but").addEventListener("input", () => { this.negativesTyped = true; });
-    byId("by-example").addEventListener("submit", event => { event.preventDefault(); this.fromExampleField(false); });
-    byId("less").addEventListener("click", () => this.fromExampleField(true));
     byId("clear").addEventListener("click", () => this.reset(true));
     byId("heat").addEventListener("change", () => { this.showsHeat = byId("heat").checked; this.onChange(); });
     byId("previous").addEventListener("click", () => this.stepObject(-1));
@@ -89,7 +87,10 @@ export class QueryPanel {
     if (!texts.length) return this.questions.length ? this.ask() : undefined;
     if (texts.length > MAX_QUESTIONS) notify(`At most ${MAX_QUESTIONS} words at a time: the first ${MAX_QUESTIONS} are used.`);
     // Typed words replace all questions, also those of clicks.
-    this.questions = texts.slice(0, MAX_QUESTIONS).map((text, index) => newQuestion({ text: [text] }, index));
+    this.questions = texts.slice(0, MAX_QUESTIONS).map((text, index) => {
+      const sets = this.ownNames().filter(({ word }) => word.toLowerCase() === text.toLowerCase()).map(({ term }) => term);
+      return newQuestion(sets.length ? { sets } : { text: [text] }, index);
+    });
     this.activeIndex = 0;
     return this.ask();
   }
@@ -117,22 +118,6 @@ export class QueryPanel {
     this.questions = [newQuestion({ sets }, 0)];
     this.activeIndex = 0;
     return this.ask();
-  }
-
-  // Replace one example by another, such as a larger mask.
-  replaceExample(old, term) {
-    for (const question of this.questions) {
-      for (const kind of ["like", "unlike"]) question[kind] = question[kind].map(example => (example === old ? term : example));
-    }
-    this.current.threshold = "auto";
-    return this.ask(this.current);
-  }
-
-  fromExampleField(less) {
-    const notation = byId("example").value.trim();
-    if (!notation) return;
-    byId("example").value = "";
-    this.askExample(notation, less);
   }
 
   // Open the questions of a link.
@@ -222,7 +207,7 @@ export class QueryPanel {
         question.objects = answer.objects;
       } catch (problem) {
         question.objects = [];
-        question.objectsProblem = problem.expected ? `The objects cannot be separated here: ${problem.expected}.` : problemText(problem);
+        question.objectsProblem = problemText(problem);
       }
     }
     if (!this.questions.includes(question)) return;
@@ -378,7 +363,7 @@ export class QueryPanel {
       byId("why").textContent = "Add splats with the brush or the box.";
     } else if (!isPainted(question) && answer.present === false) {
       byId("answer").textContent = `${quoteWords(question)} is not in this scene.`;
-      byId("why").textContent = presenceReason(answer);
+      byId("why").textContent = answer.reason;
     } else if (!isPainted(question)) {
       byId("answer").textContent = question.text.length ? `No splats stand out for ${quoteWords(question)}.` : "No similar splats stand out.";
       byId("why").textContent = "Try another word, or click an example.";
@@ -445,20 +430,11 @@ export const heatOf = question => (question?.answer ? { scores: question.scores,
 const newQuestion = (terms, index) => ({ ...defaultFields(), objects: [], ...terms, colour: COLOURS[index % COLOURS.length] });
 const splitWords = text => text.split(",").map(word => word.trim()).filter(Boolean);
 const isPainted = question => question.showsClosest || question.threshold !== "auto" || (question.answer.clear && question.answer.present !== false);
-const describeTerm = term => term.replace(/^splat:/, "splat ").replace(/^region:(.*):(\d+):(\d+)$/, "a mask of $1").replace(/^(.*):(box|stroke):[\d,\s]+$/, "a $2 of $1");
+const describeTerm = term => term.replace(/^splat:/, "splat ").replace(/^(.*):(box|stroke):[\d,\s]+$/, "a $2 of $1");
 export const namesByTerm = new Map(); // names of objects and selections by their terms
-export const questionLabel = question => question.text.join(", ") || question.sets.map(set => (question.titles ?? namesByTerm).get(set) || set.replace(/^object:(\d+)$/, (_, number) => `object ${Number(number) + 1}`).replace(/^selection:.*/, "a selection")).join(", ") || (question.like.length > 1 ? `like ${question.like.length} examples` : `like ${describeTerm(question.like[0] || "")}`);
+export const questionLabel = question => question.text.join(", ") || question.sets.map(set => namesByTerm.get(set) || set.replace(/^object:(\d+)$/, (_, number) => `object ${Number(number) + 1}`).replace(/^selection:.*/, "a selection")).join(", ") || (question.like.length > 1 ? `like ${question.like.length} examples` : `like ${describeTerm(question.like[0] || "")}`);
 const quoteWords = question => (question.text.length ? `\u201c${question.text.join(", ")}\u201d` : "Such an object");
 const boxSize = ({ low, high }) => ` ${low.map((value, axis) => (high[axis] - value).toPrecision(2)).join(" \u00d7 ")}`;
-
-// The reason why a word is absent or uncertain, by the numbers of its comparison; without one, the service's sentence.
-function presenceReason({ present, comparison, reason }) {
-  if (!comparison) return reason;
-  const { nearer, limit, count, nearest } = comparison;
-  if (nearer <= limit) return "Hardly any other word is nearer to its best splats, but many are to what sets them apart from the rest.";
-  const facts = `Its best splats are nearer to ${nearer} of ${count} other words, first of all to \u201c${plainWord(nearest)}\u201d`;
-  return present === false ? `${facts}.` : `${facts}, but to what sets them apart from the rest of the scene it is the nearest.`;
-}
 
 // The object may be there, or other words are nearer to the selection.
 const isUncertain = ({ text, answer }) => Boolean(text.length && answer && answer.present !== false
@@ -483,20 +459,11 @@ function adviceLines(question, panel) {
   return paragraphs;
 }
 
+// The reason for the selection, in the service's words.
 function thresholdReason({ answer, threshold, showsClosest, sets }) {
   if (sets.length) return "";
-  if (answer.present === false) return `It is not in this scene; these splats are the nearest. ${presenceReason(answer)}`;
-  if (answer.present === null && answer.presence !== null) return presenceReason(answer);
-  if (!answer.clear && threshold === "auto" && showsClosest) return "These splats are the nearest; they hardly stand out from the others.";
   if (typeof threshold === "number") return "You set this threshold. The dashes mark the automatic one.";
-  const { method, explanation } = answer.threshold;
-  const rule = method === "auto" || answer.clear ? THRESHOLD_RULES[method] : THRESHOLD_RULES.none;
-  return rule ? `Automatic threshold: ${rule}.` : explanation;
+  const isUnsure = answer.present === false || (answer.present === null && answer.presence !== null);
+  if (isUnsure || (!answer.clear && showsClosest)) return `${answer.reason}${showsClosest ? " These splats are the nearest." : ""}`;
+  return answer.threshold.explanation;
 }
-
-// How the methods find a threshold; where `paper` finds no valley, the scores are split into two groups.
-const THRESHOLD_RULES = {
-  auto: "a small change of it changes the selection least",
-  paper: "the valley above the largest peak of the scores",
-  none: "there is no clear gap, so it splits the scores into two groups",
-};

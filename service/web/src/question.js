@@ -5,8 +5,6 @@ const FIELDS = Object.entries(fields);
 const isList = field => field.type === "array";
 const alternatives = field => [field, ...(field.anyOf || [])];
 
-export const notation = fields.like.items.anyOf[0]; // schema of an example as text
-
 // The default of each field.
 export const defaultFields = () => Object.fromEntries(FIELDS.map(([name, field]) => [name, isList(field) ? [] : field.default]));
 

@@ -140,23 +140,11 @@ export function upload(kind, file, progress, cameras) {
   return { done, end: () => request.abort() };
 }
 
-// The text of an error, without names of request fields, digests and routes.
+// The text of an error, in the service's words.
 export function problemText(problem) {
-  if (problem.expected && problem.got) {
-    const hint = problem.hint && !TECHNICAL.test(problem.hint) ? ` ${sentence(hideIds(problem.hint))}` : "";
-    const fileName = problem.argument && !FIELD_NAME.test(problem.argument) ? `${hideIds(problem.argument)}: ` : "";
-    return hideIds(`${problem.title}. ${fileName}It must be ${problem.expected}, got ${problem.got}.${hint}`);
-  }
-  if (problem.title) return hideIds(problem.detail ? `${problem.title}: ${problem.detail}` : problem.title);
-  return "The service does not answer. Is it running?";
+  if (!problem.title) return "The service does not answer. Is it running?";
+  return [problem.title, problem.detail].filter(Boolean).join(": ");
 }
-
-const TECHNICAL = /\b(GET|PUT|POST|PATCH|DELETE) \/|SPLATLIFT_|\b\w+=[A-Z]|in the (body|query|path) of the request/;
-const FIELD_NAME = /^(text|like|unlike|negatives|settings|features|labels|words|query|lift|body)(\.|$)/;
-const hideIds = text => text.replace(/(splats|cameras|features|table|masks|photos|lift) (sha256:)?[0-9a-f]{32,}/g, "the $1")
-  .replace(/sha256:[0-9a-f]{8,}/g, "a file").replace(/\b[0-9a-f]{32,}\b/g, "it");
-
-const sentence = text => `${text[0].toUpperCase()}${text.slice(1)}${/[.!?]$/.test(text) ? "" : "."}`;
 
 // Save the reply to a request as a file.
 export async function download(path, fallback, body, useFallback = false) {

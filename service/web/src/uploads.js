@@ -1,36 +1,28 @@
 // The panel Upload: dropped files, the settings of a lift by its schema, jobs with their progress, and stored files.
 import { Chart } from "./chart.js";
 import { ago, byId, formatCount, el, plural, formatBytes, notify, confirmButton } from "./dom.js";
-import { camerasOf, filesOfDrop, zipPhotos, kindOf, nameOf, rememberName, suffixes } from "./files.js";
+import { filesOfDrop, zipPhotos, kindOf, suffixes } from "./files.js";
 import { textSpaceLabel } from "./lifts.js";
 import { fetchBytes, events, fetchJson, patch, post, remove, upload, problemText } from "./service.js";
 
 const PAGE_SIZE = 20; // of each list
 const REFRESH_INTERVAL = 15_000; // ms between updates of the lists while the panel is open
 const PLAN_DELAY = 400; // ms from the last change to the request of a plan
+const SINGLE_KINDS = ["splats", "cameras", "photos", "table"]; // of which the last good file counts
 const SCENE_KINDS = ["splats", "cameras", "features", "photos", "table"];
-const REPEAT_TIME = 2000; // ms within which the same order is a double click
 const EXAMPLE = { splats: "point_cloud.spz", cameras: "cameras.json", features: "features.safetensors" };
 const GENERIC_NAME = /^(point_cloud|splat|splats|scene|iteration_\d+|\d+)$/i; // names that trainers give to every file
 const FINAL_STATES = ["succeeded", "failed", "canceled"];
 const REQUIRED_KINDS = { splats: "Splats", cameras: "Cameras", features: "Features" };
-const OPTIONAL_KINDS = { photos: "Photos", lift: "Lift", masks: "Masks", table: "Words" };
 const FORMATS = { splats: suffixes("splats"), cameras: "cameras.json, transforms.json, or a COLMAP model: its folder or a .zip", features: `${suffixes("features")} packs` };
-const PRESETS = {
-  default: ["Robust", "Masks that disagree with other views count less. Splats get a confidence."],
-  tikhonov: ["Tikhonov", "The most accurate solver of the paper: large weights count more."],
-  "row-sum": ["Row sum", "Each splat takes the weighted mean of the features of its rays."],
-  "top-k": ["Top k", "Only the largest weights of each ray count."],
-};
-const QUALITIES = { exact: "every pixel", balanced: "every 4th pixel", fast: "fewer views too", draft: "for a preview" };
 const STAGES = { read: "Reading files", digest: "Reading files", compile: "Compiling kernels", plan: "Planning", geometry: "Rasterizing the views",
   solve: "Solving", robust: "Comparing views", smooth: "Smoothing", certify: "Checking the result", save: "Saving" };
 
 export class UploadPanel {
   // onOpen(id): open a lift. onDelete(): after lifts were deleted. openLiftId(): the id of the open lift, or null.
-  // onRaise(): show this panel. preview(file, cameras): draw splats before they are lifted.
-  constructor({ onOpen, onDelete, openLiftId, onRaise, preview }) {
-    Object.assign(this, { onOpen, onDelete, openLiftId, onRaise, preview, cameras: [], files: [], followedJobs: new Map(), jobs: [] });
+  // onRaise(): show this panel. showFile(file): draw splats before they are lifted.
+  constructor({ onOpen, onDelete, openLiftId, onRaise, showFile }) {
+    Object.assign(this, { onOpen, onDelete, openLiftId, onRaise, showFile, files: [], followedJobs: new Map(), jobs: [] });
     this.chart = new Chart({ onOpen, onOrder: (job, name) => this.followOrder(job, { name }) });
     const allowDrop = event => { if ([...event.dataTransfer.types].includes("Files")) event.preventDefault(); };
     addEventListener("dragover", event => { allowDrop(event); document.body.classList.add("dragging"); });
@@ -45,28 +37,10 @@ export class UploadPanel {
     byId("files").addEventListener("change", () => { this.add([...byId("files").files]); byId("files").value = ""; });
     byId("order").addEventListener("submit", event => { event.preventDefault(); this.submitOrder("/lift"); });
     byId("compare").addEventListener("click", () => this.submitOrder("/tradeoff"));
-    byId("plan-it").addEventListener("click", () => this.plan());
     byId("order").addEventListener("change", () => this.render());
-    byId("preset").replaceChildren(...Object.entries(PRESETS).map(([name, [title, description]], index) => choice("preset", name, title, description, index === 0)));
-    byId("quality").replaceChildren(...Object.entries(QUALITIES).map(([name, description], index) => choice("quality", name, name, description, index === 0)));
     byId("more-settings").addEventListener("toggle", () => { if (byId("more-settings").open) this.schema(); });
     setInterval(() => { if (!document.hidden && !byId("panel-bring").hidden) this.refresh(); }, REFRESH_INTERVAL);
-    const earlierFiles = earlierOrder();
     this.render();
-    this.resume(earlierFiles);
-  }
-
-  // List the files of an order from before the page was reloaded. Those that were not uploaded have to be dropped again,
-  // as a browser gives a file to one page load alone.
-  async resume(files) {
-    const earlierFiles = await Promise.all(files.map(async ({ name, bytes: length, kind, id }) => {
-      const file = { name, bytes: length, kind, sentBytes: 0, asset: id ? await fetchJson(`/assets/${id}`).catch(() => null) : null, problem: null };
-      return file.asset ? file : { ...file, problem: { title: "Not uploaded", detail: "the page was reloaded during the upload; drop the file again" }, isLost: true };
-    }));
-    if (this.files.length || !earlierFiles.length) return;
-    this.files = earlierFiles;
-    this.render();
-    if (earlierFiles.some(({ isLost }) => isLost)) this.onRaise();
   }
 
   // Begin a new order for files that come after an order, and for splats with other files beside splats that are here.
@@ -76,38 +50,28 @@ export class UploadPanel {
     const isNewScene = this.isOrdered || (kinds.has("splats") && kinds.size > 1 && this.files.some(({ kind, asset }) => kind === "splats" && asset));
     if (isNewScene && typedFiles.some(({ kind }) => SCENE_KINDS.includes(kind))) {
       for (const file of this.files) if (!file.asset && !file.problem) file.end?.();
-      Object.assign(this, { files: [], cameras: [], isOrdered: false });
+      Object.assign(this, { files: [], isOrdered: false });
     }
-    this.previewSplats(typedFiles);
-    for (const { file: content, kind, needs, reason } of typedFiles) {
-      const file = { name: content.name, bytes: content.size, kind, needs, file: content, sentBytes: 0, asset: null, problem: null };
+    for (const { file: content, kind, reason } of typedFiles) {
+      const file = { name: content.name, bytes: content.size, kind, file: content, sentBytes: 0, asset: null, problem: null };
       if (!kind) file.problem = { title: "Not sent", detail: reason ?? (/\.bin$/i.test(content.name) ? "drop the folder of the COLMAP model, or a ZIP of it" : `the file must be one of: ${Object.values(FORMATS).join("; ")}; photos; a lift file`) };
-      this.files = this.files.filter(entry => !(entry.isLost && entry.name === content.name && entry.bytes === content.size));
-      if (kind && kind !== "features") this.files = this.files.filter(entry => entry.kind !== kind || !entry.asset);
       this.files.push(file);
-      if (kind === "lift") this.sendLift(file);
-      else if (kind) this.send(file);
+      if (kind) this.send(file);
     }
     this.render();
   }
 
-  // Draw dropped splats and cameras before they are uploaded.
-  async previewSplats(typedFiles) {
-    const cameras = typedFiles.find(({ kind }) => kind === "cameras");
-    const splats = typedFiles.find(({ kind }) => kind === "splats");
-    if (cameras) this.cameras = await camerasOf(cameras.file);
-    if (splats) this.splatFile = splats.file;
-    if ((splats || cameras) && this.splatFile) this.preview(this.splatFile, this.cameras);
-  }
-
-  async send(file, cameras) {
+  async send(file) {
+    const storedCount = this.storedFiles().length;
+    const cameras = file.kind === "lift" ? this.ids("cameras").at(-1) : undefined; // for those of a folder, which is a new ZIP each time
     const uploading = upload(file.kind, file.file, sentBytes => { file.sentBytes = sentBytes; this.render(); }, cameras);
     file.end = uploading.end;
     try {
       file.asset = await uploading.done;
-      rememberName(file.asset.id, file.name);
+      if (SINGLE_KINDS.includes(file.kind)) this.files = this.files.filter(entry => entry === file || entry.kind !== file.kind || !entry.asset);
     } catch (problem) {
-      Object.assign(file, { problem, sentBytes: 0 }); // a lift may be uploaded again with other cameras
+      Object.assign(file, { problem, sentBytes: 0 });
+      if (storedCount < this.storedFiles().length) this.sendLifts();
     }
     this.render();
     if (!file.asset) return;
@@ -117,8 +81,19 @@ export class UploadPanel {
       this.onOpen(file.asset.id);
       return;
     }
-    this.refreshAssets();
-    for (const entry of this.files) if (entry.kind === "lift" && !entry.asset) this.sendLift(entry);
+    this.sendLifts();
+  }
+
+  // Upload lift files again whose splats or cameras were not stored.
+  sendLifts() {
+    for (const file of this.files.filter(({ kind, problem }) => kind === "lift" && problem?.status === 404)) {
+      file.problem = null;
+      this.send(file);
+    }
+  }
+
+  storedFiles() {
+    return this.files.filter(({ asset }) => asset);
   }
 
   // Upload and lift the example scene of the service.
@@ -142,36 +117,6 @@ export class UploadPanel {
     }
   }
 
-  // Upload a lift file once its splats and cameras are stored. One check runs at a time, as a late reply would hide a
-  // newer one; files that arrive meanwhile cause another check.
-  async sendLift(file) {
-    file.needsCheck = true;
-    if (file.isChecking) return;
-    for (file.isChecking = true; file.needsCheck && this.files.includes(file);) {
-      file.needsCheck = false;
-      try {
-        await this.sendIfComplete(file);
-      } catch (problem) {
-        file.problem = problem;
-        this.render();
-      }
-    }
-    file.isChecking = false;
-  }
-
-  // Check the assets of a lift file, and upload it if none is missing. If its cameras alone are missing, such as those of a
-  // folder, the dropped cameras are tried; the service compares the views.
-  async sendIfComplete(file) {
-    const absent = need => fetchJson(`/assets/${need.id}`).then(() => [], problem => { if (problem.status === 404) return [need]; throw problem; });
-    file.missing = (await Promise.all(file.needs.map(absent))).flat();
-    this.render();
-    const cameraId = file.missing.length === 1 && file.missing[0].kind === "cameras" ? this.ids("cameras").at(-1) : undefined;
-    const cameras = file.missing.length ? cameraId : ""; // "": the cameras that the lift file names
-    if (cameras === undefined || cameras === file.triedCameras) return;
-    Object.assign(file, { triedCameras: cameras, problem: null });
-    await this.send(file, cameras);
-  }
-
   // Attach photos to the open lift.
   async attachPhotos(file) {
     try {
@@ -182,24 +127,14 @@ export class UploadPanel {
     }
   }
 
-  // Add a stored asset to the order.
-  useAsset(asset) {
-    if (this.files.some(file => file.asset?.id === asset.id)) return;
-    if (asset.kind !== "features") this.files = this.files.filter(file => file.kind !== asset.kind);
-    this.files.push({ name: nameOf(asset.id) ?? `Stored ${REQUIRED_KINDS[asset.kind].toLowerCase()}`, bytes: asset.bytes, kind: asset.kind, sentBytes: asset.bytes, asset, problem: null });
-    this.render();
-    byId("drop").scrollIntoView({ block: "nearest" });
-  }
-
   render() {
-    saveOrder(this.isOrdered ? [] : this.files.filter(file => SCENE_KINDS.includes(file.kind) && (file.asset || file.isLost || !file.problem)));
     byId("sent").replaceChildren(...this.files.map(file => this.fileItem(file)));
     const isReady = kind => this.files.some(file => file.kind === kind && file.asset);
     const missing = Object.keys(REQUIRED_KINDS).filter(kind => !isReady(kind));
-    const isUploading = this.files.some(file => !file.asset && !file.problem && !file.missing?.length);
+    const isUploading = this.files.some(file => !file.asset && !file.problem);
     byId("needs").replaceChildren(...Object.keys(REQUIRED_KINDS).map(kind => el("li", { className: isReady(kind) ? "done" : "" },
       el("b", {}, REQUIRED_KINDS[kind]), ` ${isReady(kind) ? "ready" : FORMATS[kind]}`)));
-    byId("lift-it").disabled = byId("compare").disabled = byId("plan-it").disabled = Boolean(missing.length) || isUploading;
+    byId("lift-it").disabled = byId("compare").disabled = Boolean(missing.length) || isUploading;
     byId("settings").hidden = missing.length === 3;
     byId("order-problem").hidden = true; // it was about other files
     if (missing.length || isUploading) byId("plan").hidden = true;
@@ -209,14 +144,15 @@ export class UploadPanel {
   fileItem(file) {
     const isFinished = file.asset || file.problem;
     const share = file.bytes ? file.sentBytes / file.bytes : 1;
-    const state = file.problem ? problemText(file.problem) : file.asset ? summarize(file.asset)
-      : file.missing?.length && !file.sentBytes ? `This lift needs ${file.missing.map(({ kind, name }) => `${name || "its"} (${kind})`).join(" and ")}: drop ${file.missing.length > 1 ? "them" : "it"} here as well.`
+    const needsMore = file.kind === "lift" && file.problem?.status === 404;
+    const state = needsMore ? `This lift needs its ${file.problem.argument}: drop them here as well.` : file.problem ? problemText(file.problem) : file.asset ? summarize(file.asset)
       : share >= 1 ? "checking\u2026" : `${formatBytes(file.sentBytes)} of ${formatBytes(file.bytes)}`;
     return el("li", { className: file.problem ? "file bad" : file.asset ? "file done" : "file" },
       el("span", { className: "name" }, file.name), el("span", { className: "kind" }, file.kind || ""),
-      isFinished || (file.missing?.length && !file.sentBytes) ? null : el("progress", share >= 1 ? { "aria-label": `checking ${file.name}` } : { max: 1, value: share, "aria-label": `upload of ${file.name}` }),
+      isFinished ? null : el("progress", share >= 1 ? { "aria-label": `checking ${file.name}` } : { max: 1, value: share, "aria-label": `upload of ${file.name}` }),
       el("span", { className: "state" }, state),
       ...(file.asset?.warnings || []).map(warning => el("span", { className: "state warning" }, `Note: ${warning}`)),
+      file.kind === "splats" && file.file && !file.problem ? el("span", { className: "actions only-3d" }, el("button", { type: "button", on: { click: () => this.showFile(file.file) } }, "Show in 3D")) : null,
       file.kind === "photos" && file.asset && this.openLiftId() ? el("span", { className: "actions" }, el("button", { type: "button", on: { click: () => this.attachPhotos(file) } }, "Attach to this lift")) : null,
       el("button", { type: "button", className: "away", "aria-label": `Remove ${file.name}`,
         on: { click: () => { if (!isFinished) file.end?.(); this.files = this.files.filter(entry => entry !== file); this.render(); } } }, "\u00d7"));
@@ -229,7 +165,7 @@ export class UploadPanel {
     try {
       const { components: { schemas } } = await fetchJson("/openapi.json");
       const { properties } = schemas.LiftRequest.properties.settings;
-      byId("knobs").replaceChildren(...Object.entries(properties).filter(([name, schema]) => !schema.deprecated && name !== "quality").map(([name, schema]) => {
+      byId("knobs").replaceChildren(...Object.entries(properties).map(([name, schema]) => {
         const input = this.fields[name] = field(resolveSchema(schema, schemas));
         input.id = `knob-${name}`;
         return el("div", { className: "knob" }, el("label", { htmlFor: input.id }, name), input, el("small", {}, schema.description || ""));
@@ -241,7 +177,7 @@ export class UploadPanel {
   }
 
   settings() {
-    const settings = { preset: byId("order").elements.preset.value, quality: byId("order").elements.quality.value };
+    const settings = {};
     for (const [name, input] of Object.entries(this.fields || {})) {
       if (input.value === "") continue;
       const value = input.value;
@@ -296,20 +232,18 @@ export class UploadPanel {
       delete body.table;
       body.budget_s = Number(byId("budget").value);
     }
-    // A double click orders once: for the same idempotency key the service returns the same job.
-    const order = path + JSON.stringify(body);
-    if (this.lastOrder?.order !== order || this.lastOrder.until < Date.now()) this.lastOrder = { order, key: `${Date.now()}-${Math.random()}` };
-    this.lastOrder.until = Date.now() + REPEAT_TIME;
+    byId("lift-it").disabled = byId("compare").disabled = true; // a double click orders once
     try {
-      const job = await post(path, body, { "Idempotency-Key": this.lastOrder.key });
+      const job = await post(path, body);
       byId("order-problem").hidden = true;
       this.isOrdered = path === "/lift";
-      rememberName(job.id, this.sceneName() ?? this.ids("splats").map(nameOf).at(-1));
       this.followOrder(job, { photos: this.ids("photos").at(-1), name: this.sceneName() });
       byId("jobs").scrollIntoView({ block: "nearest" });
     } catch (problem) {
       byId("order-problem").textContent = problemText(problem);
       byId("order-problem").hidden = false;
+    } finally {
+      byId("lift-it").disabled = byId("compare").disabled = false;
     }
   }
 
@@ -351,23 +285,9 @@ export class UploadPanel {
       this.jobs = jobs.map(job => followedJobs.get(job.id) || job);
       this.showJobs();
       for (const job of this.jobs) this.follow(job);
-      await this.refreshAssets();
     } catch (problem) {
       if (problem.status !== 401) notify(problemText(problem), true);
     }
-  }
-
-  async refreshAssets() {
-    const { assets, next } = await fetchJson(`/assets?limit=${PAGE_SIZE}`);
-    const snapshot = JSON.stringify(assets);
-    if (snapshot === this.assetsSnapshot) return;
-    this.assetsSnapshot = snapshot;
-    byId("assets-count").textContent = assets.length ? `(${assets.length}${next ? "+" : ""})` : "(none)";
-    byId("assets").replaceChildren(...assets.map(asset => el("li", {},
-      el("span", { className: "name" }, nameOf(asset.id) ?? REQUIRED_KINDS[asset.kind] ?? OPTIONAL_KINDS[asset.kind] ?? asset.kind), el("span", { className: "state" }, `${summarize(asset)} \u00b7 ${formatBytes(asset.bytes)} \u00b7 ${ago(asset.created)}`),
-      el("span", { className: "actions" },
-        REQUIRED_KINDS[asset.kind] ? el("button", { type: "button", on: { click: () => this.useAsset(asset) } }, "Use again") : null,
-        confirmButton("Delete", () => remove(`/assets/${asset.id}`).then(() => this.refreshAssets()))))));
   }
 
   showJobs(force = false) {
@@ -384,8 +304,7 @@ export class UploadPanel {
 
   jobItem(job) {
     const title = job.kind === "tradeoff" ? `Comparison within ${job.parameters.budget_s} s` : `Lift, ${job.settings.preset}`;
-    const kind = nameOf(job.id) ? `${nameOf(job.id)}: ${title.toLowerCase()}` : title;
-    const parts = [el("span", { className: "name" }, kind), el("span", { className: `kind ${job.state}` }, job.state)];
+    const parts = [el("span", { className: "name" }, title), el("span", { className: `kind ${job.state}` }, job.state)];
     const step = job.progress;
     if (job.state === "running" && step) {
       const name = STAGES[step.stage] || step.stage;
@@ -416,27 +335,14 @@ export class UploadPanel {
   }
 }
 
-// The files of an unfinished order, stored for this tab alone.
-const ORDER_KEY = "splatlift-order";
-const earlierOrder = () => { try { return JSON.parse(sessionStorage.getItem(ORDER_KEY)) ?? []; } catch { return []; } };
-function saveOrder(files) {
-  try {
-    sessionStorage.setItem(ORDER_KEY, JSON.stringify(files.map(({ name, bytes: length, kind, asset }) => ({ name, bytes: length, kind, id: asset?.id ?? null }))));
-  } catch { /* this browser stores nothing */ }
-}
-
 const planItems = ({ summary, warnings }) => [...warnings.map(warning => el("li", { className: "warning" }, warning)), ...summary.map(line => el("li", {}, line))];
-
-function choice(group, value, title, description, checked) {
-  return el("label", { className: "choice" }, el("input", { type: "radio", name: group, value, checked }), el("span", {}, el("b", {}, title), el("small", {}, description)));
-}
 
 const resolveSchema = (schema, schemas) => (schema.$ref ? { ...schemas[schema.$ref.split("/").at(-1)], ...schema } : schema);
 
 function field(schema) {
   const values = schema.enum || (schema.type === "boolean" ? ["true", "false"] : null);
   const defaultText = schema.default === undefined ? "" : String(schema.default);
-  if (values) return el("select", {}, new Option(`preset's value${defaultText ? ` (${defaultText})` : ""}`, ""), ...values.map(value => new Option(String(value), String(value))));
+  if (values) return el("select", {}, new Option(`unchanged${defaultText ? ` (${defaultText})` : ""}`, ""), ...values.map(value => new Option(String(value), String(value))));
   const isNumber = schema.type === "integer" || schema.type === "number";
   return el("input", { type: isNumber ? "number" : "text", placeholder: defaultText, ...(isNumber ? { step: schema.type === "integer" ? "1" : "any" } : {}),
     ...(schema.minimum === undefined ? {} : { min: schema.minimum }), ...(schema.maximum === undefined ? {} : { max: schema.maximum }) });

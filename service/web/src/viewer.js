@@ -11,10 +11,10 @@ const FLIGHT_TIME = 700; // ms of a camera flight
 const UNPACK_TIMEOUT = 60_000; // ms after which the unpacking of a scene is an error
 const SAMPLE_SIZE = 200_000; // splats in the medians of centres
 const MIN_PICK_OPACITY = 40; // of 255; fainter splats cannot be picked
-const MIN_SPLATS = 10_000; // drawn splats during a motion, on the slowest machine
-const FRAME_BUDGET = 60; // ms of a frame during a motion
+const MIN_SPLATS = 10_000; // drawn splats during a motion, without a GPU
+const MOVING_SPLATS = 500_000; // drawn splats during a motion, with one
+const HORIZON = 0.49 * Math.PI; // radians from the up vector
 const REST_DELAY = 250; // ms from the last change to a frame of all splats
-const TIMED_FRAMES = 4; // frames in the estimate of the speed; the fastest counts, as others may have been delayed
 const MAX_WIDENING = 2; // largest factor of the size of splats that are drawn for others
 const COARSE_RATIO = 0.5; // device pixels per CSS pixel while fewer splats are drawn
 const SOFTWARE = /swiftshader|llvmpipe|software|basic render/i; // renderers without a GPU
@@ -37,6 +37,7 @@ export class Viewer {
     this.scene = new THREE.Scene();
     this.camera = new THREE.PerspectiveCamera(50, 1, 0.01, 1000);
     this.onMove = () => {};
+    this.lowestAngle = Math.PI;
     this.createControls();
     this.boxes = new THREE.Group();
     this.scene.add(this.boxes);
@@ -51,7 +52,7 @@ export class Viewer {
     this.frames = 0;
     const gl = this.renderer.getContext();
     const debugInfo = gl.getExtension("WEBGL_debug_renderer_info");
-    this.splatsPerFrame = SOFTWARE.test(gl.getParameter(debugInfo ? debugInfo.UNMASKED_RENDERER_WEBGL : gl.RENDERER)) ? [MIN_SPLATS] : [Infinity];
+    this.movingSplats = SOFTWARE.test(gl.getParameter(debugInfo ? debugInfo.UNMASKED_RENDERER_WEBGL : gl.RENDERER)) ? MIN_SPLATS : MOVING_SPLATS;
     new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
     this.resize();
   }
@@ -74,6 +75,7 @@ export class Viewer {
     controls.enableDamping = !prefersStill();
     controls.dampingFactor = 0.12;
     controls.zoomToCursor = true;
+    controls.maxPolarAngle = this.lowestAngle;
     controls.addEventListener("change", () => this.draw());
     controls.addEventListener("start", () => { this.flight = null; this.isSteered = true; this.takeLead(); });
     controls.addEventListener("end", () => this.onMove());
@@ -99,15 +101,13 @@ export class Viewer {
     this.partner.isLeading = false;
   }
 
-  // Take over the camera of another viewer, in the frame of this one.
-  follow({ camera, controls, lens, origin }) {
-    const shift = new THREE.Vector3(...origin.map((value, axis) => value - this.origin[axis]));
-    const [position, target] = [camera.position.clone().add(shift), controls.target.clone().add(shift)];
-    if (position.equals(this.camera.position) && target.equals(this.controls.target) && lens === this.lens && camera.up.equals(this.camera.up)) return;
+  // Take over the camera of another viewer.
+  follow({ camera, controls, lens }) {
+    if (camera.position.equals(this.camera.position) && controls.target.equals(this.controls.target) && lens === this.lens && camera.up.equals(this.camera.up)) return;
     this.flight = null;
     this.upright(camera.up);
-    this.camera.position.copy(position);
-    this.controls.target.copy(target);
+    this.camera.position.copy(camera.position);
+    this.controls.target.copy(controls.target);
     this.lens = lens;
     this.updateLens();
     this.draw();
@@ -118,11 +118,11 @@ export class Viewer {
     this.draw();
   }
 
-  // Request a frame. isChange: false if only a sort has ended. After a change a slow machine draws some of the splats first,
-  // and all of them at rest.
+  // Request a frame. isChange: false if only a sort has ended. After a change some of the splats are drawn first, and
+  // all of them at rest.
   draw(isChange = true) {
     if (isChange && this.mesh) {
-      const number = Math.min(this.count, Math.max(MIN_SPLATS, Math.round(Math.max(...this.splatsPerFrame))));
+      const number = Math.min(this.count, this.movingSplats);
       this.drawFirst(number);
       this.drawAllLater(number < this.count);
     }
@@ -141,7 +141,7 @@ export class Viewer {
   drawAllLater(isThinned) {
     clearTimeout(this.restTimer);
     this.restTimer = isThinned && setTimeout(() => {
-      if (this.frameRequest || this.isTiming || this.spark.sorting || this.spark.sortDirty) return this.drawAllLater(true);
+      if (this.frameRequest || this.spark.sorting || this.spark.sortDirty) return this.drawAllLater(true);
       this.restTimer = 0;
       this.drawFirst(this.count);
       return this.draw(false);
@@ -167,21 +167,11 @@ export class Viewer {
       spark.updateInternal({ scene, camera, autoUpdate: true });
       return;
     }
-    const start = performance.now();
     const ratio = mesh && spark.display.numSplats < this.count ? COARSE_RATIO : pixelRatio();
     if (this.renderer.getPixelRatio() !== ratio) this.renderer.setPixelRatio(ratio);
     this.renderer.render(scene, camera);
     this.frames += 1;
     this.onFrame(point => this.project(point));
-    if (mesh) this.timeFrame(spark.display.numSplats, start);
-  }
-
-  // Estimate the splats of a frame within FRAME_BUDGET by the time of the last frames.
-  async timeFrame(number, start) {
-    if (this.isTiming) return;
-    this.isTiming = true;
-    await this.gpuDone().finally(() => { this.isTiming = false; });
-    this.splatsPerFrame = [...this.splatsPerFrame.slice(1 - TIMED_FRAMES), number * FRAME_BUDGET / (performance.now() - start)];
   }
 
   // True if the screen shows the last change with all splats.
@@ -253,8 +243,8 @@ export class Viewer {
     this.paint([]);
   }
 
-  // Draw a splat file before it is uploaded, with its cameras if there are any.
-  async showPreview(content, name, views) {
+  // Draw a splat file before it is lifted.
+  async showFile(content, name) {
     this.clear();
     const mesh = new SplatMesh({ fileBytes: content, fileName: name, lod: false });
     await mesh.initialized;
@@ -263,38 +253,16 @@ export class Viewer {
     Object.assign(this, { origin: [0, 0, 0], draft: mesh, floats: centres, count: centres.length / 8 });
     this.scene.add(mesh);
     this.measureExtent();
-    this.drawFrusta(views);
-    if (views.length) {
-      this.orient(views);
-      this.goToView(views[0], true);
-    } else {
-      this.upright(new THREE.Vector3(0, -1, 0));
-      this.camera.position.copy(this.centre).add(new THREE.Vector3(0, -0.6, -2.4).multiplyScalar(this.extent));
-      this.controls.target.copy(this.centre);
-    }
+    this.upright(new THREE.Vector3(0, -1, 0));
+    this.camera.position.copy(this.centre).add(new THREE.Vector3(0, -0.6, -2.4).multiplyScalar(this.extent));
+    this.controls.target.copy(this.centre);
     this.draw();
-  }
-
-  // Draw the frusta of cameras.
-  drawFrusta(views) {
-    const points = [];
-    for (const view of views) {
-      const { position, right, up, forward } = this.pose(view);
-      const far = this.extent / 6;
-      const corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([x, y]) => position.clone().addScaledVector(forward, far)
-        .addScaledVector(right, x * far * view.width / 2 / view.fx).addScaledVector(up, y * far * view.height / 2 / view.fy));
-      corners.forEach((corner, index) => points.push(position, corner, corner, corners[(index + 1) % 4]));
-    }
-    this.cones = new THREE.LineSegments(new THREE.BufferGeometry().setFromPoints(points), new THREE.LineBasicMaterial({ color: 0xffb84d, depthTest: false, transparent: true, opacity: 0.7 }));
-    this.cones.renderOrder = 10;
-    this.scene.add(this.cones);
   }
 
   clear() {
     if (this.draft) {
-      this.scene.remove(this.draft, this.cones);
+      this.scene.remove(this.draft);
       this.draft.dispose();
-      this.cones.geometry.dispose();
       this.draft = null;
     }
     clearTimeout(this.restTimer);
@@ -321,6 +289,19 @@ export class Viewer {
     this.camera.updateProjectionMatrix();
   }
 
+  // Hide splats, which are neither drawn nor picked then. hidden: a value for each row of the lift, or null.
+  hide(hidden) {
+    const { packedSplats } = this.mesh;
+    const words = packedSplats.packedArray; // the first of four has the opacity in its highest byte
+    for (let index = 0; index < this.count; index += 1) {
+      const opacity = hidden?.[this.rowOf(index)] ? 0 : this.bytes[ROW_BYTES * index + 27];
+      words[4 * index] = words[4 * index] & 0xffffff | opacity << 24;
+    }
+    packedSplats.needsUpdate = true;
+    this.mesh.updateVersion();
+    this.draw();
+  }
+
   // The row of the lift of a drawn splat.
   rowOf(index) {
     return this.rows ? this.rows[index] : index;
@@ -341,6 +322,8 @@ export class Viewer {
     this.up = mean.applyMatrix3(outerSum(poses.map(pose => pose.right), 1, 0.002 * poses.length).invert()).normalize();
     if (this.up.lengthSq() < 0.5) this.up.set(0, 0, 1);
     this.upright(this.up);
+    // There is a floor: a drag goes no lower than the horizon, or than the lowest view.
+    this.lowestAngle = this.controls.maxPolarAngle = Math.max(HORIZON, ...poses.map(({ forward }) => Math.PI - forward.angleTo(this.up)));
     const normal = outerSum(poses.map(pose => pose.forward), -1, poses.length); // sum of I - d d^T
     const rightSide = poses.reduce((sum, { position, forward }) => sum.add(position).addScaledVector(forward, -position.dot(forward)), new THREE.Vector3());
     const point = Math.abs(normal.determinant()) > 1e-6 * poses.length ** 3 ? rightSide.applyMatrix3(normal.invert()) : null;
@@ -419,7 +402,7 @@ export class Viewer {
     const toYUp = new THREE.Quaternion().setFromUnitVectors(this.camera.up, new THREE.Vector3(0, 1, 0));
     const spherical = new THREE.Spherical().setFromVector3(offset.applyQuaternion(toYUp));
     spherical.theta += azimuth;
-    spherical.phi += polar;
+    spherical.phi = Math.min(spherical.phi + polar, this.lowestAngle);
     spherical.makeSafe();
     offset.setFromSpherical(spherical).applyQuaternion(toYUp.invert());
     this.camera.position.copy(this.controls.target).add(offset);
@@ -449,6 +432,7 @@ export class Viewer {
     const hit = ray.intersectObject(this.mesh)[0];
     if (!hit) return null;
     const { x: px, y: py, z: pz } = hit.point;
+    const opacities = this.mesh.packedSplats.packedArray; // see hide
     let nearest = -1;
     let closest = Infinity;
     for (let index = 0; index < this.count; index += 1) {
@@ -456,7 +440,7 @@ export class Viewer {
       const dy = this.floats[8 * index + 1] - py;
       const dz = this.floats[8 * index + 2] - pz;
       const distance = dx * dx + dy * dy + dz * dz;
-      if (distance < closest && this.bytes[ROW_BYTES * index + 27] >= MIN_PICK_OPACITY) {
+      if (distance < closest && opacities[4 * index] >>> 24 >= MIN_PICK_OPACITY) {
         closest = distance;
         nearest = index;
       }
