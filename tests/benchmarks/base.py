@@ -2,23 +2,15 @@
 
 import argparse
 import json
-import os
-import platform
 from collections.abc import Iterable, Mapping, Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 import liftcore as lc
 from liftcore.evaluate.hardware import hardware, machine_line
 from liftcore.values.views import ViewFeatures
-
-PACKS = ("features", "features_hard", "features_clean", "grids")  # of tabletop
-PRESETS = ("row-sum", "tikhonov")
 
 
 def cameras_of(folder: Path) -> Path:
@@ -42,13 +34,6 @@ def read_pack(folder: Path, name: str, stride: int = 1) -> Mapping[str, ViewFeat
     """Every n-th view of a feature pack of a scene folder; the pack itself where that is all of them."""
     views = lc.read_features(folder / f"{name}.safetensors")
     return views if stride == 1 else {view: views[view] for view in views.views[::stride]}
-
-
-def mask_iou(mask: Tensor | np.ndarray, truth: Tensor | np.ndarray) -> float:
-    """Intersection over union of two masks [H, W] bool; one where both are empty."""
-    mask, truth = torch.as_tensor(mask), torch.as_tensor(truth)
-    union = int((mask | truth).sum())
-    return int((mask & truth).sum()) / union if union else 1.0
 
 
 def box_iou(a: np.ndarray, b: np.ndarray) -> float:
@@ -89,12 +74,6 @@ def print_rows(
         return
     print(table_of(rows, columns))
     print("\n".join(["", *([note] if note else []), machine_line(hardware())]))
-
-
-def machine() -> dict[str, str]:
-    """The minute and the machine, for figures that are printed as JSON."""
-    minute = datetime.now(UTC).isoformat(timespec="minutes")
-    return {"date": minute, "machine": f"{os.cpu_count()} cores, Python {platform.python_version()}"}
 
 
 def _cell(value: Any) -> str:

@@ -14,8 +14,7 @@ from PIL import Image
 from liftcore.io.cameras import read_cameras
 from liftcore.io.splats import read_splats
 from tests.inria_file import write_inria_cameras
-from tests.still_life.files import write_still_life
-from tests.still_life.scene import still_life
+from tests.still_life import write_still_life
 from tests.tiny_scene import colmap_zip, make_scene
 
 from .browser import PATIENCE_SECONDS, Browser
@@ -164,7 +163,7 @@ def test_lift_takes_a_name_and_photos(browser: Browser, server: PageServer, tmp_
 def test_strangers_files_become_an_object_that_lights_up(browser: Browser, tmp_path: Path) -> None:
     """The whole way: files are dropped, a lift runs, a phrase lights up the object in 3D, and all is deleted."""
     scene, page = tmp_path / "still-life", browser
-    write_still_life(scene, still_life(views=5, density=0.2))
+    write_still_life(scene)
     with serving(tmp_path / "data", encoder=f"table:{scene}/text_table.safetensors") as address:
         page.window(1280, 800)
         page.open(address)

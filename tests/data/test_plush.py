@@ -8,10 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 import torch
-from safetensors.numpy import load_file, save_file
 
-from liftcore.evaluate.check import check_scene
-from liftcore.features.encoders.encode import find_images
 from liftcore.io.cameras import read_cameras
 from liftcore.io.splats import read_splats
 from liftcore.lifting.files import lift_files
@@ -47,32 +44,6 @@ def cameras(plush: Path) -> Cameras:
 @pytest.fixture(scope="module")
 def raster(plush: Path) -> CpuRaster:
     return CpuRaster(read_splats(plush / "point_cloud.ply"))
-
-
-def test_colmap_and_inria_files_describe_the_same_cameras(plush, cameras):
-    model = read_cameras(plush / "sparse" / "0")
-    assert set(model) == set(cameras)
-    for camera in model.values():
-        other = cameras[camera.name]
-        assert (camera.width, camera.height) == (other.width, other.height) == (990, 742)
-        assert np.allclose([camera.fx, camera.fy], [other.fx, other.fy], rtol=1e-6)
-        assert np.allclose(camera.viewmat, other.viewmat, atol=1e-5)
-
-
-@pytest.mark.parametrize("broken", [None, "cameras", "features"])
-def test_check_tells_broken_inputs_alone(plush, cameras, raster, tmp_path: Path, broken: str | None) -> None:
-    pack = plush / "grids.safetensors"
-    if broken == "cameras":
-        factors = np.ones((4, 4))
-        factors[:3, 3] = 0.3
-        cameras = Cameras([camera.replace(viewmat=camera.viewmat * factors) for camera in cameras.values()])
-    if broken == "features":  # bytes [F, h, w] under a shape of [h, w, F]
-        grids = {name: grid.transpose(2, 0, 1).copy().reshape(grid.shape) for name, grid in load_file(pack).items()}
-        pack = tmp_path / "grids.safetensors"
-        save_file(grids, pack)
-    check = check_scene(raster.splats, cameras, find_images([plush / "images"]), read_features(pack))
-    expected = {None: [], "cameras": ["photos"], "features": ["features"]}[broken]
-    assert [sentence.partition(":")[0] for sentence in check.wrong] == expected
 
 
 def test_rays_are_as_full_as_the_training_measured(plush, cameras, raster):

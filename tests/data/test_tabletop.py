@@ -7,20 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from PIL import Image
+from scipy.stats import rankdata
 
 import liftcore as lc
-from liftcore.features.prompts import prompt_views
 from liftcore.query.ask import ask
+from liftcore.query.objects import objects
 from liftcore.query.question import Query
-from liftcore.query.render import view_mask
 from liftcore.query.segment import segment
 from liftcore.query.terms import SplatTerm
 from liftcore.text.table import TableEncoder
-from liftcore.values.pack import read_features, write_pack
-from tests.benchmarks.base import read_pack
-from tests.benchmarks.consensus import ranked
-from tests.benchmarks.objects import measure_lift
+from tests.benchmarks.base import box_iou, read_pack
 from tests.benchmarks.tabletop import CASES, Case, Truth, tabletop
 
 if TYPE_CHECKING:
@@ -84,12 +80,19 @@ def test_a_row_sum_lift_reaches_the_baseline(
     assert got.miou >= case.miou - ROUNDING
 
 
+def ranked(truth: Truth, lifted: lc.LiftResult) -> float:
+    """Return the AUROC of the confidence for being right, over the splats that count."""
+    assert lifted.confidence is not None
+    right = (truth.scores(lifted).argmax(dim=1) == truth.objects)[truth.evaluated].numpy()
+    ranks, hits = rankdata(lifted.confidence[truth.evaluated].numpy()), int(right.sum())
+    return float((ranks[right].sum() - hits * (hits + 1) / 2) / (hits * (right.size - hits)))
+
+
 def test_hard_masks_gain_and_confidence_tells_right_from_wrong(truth: Truth, hard: lc.LiftResult) -> None:
     figures = truth.evaluate(hard)
     assert figures.accuracy > 0.893  # .818 with row-sum, .862 with a robust step
     assert figures.miou > 0.894  # .834 and .878
-    assert hard.confidence is not None
-    assert ranked(truth, hard, hard.confidence) > 0.8
+    assert ranked(truth, hard) > 0.8
 
 
 def test_masks_that_are_mostly_right_lose_nothing_by_the_default(
@@ -99,20 +102,19 @@ def test_masks_that_are_mostly_right_lose_nothing_by_the_default(
     figures = truth.evaluate(default_lift)
     assert figures.accuracy >= row_sum.accuracy - TOLERANCE
     assert figures.miou >= row_sum.miou - TOLERANCE
-    assert default_lift.confidence is not None
-    assert ranked(truth, default_lift, default_lift.confidence) > 0.8
+    assert ranked(truth, default_lift) > 0.8
 
 
 def test_the_objects_of_hard_masks_are_the_things_of_the_scene(
     truth: Truth, lift_of: Callable[[Case], lc.LiftResult], encoder: TableEncoder
 ) -> None:
     scene = truth.open_scene(lift_of(BARS[0]))
-    answers = {number: ask(scene, truth.words[number], encoder) for number in OBJECTS}
-    measures = measure_lift(scene, answers, truth.objects.numpy())
-    assert measures["one"] == measures["things"] == 12
-    assert measures["box"] > 0.93 and measures["worst"] > 0.85  # .059 around all selected splats
-    assert measures["middle"] < 0.01
-    assert measures["apart"] == measures["pairs"] == 66
+    ious, means = [], scene.splats.means.numpy()
+    for number in OBJECTS:
+        (found,) = objects(scene, ask(scene, truth.words[number], encoder)).objects
+        inside = means[truth.objects.numpy() == number]
+        ious.append(box_iou(np.array(found.box), np.stack([inside.min(axis=0), inside.max(axis=0)])))
+    assert np.mean(ious) > 0.93 and min(ious) > 0.85  # .059 around all selected splats
 
 
 def test_fourteen_words_are_found_among_many(
@@ -149,27 +151,3 @@ def test_a_thing_stays_found_when_something_else_is_not_wanted(truth: Truth, def
     for unlike in cases:
         against = np.array([iou(number, *(unlike or ((number + 1) % len(OBJECTS),))) for number in OBJECTS])
         assert (against > ious - 0.01).all(), unlike
-
-
-def test_things_are_found_in_the_words_of_their_masks(
-    truth: Truth, folder: Path, encoder: TableEncoder, tmp_path: Path
-) -> None:
-    """Regions of real photos become a picture a word and view: the cloth and the curtain have none."""
-    packs, vectors = read_features(folder / "features_clean.safetensors"), encoder.encode(truth.words)
-    for view in packs.views[::4]:
-        regions = packs[view]
-        assert isinstance(regions, lc.Regions)
-        nearest = np.append((regions.codebook.float().numpy() @ vectors.T).argmax(axis=1), -1)
-        labels = nearest[regions.labels[0].numpy()]
-        for number in set(np.unique(labels).tolist()) & {*OBJECTS}:
-            (tmp_path / truth.words[number]).mkdir(exist_ok=True)
-            Image.fromarray(labels == number).save(tmp_path / truth.words[number] / f"{view}.png")
-    views = prompt_views(tmp_path)
-    write_pack(tmp_path / "pack", views.views, {}, table=views.table)
-    scene = truth.open_scene(truth.lift(read_features(tmp_path / "pack"), preset="row-sum"))
-    for number in OBJECTS:
-        answer, ious = ask(scene, truth.words[number]), []
-        for view, mask in truth.held_out.items():
-            visible, right = view_mask(scene, answer, view).mask, (mask == number).numpy()
-            ious.append((visible & right).sum() / (visible | right).sum() if right.any() else 1.0)
-        assert np.mean(ious) >= 0.95, (truth.words[number], ious)
