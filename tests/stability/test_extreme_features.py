@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.benchmarks.extreme_measures import cloud, run
-from tests.benchmarks.extremes import checkerboard
+from tests.stability.extreme_measures import cloud, run
+from tests.stability.extremes import checkerboard
 
 
 def lifted(views, splats=None, **settings):
