@@ -19,7 +19,6 @@ FEW: dict[str, Any] = {"diagnostic_rays": 6}  # as the interpreter traces one in
 CASES: list[tuple[bool, dict[str, Any]]] = [
     *((False, {"preset": preset}) for preset in ("row-sum", "tikhonov", "default", "argmax", "top-k")),
     (False, {"aggregation": True, "objects": True}),
-    (False, {"smoothness": 1.0}),
     (True, {}),  # maps of features in place of masks
 ]
 

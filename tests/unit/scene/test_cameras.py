@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import shutil
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -14,16 +12,10 @@ import pytest
 from camera_files import CAMERAS, IMAGES, assert_same, binary_files, text_files, with_json, write_files
 
 from liftcore.errors import InvalidCameras, InvalidFeatures
-from liftcore.evaluate.inspect import describe_camera_file, inspect_file
-from liftcore.io import json_file
+from liftcore.evaluate.inspect import inspect_file
 from liftcore.io.cameras import read_cameras
-from liftcore.io.transforms import transforms_of
-from liftcore.scene.cameras import Cameras
 from liftcore.scene.distortion import Brown, Fisheye, Lens
 from liftcore.scene.views import require_pairs
-from liftcore.values.lift import LiftMetadata
-from liftcore.values.lift_file import has_poses, poses_of
-from liftcore.values.settings import LiftSettings
 
 FIRST_IMAGE = IMAGES[:1]
 OPENCV = Brown(k1=0.01, k2=-0.02, p1=0.001, p2=0.002)
@@ -47,8 +39,6 @@ def model(tmp_path: Path) -> Path:
         (4, "OPENCV", (500.0, 510.0, 320.0, 240.0, *[0.0] * 4), None),
         (4, "OPENCV", (500.0, 510.0, 320.0, 240.0, 0.01, -0.02, 0.001, 0.002), OPENCV),
         (5, "OPENCV_FISHEYE", (500.0, 510.0, 320.0, 240.0, *[0.0] * 4), Fisheye()),
-        (8, "SIMPLE_RADIAL_FISHEYE", (500.0, 320.0, 240.0, 0.1), Fisheye(0.1)),
-        (14, "SIMPLE_FISHEYE", (500.0, 320.0, 240.0), Fisheye()),
         (15, "FISHEYE", (500.0, 510.0, 320.0, 240.0), Fisheye()),
     ],
 )
@@ -85,24 +75,6 @@ RECORD = {
     "position": [0, 0, 0],
     "rotation": np.eye(3).tolist(),
 }
-
-
-def test_large_json_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "cameras.json"
-    with path.open("wb") as handle:
-        handle.write(b"[")
-        handle.truncate(json_file.MAX_JSON_BYTES + 1)
-    with pytest.raises(InvalidCameras, match="at most 67108864 bytes"):
-        read_cameras(path)
-
-
-def test_real_cameras_agree_in_both_formats(shared_data: Path) -> None:
-    inria = read_cameras(shared_data / "plush" / "cameras.json")
-    colmap = read_cameras(shared_data / "plush" / "sparse" / "0")
-    assert len(inria) == 97
-    names = sorted(inria)
-    assert_same(Cameras([inria[name] for name in names]), Cameras([colmap[name] for name in names]))
-    assert len(read_cameras(shared_data / "tabletop")) == 60
 
 
 def names(path: Path) -> list[str]:
@@ -193,72 +165,12 @@ def test_camera_that_no_image_uses_may_be_of_any_model(tmp_path: Path) -> None:
     assert len(names(write_files(tmp_path / "marked", files_with_bom))) == 3  # and a byte order mark is none
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("sparse/0/cameras.bin", r"got 'sparse/0/cameras\.bin' without 'images\.bin'; zip both"),
-        ("images.txt", r"got 'images\.txt' without 'cameras\.txt'; zip both"),
-        ("data/cameras.json", r"got 'data/cameras\.json'; give the JSON file itself"),
-        ("photo.jpg", "got photos; give the COLMAP model"),
-    ],
-)
-def test_zip_without_a_model_says_what_it_has(name: str, message: str, tmp_path: Path) -> None:
-    with zipfile.ZipFile(tmp_path / "scene.zip", "w") as archive:
-        archive.writestr(name, b"")
-    with pytest.raises(InvalidCameras, match=message):
-        read_cameras(tmp_path / "scene.zip")
-
-
-def test_error_in_a_zip_names_the_zip(tmp_path: Path) -> None:
-    path = tmp_path / "scene.zip"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as archive:
-        archive.writestr("cameras.bin", binary_files()["cameras.bin"] * 50)
-        archive.writestr("images.bin", b"")
-    with pytest.raises(InvalidCameras) as error:
-        read_cameras(path)
-    assert str(error.value).startswith(f"{path}/images.bin")
-    content = bytearray(path.read_bytes())
-    content[60:100] = bytes(40)
-    path.write_bytes(content)
-    with pytest.raises(InvalidCameras, match="a zip of a COLMAP sparse model, got one that does not open"):
-        read_cameras(path)
-
-
-def test_lifts_know_cameras_whose_names_a_mac_wrote(tmp_path: Path) -> None:
-    frames = [{"file_path": f"Ku\u0308che_{k}.png", "transform_matrix": np.eye(4).tolist()} for k in range(2)]
-    path = with_json(tmp_path, {"w": 4, "h": 3, "fl_x": 4.0, "fl_y": 4.0, "frames": frames})
-    cameras = read_cameras(path)
-    assert [*cameras] == ["K\u00fcche_0", "K\u00fcche_1"]
-    views = tuple(f"Ku\u0308che_{k}" for k in range(2))
-    view_cameras = [cameras[view] for view in views]
-    metadata = LiftMetadata(
-        version="0",
-        settings=LiftSettings.of(),
-        views=views,
-        poses=poses_of(view_cameras),
-        diagnostics={},
-        timings={},
-    )
-    assert metadata.views == tuple(cameras) and has_poses(path, metadata)
-    assert has_poses(path, metadata.model_copy(update={"poses": poses_of(view_cameras)}))
-    assert not has_poses(path, metadata.model_copy(update={"poses": poses_of(view_cameras[:1])}))
-
-
 def test_image_names_that_are_no_utf8_give_a_warning(tmp_path: Path) -> None:
     files = {name: content.replace(b"K?c", b"K\xfcc") for name, content in named_model("K?che_0", "K?che_1").items()}
     cameras = read_cameras(write_files(tmp_path, files))
     assert len(cameras) == 2 and "2 images are not UTF-8" in " ".join(cameras.warnings)
     with pytest.raises(InvalidFeatures, match="names of cameras are not UTF-8"):
         require_pairs(["K\u00fcche_0", "K\u00fcche_1"], cameras)
-
-
-def test_a_zip_of_json_alone_is_warned_of_no_model(tmp_path: Path) -> None:
-    document = transforms_of(
-        {"a": next(iter(read_cameras(write_files(tmp_path / "m", named_model("a.png"))).values()))}
-    )
-    with zipfile.ZipFile(tmp_path / "scene.zip", "w") as archive:
-        archive.writestr("transforms.json", json.dumps(document))
-    assert describe_camera_file(tmp_path / "scene.zip")["warnings"] == []
 
 
 BROKEN_POSES = {

@@ -7,8 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from liftcore.errors import InvalidCameras
 from liftcore.io.colmap import MODELS_BY_NAME, calibration
@@ -72,16 +70,6 @@ def test_models_of_colmap_show_a_ray_where_colmap_does(name: str) -> None:
     intrinsics, lens = calibration(MODELS_BY_NAME[name], parameters, "a camera")
     u, v = (0.5, -0.4) if lens is None else distorted_points(lens, np.array([[0.5, -0.4]]))[0]
     assert np.allclose((intrinsics.fx * u + intrinsics.cx, intrinsics.fy * v + intrinsics.cy), expected, atol=1e-9)
-
-
-@given(st.tuples(*[st.floats(-1, 1)] * 5), st.floats(0, 6.3), st.floats(0, 1))
-def test_a_lens_is_undone_where_it_does_not_turn_back(k: tuple[float, ...], angle: float, share: float) -> None:
-    brown = Brown(k1=0.3 * k[0], k2=0.05 * k[1], k3=0.01 * k[2], p1=0.005 * k[3], p2=0.005 * k[4])
-    fisheye = Fisheye(*(0.02 * value for value in k[:4]))
-    for lens, radius in ((brown, 0.8 * share), (fisheye, np.tan(1.4 * share))):
-        point = radius * np.array([[np.cos(angle), np.sin(angle)]])
-        if lens.reach(np.tan(1.05 * np.arctan(radius))) == math.inf:
-            assert np.abs(straight(lens, distorted_points(lens, point)) - point).max() < 1e-5
 
 
 def test_what_a_lens_cannot_show_has_no_way_back() -> None:
@@ -170,11 +158,8 @@ def test_the_pinhole_of_a_whole_hemisphere_ends_at_sixty_degrees() -> None:
     [
         (Brown(k1=-9.0), r"covers \d\.\d% of the photo"),
         (Brown(k1=math.nan), "image within the photo is empty"),
-        (Brown(k1=1e200, k2=1e200), "not monotonic|is empty"),
         (Brown(k4=-2.0), "not monotonic within the photo"),
         (Fisheye(k1=-5.0), r"covers \d\.\d% of the photo"),
-        (Fisheye(k1=math.inf), "image within the photo is empty"),
-        (Brown(p1=5.0, p2=5.0), "image within the photo is empty"),
     ],
 )
 def test_what_no_lens_does_is_refused(distortion: Distortion, message: str) -> None:
@@ -186,7 +171,6 @@ def test_what_no_lens_does_is_refused(distortion: Distortion, message: str) -> N
     ("distortion", "width", "height", "focal"),
     [
         (Brown(k1=-0.2), 1920, 1080, 1150.0),  # COLMAP's own for wide lenses: its corners have no rays
-        (Brown(k1=-0.3), 1920, 1080, 1000.0),  # nor have the left and right sides
         (Fisheye(-1 / 24, 1 / 1920), 1000, 1000, 330.0),  # a circle in a square
     ],
 )
@@ -206,52 +190,6 @@ def test_a_photo_whose_corners_show_no_ray_is_lifted_as_far_as_it_shows_some(
     assert np.abs(back[0] - x)[inside].max() < 1e-6 and np.abs(back[1] - y)[inside].max() < 1e-6
     pinhole = drawn_by(view)
     assert pinhole.width >= view.width and pinhole.height >= view.height
-
-
-def turns_back(lens: Lens) -> bool:
-    """Return True if two positions on the photo show one ray, by the lens's slopes at dense samples."""
-    angles = np.linspace(0, 2 * np.pi, 180, endpoint=False)[:, None]
-    radii = np.tan(np.linspace(0, np.arctan(2 * math.tan(math.radians(60))), 1500))
-    x, y, h = radii * np.cos(angles), radii * np.sin(angles), 1e-6
-    right, left, below, above = (
-        lens.distortion.distorted(x + a, y + b) for a, b in ((h, 0), (-h, 0), (0, h), (0, -h))
-    )
-    slopes = [
-        (p - q) / (2 * h) for plus, minus in ((right, left), (below, above)) for p, q in zip(plus, minus, strict=True)
-    ]
-    back = ~((slopes[0] * slopes[3] - slopes[1] * slopes[2] > 0) & (slopes[0] + slopes[3] > 0))
-    u, v = lens.on_photo(x, y)
-    outside = (u < 0) | (u > lens.width) | (v < 0) | (v > lens.height)
-    ends = [np.where(mask.any(axis=1), mask.argmax(axis=1), radii.size) for mask in (back, outside)]
-    return bool((ends[0] < ends[1]).any())
-
-
-def test_no_lens_is_refused_for_a_principal_point_off_the_centre() -> None:
-    rng = np.random.default_rng(7)
-    healthy = 0
-    for _ in range(60):
-        width, height = [(1752, 1168), (1920, 1080), (4000, 3000), (1080, 1920)][rng.integers(4)]
-        focal = width * rng.uniform(0.45, 0.9)
-        centre = width / 2 + width * rng.uniform(-0.02, 0.02), height / 2 + height * rng.uniform(-0.02, 0.02)
-        few = rng.uniform(-1, 1, size=5)
-        fisheye = Fisheye(-0.03 + 0.03 * few[0], 0.01 * few[1], 0.005 * few[2], 0.001 * few[3])
-        brown = Brown(k1=-0.12 + 0.2 * few[0], k2=0.08 + 0.02 * few[1], p1=0.002 * few[2], p2=0.002 * few[3])
-        for distortion in (fisheye, brown):
-            lens = Lens(width, height, focal, focal, *centre, distortion)
-            if turns_back(lens):
-                continue
-            healthy += 1
-            box = lens.inner  # which is refused by none
-            steps = np.linspace(0, 1, 2001)
-            u = np.concatenate(
-                [box.left + (box.right - box.left) * steps] * 2 + [0 * steps + box.left, 0 * steps + box.right]
-            )
-            v = np.concatenate(
-                [0 * steps + box.top, 0 * steps + box.bottom] + [box.top + (box.bottom - box.top) * steps] * 2
-            )
-            x, y = lens.on_photo((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy)
-            assert min(x.min(), y.min(), width - x.max(), height - y.max()) > -1e-3
-    assert healthy > 90
 
 
 def test_warning_tells_the_least_share_and_knows_no_hundred_percent_or_more() -> None:

@@ -85,19 +85,6 @@ def test_a_file_of_another_program_is_read_as_the_ply_that_it_was_made_of(tmp_pa
     assert_same(read_splats(tmp_path / "s.gltf"), expected)
 
 
-@pytest.mark.parametrize("kernel", Kernel)
-@pytest.mark.parametrize("degree", [0, 3])
-def test_every_kernel_comes_back_as_the_gaussians_that_were_written(
-    kernel: Kernel, degree: int, tmp_path: Path
-) -> None:
-    splats = some_splats(kernel, degree)
-    copy = read_splats(write(tmp_path / "s.glb", splats))
-    assert copy.kernel is Kernel.GAUSSIAN_3D and not copy.warnings
-    assert_same(copy, splats)
-    note = parts_of(tmp_path / "s.glb")[0]["asset"].get("extras", {}).get("note", "")
-    assert (kernel in note) is (kernel is not Kernel.GAUSSIAN_3D)
-
-
 def test_what_the_format_has_no_word_for_is_kept(tmp_path: Path) -> None:
     splats = replace(some_splats(), render_mode="antialiased")
     assert read_splats(write(tmp_path / "s.glb", splats)).antialiased
@@ -193,16 +180,3 @@ def test_columns_that_would_share_an_attribute_are_refused(tmp_path: Path) -> No
     for names in (("A", "a"), ("instance_id", "feature_id_0")):
         with pytest.raises(InvalidSplats, match="more than their case"):
             write_splats(tmp_path / "s.glb", some_splats(), {name: np.arange(P) for name in names})
-
-
-def test_attributes_of_others_may_have_any_number(tmp_path: Path) -> None:
-    write_splats(tmp_path / "s.glb", some_splats(), {"instance_id": np.arange(P) % 3})
-    document, binary = parts_of(tmp_path / "s.glb")
-    document["meshes"][0]["primitives"][0]["attributes"]["_FEATURE_ID_" + "9" * 5000] = 0
-    extras = read_splats(join(tmp_path / "t.glb", document, binary)).extras
-    assert extras["instance_id"].tolist() == (np.arange(P) % 3).tolist()
-
-
-def test_spz_holds_no_columns(tmp_path: Path) -> None:
-    with pytest.raises(InvalidSplats, match=r"\.ply or \.glb"):
-        write_splats(tmp_path / "s.spz", some_splats(), {"instance_id": np.arange(P)})

@@ -19,11 +19,6 @@ from liftcore.io.labels import Labels
 from liftcore.io.splat import splat_blocks
 from liftcore.io.splats import labelled, read_places, read_splats, some_rows, write_splats
 from liftcore.io.spz import spz_blocks
-from liftcore.lifting import pipeline
-from liftcore.lifting.engines.base import LocalEngine
-from liftcore.lifting.engines.lift import block_folder
-from liftcore.lifting.files import lift_files
-from liftcore.lifting.inputs import LiftInputs
 from liftcore.lifting.planning.views import visibility
 from liftcore.query.ask import ask, locate
 from liftcore.query.catalogue import catalogue, table_csv
@@ -34,19 +29,13 @@ from liftcore.query.render import expected_depth, render
 from liftcore.query.scene import Scene
 from liftcore.query.segment import segment
 from liftcore.query.terms import Vector
-from liftcore.raster.reference import dense_view
-from liftcore.runtime.progress import Timings
 from liftcore.scene.cameras import Camera, Cameras, viewmat_of
 from liftcore.scene.compositing import CompositingParams
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.origin import FILE_ORIGIN
 from liftcore.scene.splats import Splats
-from liftcore.values.lift import LiftMetadata
-from liftcore.values.lift_file import open_lift, save_lift
 from liftcore.values.settings import LiftSettings
-from tests.scenes import look_at, random_camera, random_regions, random_splats, splats_at
-from tests.tiny_scene import cameras_document, make_scene, ply, splat_rows
-from tests.unit.command_line import run
+from tests.scenes import random_camera, random_regions, random_splats, splats_at
 
 UTM = np.array([500_000.25, 5_400_000.5, 300.125])
 ROUNDING = 2e-5  # of float32 about an origin near the splats, in scene units; half a metre about the file's
@@ -71,20 +60,16 @@ def scene_of(kernel: Kernel) -> tuple[Splats, list[Camera], dict[str, Any]]:
     )
 
 
-def moved_back(splats: Splats, offset: np.ndarray = UTM) -> Splats:
-    """Return the splats translated back by the offset, with float32 means about the origin."""
-    means = splats.means.double() + torch.tensor(splats.origin, dtype=torch.float64) - torch.from_numpy(offset)
-    return replace(splats, means=means.float(), origin=FILE_ORIGIN)
-
-
 @pytest.mark.parametrize("kernel", list(Kernel))
-def test_a_moved_scene_has_the_same_features_pictures_and_plan(kernel: Kernel) -> None:
+def test_a_moved_scene_has_the_same_features_pictures_and_plan(kernel: Kernel, tmp_path: Path) -> None:
     splats, cameras, views = scene_of(kernel)
     far_splats, far_cameras = moved_splats(splats), [moved_camera(camera) for camera in cameras]
     settings = LiftSettings.of(dtype="float32", robust=True)
     original = lc.lift(splats, Cameras(cameras), views, settings)
     far = lc.lift(far_splats, Cameras(far_cameras), views, settings)
-    assert far.metadata.origin == far_splats.origin != FILE_ORIGIN
+    far.save(tmp_path / "far.safetensors")
+    origin = lc.load_lift(tmp_path / "far.safetensors").metadata.origin
+    assert origin == far.metadata.origin == far_splats.origin != FILE_ORIGIN
     assert np.abs(np.array(far_splats.origin) - UTM).max() < 4
     assert torch.equal(far.has_feature, original.has_feature)
     relative_error = (far.features - original.features).norm(dim=1) / original.features.norm(dim=1).clamp_min(1e-9)
@@ -103,35 +88,6 @@ def test_a_moved_scene_has_the_same_features_pictures_and_plan(kernel: Kernel) -
     assert np.allclose(near.centres - near.means[:4], away.centres - away.means[:4], atol=1e-4)
 
 
-@pytest.mark.parametrize("kernel", list(Kernel))
-def test_the_reference_raster_sees_a_moved_scene_as_it_stood(kernel: Kernel) -> None:
-    splats, camera = random_splats(5, 60, kernel=kernel), random_camera(5)
-    far_splats = moved_splats(splats)
-    expected = dense_view(moved_back(far_splats), camera, CompositingParams())
-    far = dense_view(far_splats, moved_camera(camera), CompositingParams())
-    sure = ~(expected.cut | far.cut)
-    assert sure.mean() > 0.5
-    assert np.allclose(far.A[sure], expected.A[sure], atol=1e-4)
-
-
-@pytest.mark.parametrize("kernel", list(Kernel))
-def test_an_offset_that_float64_holds_leaves_every_bit(kernel: Kernel) -> None:
-    # Cameras along the axes, whose poses an offset of whole numbers moves without rounding.
-    offset = np.array([524_288.0, 4_194_304.0, 8_192.0])
-    splats, cameras, views = scene_of(kernel)
-    centres = np.array([(0.0, 0, -4), (4, 0, 0), (0, 0, 4), (-4, 0, 0)])
-    cameras = [look_at(f"v{k}", centre, 32, 24, 30.0) for k, centre in enumerate(centres)]
-    far_splats = moved_splats(splats, offset)
-    lifts = [
-        lc.lift(replace(splats, means=far_splats.means), Cameras(cameras), views),
-        lc.lift(
-            far_splats, Cameras([moved_camera(camera, np.array(far_splats.origin)) for camera in cameras]), views
-        ),
-    ]
-    for name in ("features", "total_weight", "has_feature"):
-        assert torch.equal(getattr(lifts[0], name), getattr(lifts[1], name)), name
-
-
 def test_scenes_about_their_own_origin_keep_it_and_their_bits() -> None:
     base = random_splats(1)
     near = np.array([40.0, -300.0, 7.0])
@@ -147,16 +103,6 @@ def test_scenes_about_their_own_origin_keep_it_and_their_bits() -> None:
         assert copy.origin == FILE_ORIGIN and copy.warnings == ()
         assert torch.equal(copy.means, splats.means)
         assert np.array_equal(copy.positions(), splats.means.numpy())
-
-
-def test_an_origin_stays_with_splats_that_are_changed_and_a_broken_one_is_refused() -> None:
-    far_splats = moved_splats(random_splats(2))
-    names = ("means", "quats", "log_scales", "sh", "opacity_logits")
-    subset = replace(far_splats, **{name: getattr(far_splats, name)[:5] for name in names})
-    assert subset.origin == far_splats.origin
-    assert np.array_equal(subset.positions(), far_splats.positions()[:5])
-    with pytest.raises(lc.InvalidSplats, match="origin"):
-        replace(far_splats, origin=(1.0, float("nan"), 0.0))
 
 
 def doubles(path: Path, splats: Splats, offset: np.ndarray) -> None:
@@ -266,26 +212,6 @@ def test_quantised_files_far_from_their_origin_keep_their_digits(write: Any, ste
     assert np.array_equal(read_places(tmp_path / "far"), actual.positions())
 
 
-def test_check_says_of_a_moved_scene_what_it_says_where_it_stood(
-    tiny: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    answers = []
-    for name, lift in tiny.items():
-        folder, photos = lift.parent, tmp_path / name
-        photos.mkdir()
-        for view in ("left", "middle", "right"):
-            assert run(capsys, "render", tiny["here"], "--view", view, "-o", photos / f"{view}.png")[0] == 0
-        (folder / "f.safetensors").write_bytes((folder / "f.st").read_bytes())
-        files = folder / "s.ply", folder / "c.json", photos, folder / "f.safetensors"
-        status, out, err = run(capsys, "check", *files, "--json")
-        answers.append({"status": status, "err": err, **json.loads(out)})
-    near, far = answers
-    assert (near["status"], near["wrong"]) == (far["status"], far["wrong"]) and near["err"] == far["err"] == ""
-    assert np.isclose(near["in_view"], far["in_view"]) and far["in_view"] > 0.9
-    for a, b in zip(near["views"], far["views"], strict=True):
-        assert np.allclose([a["row_sum"], a["psnr"]], [b["row_sum"], b["psnr"]], atol=0.1), a["view"]
-
-
 def test_cameras_whose_rotation_has_few_digits_stand_where_their_file_says() -> None:
     camera = random_camera(9)
     rotation = camera.viewmat[:3, :3].T.astype(np.float32).astype(np.float64)
@@ -328,77 +254,3 @@ def test_every_answer_with_a_place_is_in_the_frame_of_the_file() -> None:
     far = positions_of_answers(moved_splats(splats), Cameras([moved_camera(camera) for camera in cameras]), views)
     for name, places in near.items():
         assert len(places) and np.abs(np.array(far[name]) - np.array(places) - UTM).max() < 1e-3, name
-
-
-def test_a_lift_in_blocks_and_its_file_keep_the_origin(tmp_path: Path) -> None:
-    splats, cameras, views = scene_of(Kernel.GAUSSIAN_3D)
-    far_splats, cameras = moved_splats(splats), [moved_camera(camera) for camera in cameras]
-    settings = LiftSettings.of(preset="row-sum")
-    in_memory = lc.lift(far_splats, Cameras(cameras), views, settings)
-    inputs, timings = LiftInputs.of(far_splats, Cameras(cameras), views, settings), Timings()
-    with block_folder(LocalEngine(), settings, selected=9) as folder:
-        in_blocks = pipeline.run(inputs, timings, lambda _: None, blocks=folder)
-    assert (
-        torch.equal(in_memory.features, in_blocks.features) and in_memory.metadata.origin == in_blocks.metadata.origin
-    )
-    save_lift(in_blocks, tmp_path / "scene.lift")
-    assert open_lift(tmp_path / "scene.lift").metadata.origin == far_splats.origin
-    fields = in_memory.metadata.model_dump()
-    del fields["origin"]  # as a lift of before has it
-    assert LiftMetadata(**fields).origin == FILE_ORIGIN
-
-
-@pytest.fixture(scope="module")
-def tiny(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Lift a scene of files at the origin, and the same scene translated: a PLY of doubles and a transforms.json."""
-    lifts = {}
-    for name, offset in (("here", np.zeros(3)), ("far", UTM)):
-        folder, tiny = tmp_path_factory.mktemp(name), make_scene()
-        rows = splat_rows()
-        doubled = rows.astype("f8")
-        doubled[:, :3] += offset
-        (folder / "s.ply").write_bytes(
-            ply(rows).split(b"end_header")[0].replace(b"float", b"double") + b"end_header\n"
-        )
-        with (folder / "s.ply").open("ab") as file:
-            file.write(doubled.tobytes())
-        document = cameras_document()
-        for frame in document["frames"]:
-            pose = np.array(frame["transform_matrix"])
-            pose[:3, 3] += offset
-            frame["transform_matrix"] = pose.tolist()
-        (folder / "c.json").write_text(json.dumps(document))
-        (folder / "f.st").write_bytes(tiny.features)
-        lift = lift_files(folder / "s.ply", folder / "c.json", [folder / "f.st"], LiftSettings.of(preset="row-sum"))
-        save_lift(lift, folder / "scene.lift")
-        lifts[name] = folder / "scene.lift"
-    return lifts
-
-
-def test_the_command_line_tells_places_in_the_frame_of_the_file(
-    tiny: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    options = ["--like", "left:16,12", "--threshold", "0.5", "--top", "3", "--objects"]
-    answers = {}
-    for name, lift in tiny.items():
-        status, out, err = run(capsys, "query", lift, *options, "--object", tmp_path / f"{name}.ply", "--json")
-        assert (status, err) == (0, "")
-        answers[name] = json.loads(out)["answer"]
-    near, far = (
-        [*(hit["position"] for hit in answer["top"]), *answer["box"].values(), *answer["objects"][0]["box"].values()]
-        for answer in answers.values()
-    )
-    assert np.abs(np.array(far) - np.array(near) - UTM).max() < ROUNDING
-    assert [hit["splat"] for hit in answers["far"]["top"]] == [hit["splat"] for hit in answers["here"]["top"]]
-    positions = [read_splats(tmp_path / f"{name}.ply").positions() for name in answers]
-    assert np.abs(positions[1] - positions[0] - UTM).max() < ROUNDING
-    status, out, _ = run(capsys, "query", tiny["far"], *options, "--object", tmp_path / "far.splat")
-    assert status == 0 and "5400000" in out.splitlines()[-1]
-    assert np.abs(read_splats(tmp_path / "far.splat").means.numpy()).max() < 16
-    status, out, _ = run(capsys, "inspect", tiny["far"].parent / "s.ply", "--json")
-    assert status == 0 and np.abs(np.array(json.loads(out)["box"]) - UTM).max() < 8
-    [box_line] = [
-        line for line in run(capsys, "inspect", tiny["far"].parent / "s.ply")[1].splitlines() if "box" in line
-    ]
-    corners = [float(number.strip("(),")) for number in box_line.split()[1:]]
-    assert np.abs(np.array(corners) - np.array(json.loads(out)["box"]).ravel()).max() < 2e-3

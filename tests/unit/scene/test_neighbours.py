@@ -51,13 +51,6 @@ def test_affinities_are_those_of_the_formula(seed: int, count: int, coloured: bo
     np.testing.assert_allclose(dense(graph), by_formula(splats), rtol=1e-4, atol=2 * LEAST_AFFINITY)
 
 
-@pytest.mark.parametrize("power", [-10, 10])
-def test_affinities_know_no_unit_of_length(power: int) -> None:
-    splats = random_splats(0, 100)
-    scaled = replace(splats, means=2.0**power * splats.means)
-    np.testing.assert_allclose(dense(SplatGraph.of(scaled)), dense(SplatGraph.of(splats)), rtol=1e-5)
-
-
 @pytest.mark.parametrize("count", [5, 12, 60])
 def test_splats_at_one_place_are_neighbours(count: int) -> None:
     splats = replace(random_splats(0, 60), sh=None)

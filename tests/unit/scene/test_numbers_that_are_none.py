@@ -22,7 +22,6 @@ from liftcore.scene.compositing import CompositingParams
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
 from tests.scenes import look_at, observed, random_camera, random_splats
-from tests.unit.command_line import lift_arguments, run, write_toy_scene
 
 FILES = Path(__file__).parents[2] / "data" / "splats"
 COUNT, BROKEN = 40, {"means": 5, "log_scales": 9, "quats": 17, "opacity_logits": 20}
@@ -135,38 +134,6 @@ def test_files_of_every_format_keep_their_rows_and_count_what_is_none(tmp_path: 
             assert read_splats(copy).count == splats.count
 
 
-def test_questions_take_what_the_lift_took(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    scene = write_toy_scene(tmp_path)
-    splats = read_splats(scene / "splats.ply")
-    places, sh = torch.cat([splats.means, torch.full((1, 3), np.nan)]), torch.zeros(3, 1, 3)
-    sh[1, 0, 2] = np.nan
-    columns = {name: getattr(splats, name)[[0, 1, 1]] for name in ("quats", "log_scales", "opacity_logits")}
-    write_splats(scene / "splats.ply", Splats(places.nan_to_num(7.5), **columns, sh=sh.nan_to_num(7.5)))
-    content = (scene / "splats.ply").read_bytes()
-    content = content.replace(struct.pack("<f", 7.5), struct.pack("<f", np.nan))
-    (scene / "splats.ply").write_bytes(content)
-    assert content.count(struct.pack("<f", np.nan)) == 4
-    for command in (lift_arguments(scene), ["plan", *lift_arguments(scene)[1:4]]):
-        status, out, err = run(capsys, *command)
-        assert status == 0 and "1 of 3 splats have a place" in out + err
-    status, out, _ = run(capsys, "inspect", scene / "splats.ply")
-    assert status == 0 and "1 of 3 splats have a place" in out and "1 of 3 splats have a colour" in out
-    assert "1 of 3 splats have a colour" in run(capsys, "check", scene / "splats.ply", scene / "cameras.json")[1]
-    np.save(scene / "like.npy", np.array([1.0, 0.0, 0.0], np.float32))
-    ask = ["query", scene / "lift.safetensors", "--like", scene / "like.npy"]
-    status, out, err = run(capsys, *ask, "--objects", "--json")
-    assert status == 0, err
-    answer = json.loads(out)["answer"]
-    assert all(np.isfinite([*entry["box"].values()]).all() for entry in answer["objects"])
-    for options in (["--mask", scene / "m.png"], ["--overlay", scene / "r.png"], ["--attention", scene / "a.png"]):
-        assert run(capsys, *ask, "--view", "front", *options)[0] == 0
-    assert run(capsys, *ask, "--coloured", scene / "c.ply")[0] == 0
-    assert read_splats(scene / "c.ply").count == 3
-    for name in ("o.ply", "o.splat", "o.spz"):
-        status, _, err = run(capsys, *ask, "--object", scene / name)
-        assert (status, read_splats(scene / name).count if status == 0 else err) == (0, 1)
-
-
 def test_whole_and_empty_opacities_and_flat_splats_are_numbers() -> None:
     values = geometry_of(random_splats(3, COUNT))
     values["opacity_logits"][:2] = torch.tensor([np.inf, -np.inf])
@@ -176,3 +143,15 @@ def test_whole_and_empty_opacities_and_flat_splats_are_numbers() -> None:
         torch.equal(getattr(splats, name), values[name]) for name in ("opacity_logits", "log_scales", "quats")
     )
     assert bool(torch.isfinite(lc.render(splats, random_camera(0), torch.ones(COUNT))).all())
+
+
+def test_questions_take_what_the_lift_took(tmp_path: Path) -> None:
+    splats = Splats(**broken(random_splats(3, COUNT)))
+    cameras = {f"v{number}": random_camera(number, name=f"v{number}") for number in range(3)}
+    views = {name: observed(number, 0) for number, name in enumerate(cameras)}
+    scene = lc.Scene(lc.lift(splats, cameras, views, "row-sum"), splats, cameras)
+    first = int(np.flatnonzero(scene.has_feature)[0])
+    answer = scene.ask(lc.Query(like=[f"splat:{first}"], threshold=-1.0))
+    assert not answer.selected[~VALID_ROWS.numpy()].any() and np.isfinite(answer.box).all()
+    assert all(np.isfinite(item.box).all() for item in scene.objects(answer).objects)
+    assert scene.attention(answer, "v0").max() > 0 and np.isfinite(scene.render("v0")).all()

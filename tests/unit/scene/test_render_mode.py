@@ -14,17 +14,13 @@ import pytest
 import torch
 
 import liftcore as lc
-from liftcore.errors import InvalidSettings, InvalidSplats
 from liftcore.evaluate.inspect import inspect_file
 from liftcore.io.labels import Labels
 from liftcore.io.splats import labelled, read_splats, some_rows, write_splats
-from liftcore.query.render import _as_trained as params_of_renders
-from liftcore.query.scene import Scene
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
 from liftcore.values.settings import LiftSettings
-from tests.scenes import observed, random_camera, random_splats, write_scene
-from tests.unit.command_line import run
+from tests.scenes import observed, random_camera, random_splats
 
 FILES = Path(__file__).parents[2] / "data" / "splats"
 CLASSIC, MIP, DISCS = (Kernel.GAUSSIAN_3D, False), (Kernel.GAUSSIAN_3D, True), (Kernel.GAUSSIAN_2D, False)
@@ -81,25 +77,25 @@ GSPLAT = "absgrad: false\nantialiased: {}\napp_opt: false\nresult_dir: results\n
 NERFSTUDIO = "!!python/object:T\npipeline: !!python/object:V\n  model: !!python/object:S\n    rasterize_mode: {}\n"
 SAYING: dict[str, tuple[Callable[[Path], Path], tuple[Kernel, bool], str | None]] = {
     "nothing": (ply_saying, CLASSIC, None),
-    "Brush's mip": (lambda f: ply_saying(f, "comment SplatRenderMode: mip"), MIP, "SplatRenderMode: mip"),
-    "Brush's default": (lambda f: ply_saying(f, "comment SplatRenderMode: default"), CLASSIC, "default"),
+
+
     "2dgs of three scales": (lambda f: ply_saying(f, "comment SplatRenderMode: 2dgs"), DISCS, "2dgs"),
-    "in capitals, CRLF": (lambda f: ply_saying(f, "comment  splatrendermode:MIP\r"), MIP, "MIP"),
+
     "Postshot's 1": (lambda f: ply_saying(f, "comment antialiased 1"), MIP, "antialiased 1"),
-    "Postshot's 0": (lambda f: ply_saying(f, "comment antialiased 0"), CLASSIC, "antialiased 0"),
+
     "the last of two": (
         lambda f: ply_saying(f, "comment antialiased 0", "comment SplatRenderMode: mip"), MIP, "mip"
     ),
     "a comment on it": (lambda f: ply_saying(f, "comment not antialiased 1 at all"), CLASSIC, None),
     "compressed PLY": (lambda f: compressed_saying(f, "comment SplatRenderMode: mip"), MIP, "mip"),
-    "compressed PLY of discs": (lambda f: compressed_saying(f, "comment SplatRenderMode: 2dgs"), DISCS, "2dgs"),
+
     **{f"SPZ {v}": (lambda f, v=v: spz_saying(f, v, 1), MIP, "flag") for v in (1, 2, 3, 4)},
-    "SPZ with another flag": (lambda f: spz_saying(f, 3, 4), CLASSIC, None),
+
     "SOG": (lambda f: sog_saying(f, "antialiased"), MIP, "model"),
     "SOG of discs": (lambda f: sog_saying(f, "2dgs"), DISCS, "model"),
-    "SOG default": (lambda f: sog_saying(f, "default"), CLASSIC, "model"),
+
     "gsplat's configuration": (lambda f: checkpoint_beside(f, "cfg.yml", GSPLAT.format("true")), MIP, "cfg.yml"),
-    "gsplat's classic": (lambda f: checkpoint_beside(f, "cfg.yml", GSPLAT.format("false")), CLASSIC, "cfg.yml"),
+
     "gsplat's discs": (lambda f: checkpoint_beside(f, "cfg.yml", "model_type: 2dgs\n"), DISCS, "cfg.yml"),
     "nerfstudio's": (
         lambda f: checkpoint_beside(f, "config.yml", NERFSTUDIO.format("antialiased")), MIP, "config.yml"
@@ -152,6 +148,36 @@ def test_mip_splattings_filter_says_that_opacities_are_compensated(tmp_path: Pat
     assert not read_splats(ply_saying(tmp_path, "comment antialiased 0", splats=splats)).antialiased
 
 
+def test_exports_say_how_their_splats_were_trained(tmp_path: Path) -> None:
+    mip = spz_saying(tmp_path, 4, 1)
+    mask = np.ones(40, bool)
+    for suffix in (".ply", ".spz"):
+        (tmp_path / f"copy{suffix}").write_bytes(b"".join(some_rows(mip, mask, suffix)))
+        assert read_splats(tmp_path / f"copy{suffix}").antialiased
+    (tmp_path / "c.ply").write_bytes(b"".join(labelled(mip, Labels({"score": np.ones(40, np.float32)}, {}))))
+    assert read_splats(tmp_path / "c.ply").antialiased
+    mip_ply = ply_saying(tmp_path, "comment SplatRenderMode: mip")
+    (tmp_path / "c.ply").write_bytes(b"".join(some_rows(mip_ply, mask)))
+    assert read_splats(tmp_path / "c.ply").antialiased
+    discs = sog_saying(tmp_path, "2dgs")
+    (tmp_path / "c.ply").write_bytes(b"".join(some_rows(discs, np.ones(300, bool))))
+    assert read_splats(tmp_path / "c.ply").kernel is Kernel.GAUSSIAN_2D
+
+
+def test_splats_in_memory_are_drawn_and_lifted_in_their_mode() -> None:
+    splats, camera, values = random_splats(3), random_camera(0), torch.ones(40)
+    mip, params = replace(splats, render_mode="antialiased"), lc.CompositingParams(antialiased=True)
+    assert torch.equal(lc.render(mip, camera, values), lc.render(splats, camera, values, params))
+    assert not torch.equal(lc.render(mip, camera, values), lc.render(splats, camera, values))
+    cameras, views = {"v0": camera}, {"v0": observed(0, 0)}
+    lifts = [lc.lift(mip, cameras, views), lc.lift(splats, cameras, views, antialiased=True)]
+    assert torch.equal(lifts[0].features, lifts[1].features) and lifts[0].settings.antialiased is True
+    against = lc.lift(mip, cameras, views, antialiased=False)
+    assert any("antialiased=false is set by hand" in text for text in against.diagnostics["warnings"])
+    with pytest.raises(lc.InvalidSettings, match="antialiased"):
+        lc.lift(random_splats(3, kernel=Kernel.BETA), cameras, views, antialiased=True)
+
+
 @pytest.mark.parametrize(
     ("names", "words"),
     [
@@ -171,103 +197,3 @@ def test_properties_that_change_what_is_rendered_and_are_not_read_are_named(
     path = ply_saying(tmp_path, splats=replace(random_splats(3), extras={name: torch.ones(40) for name in names}))
     warnings = read_splats(path, colour=colour).warnings
     assert bool(warnings) is bool(words) and words in " | ".join(warnings)
-
-
-def test_exports_say_how_their_splats_were_trained(tmp_path: Path) -> None:
-    mip = spz_saying(tmp_path, 4, 1)
-    mask = np.ones(40, bool)
-    for suffix in (".ply", ".spz"):
-        (tmp_path / f"copy{suffix}").write_bytes(b"".join(some_rows(mip, mask, suffix)))
-        assert read_splats(tmp_path / f"copy{suffix}").antialiased
-    (tmp_path / "c.ply").write_bytes(b"".join(labelled(mip, Labels({"score": np.ones(40, np.float32)}, {}))))
-    assert read_splats(tmp_path / "c.ply").antialiased
-    mip_ply = ply_saying(tmp_path, "comment SplatRenderMode: mip")
-    (tmp_path / "c.ply").write_bytes(b"".join(some_rows(mip_ply, mask)))
-    assert read_splats(tmp_path / "c.ply").antialiased
-    discs = sog_saying(tmp_path, "2dgs")
-    (tmp_path / "c.ply").write_bytes(b"".join(some_rows(discs, np.ones(300, bool))))
-    assert read_splats(tmp_path / "c.ply").kernel is Kernel.GAUSSIAN_2D
-
-
-def test_values_in_memory_carry_their_mode_into_every_call() -> None:
-    splats = random_splats(3)
-    mip = replace(splats, render_mode="antialiased")
-    camera, values = random_camera(0), torch.ones(40)
-    params = lc.CompositingParams(antialiased=True)
-    assert torch.equal(lc.render(mip, camera, values), lc.render(splats, camera, values, params))
-    assert not torch.equal(lc.render(mip, camera, values), lc.render(splats, camera, values))
-    assert torch.equal(lc.render(mip, camera, values, lc.CompositingParams()), lc.render(splats, camera, values))
-    with pytest.raises(InvalidSplats, match="render_mode: expected classic or antialiased or 2dgs, got 'mip'"):
-        replace(splats, render_mode="mip")
-    cameras = {f"v{number}": random_camera(number, name=f"v{number}") for number in range(3)}
-    views = {name: observed(number, 0) for number, name in enumerate(cameras)}
-    lifted = lc.lift(mip, cameras, views, "row-sum", device="cpu")
-    by_hand = lc.lift(splats, cameras, views, "row-sum", device="cpu", antialiased=True)
-    assert torch.equal(lifted.features, by_hand.features) and lifted.settings.antialiased is True
-    assert lifted.diagnostics["plan"]["antialiased"] is True
-    assert lifted.diagnostics["plan"]["rendering"] == "render_mode of the splats says so"
-    assert by_hand.diagnostics["plan"]["rendering"] == "set by hand"
-    engine = lc.lift(mip, cameras, views, "row-sum", device="cpu", engine=lc.LocalEngine())
-    assert torch.equal(engine.features, lifted.features) and engine.settings == lifted.settings
-    assert engine.diagnostics["plan"]["rendering"] == lifted.diagnostics["plan"]["rendering"]
-    weights = lc.region_weights(mip, cameras, views, "row-sum", device="cpu")
-    other = lc.region_weights(splats, cameras, views, "row-sum", device="cpu", antialiased=True)
-    assert torch.equal(weights.weight, other.weight)
-    assert (
-        lc.plan(mip, cameras, views).antialiased and not lc.plan(mip, cameras, views, antialiased=False).antialiased
-    )
-    against = lc.lift(mip, cameras, views, "row-sum", device="cpu", antialiased=False)
-    assert torch.equal(against.features, lc.lift(splats, cameras, views, "row-sum", device="cpu").features)
-    assert any("antialiased=false is set by hand" in text for text in against.diagnostics["warnings"])
-    with pytest.raises(InvalidSettings, match="antialiased"):
-        lc.lift(random_splats(3, kernel=Kernel.BETA), cameras, views, antialiased=True)
-
-
-def test_commands_follow_the_file_tell_it_and_take_a_setting_by_hand(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    splats, cameras, packs = write_scene(tmp_path, 7)
-    content = splats.read_bytes()
-    splats.write_bytes(content.replace(b"element", b"comment SplatRenderMode: mip\nelement", 1))
-    out = tmp_path / "l.safetensors"
-    status, text, _ = run(capsys, "plan", splats, cameras, packs)
-    assert status == 0 and "antialiased: the comment 'SplatRenderMode: mip' says so" in text
-    assert "SplatRenderMode: mip" in run(capsys, "check", splats, cameras)[1]
-    assert "set by hand" in run(capsys, "check", splats, cameras, "--set", "antialiased=false")[1]
-    assert "set by hand" in run(capsys, "plan", splats, cameras, packs, "--set", "antialiased=false")[1]
-    assert "render mode" in run(capsys, "inspect", splats)[1]
-    assert run(capsys, "lift", splats, cameras, packs, "-o", out, "--set", "preset=row-sum")[0] == 0
-    scene = Scene(out)
-    assert scene.compositing.antialiased and params_of_renders(scene).antialiased
-    report = inspect_file(out)
-    assert report["settings"]["antialiased"] is True
-    assert "says so" in report["diagnostics"]["plan"]["rendering"]
-    assert run(capsys, "lift", splats, cameras, packs, "-o", out, "--set", "antialiased=false")[0] == 0
-    assert not Scene(out).compositing.antialiased
-
-
-def splats_of(splats: Splats, row: int) -> Splats:
-    """Return one splat of a scene."""
-    names = ("means", "quats", "log_scales", "opacity_logits")
-    return Splats(*(getattr(splats, name)[row : row + 1] for name in names))
-
-
-def test_a_splat_below_a_pixel_is_lifted_as_it_was_trained(tmp_path: Path) -> None:
-    """Splats below a pixel, as an antialiased trainer leaves them, hardly occlude the ball behind them."""
-    generator = torch.Generator().manual_seed(0)
-    veil = torch.rand(400, 3, generator=generator) * torch.tensor([2.0, 1.5, 0.2]) + torch.tensor([-1.0, -0.75, 1.0])
-    ball = torch.tensor([[0.0, 0.0, 4.0]])
-    splats = Splats(
-        torch.cat([veil, ball]), torch.tensor([[1.0, 0, 0, 0]]).repeat(401, 1),
-        torch.cat([torch.full((400, 3), -7.0), torch.zeros(1, 3)]), torch.full((401,), 4.0),
-    )  # fmt: skip
-    write_splats(tmp_path / "classic.ply", splats)
-    path = ply_saying(tmp_path, "comment SplatRenderMode: mip", splats=splats)
-    camera = lc.Camera(np.eye(4), [[32.0, 0, 32], [0, 32, 24], [0, 0, 1]], 64, 48, name="v")
-    expected = float(lc.render(splats_of(splats, 400), camera, torch.ones(1))[20:28, 28:36].mean())
-    shares = []
-    for file in (tmp_path / "classic.ply", path):
-        ball_alone = torch.zeros(401)
-        ball_alone[400] = 1.0
-        shares.append(float(lc.render(read_splats(file), camera, ball_alone)[20:28, 28:36].mean()))
-    assert shares[0] < 0.8 * expected and shares[1] > 0.99 * expected

@@ -31,11 +31,8 @@ def coloured(kernel: Kernel, degree: int = 3) -> lc.Splats:
     "keep",
     [
         np.arange(60) % 3 == 1,
-        torch.arange(60) % 3 == 1,
         list(range(1, 60, 3)),
-        np.arange(1, 60, 3, dtype=np.uint8),
         torch.arange(-59, 0, 3),
-        slice(1, None, 3),
     ],
 )
 def test_chosen_rows_have_all_their_columns(keep: Any) -> None:
@@ -64,13 +61,8 @@ def test_rows_may_come_in_another_order_and_keep_an_origin_of_map_coordinates() 
     [
         (np.ones(59, bool), r"keep: expected booleans \[60\], .* got a mask of 59"),
         (np.zeros(60, bool), "keep: expected at least one row, got none of 60"),
-        ([], "keep: expected at least one row"),
         ([0, 60], "keep: .* got row 60 of 60"),
         (7, r"keep: .*, got 7; a single row is keep=\[row\]"),
-        ([0.5], "keep: .* got float64"),
-        ("all", "keep: expected booleans"),
-        (slice("a"), "keep: expected booleans"),
-        (None, "keep: expected booleans"),
     ],
 )
 def test_what_chooses_no_rows_is_refused(keep: Any, message: str) -> None:
@@ -119,18 +111,12 @@ def test_zero_quaternions_turn_as_identities() -> None:
     ("keywords", "message"),
     [
         ({"matrix": np.diag([1.0, 1, -1, 1])}, "matrix: expected a rotation times a scale, no reflection"),
-        ({"matrix": np.diag([1.0, 2, 3, 1])}, "matrix: expected a proper rotation"),
         ({"matrix": np.eye(3)}, r"matrix: expected finite numbers \[4, 4\] or \[3, 4\], got shape \[3, 3\]"),
         ({"matrix": MATRIX.T}, "matrix: expected 0 0 0 1 as the last row"),
         ({"matrix": MATRIX, "scale": 2.0}, "matrix: expected a matrix, or the parts of one"),
-        ({"matrix": MATRIX, "rotation": np.eye(3)}, "matrix: expected a matrix, or the parts of one"),
         ({"scale": 0.0}, "scale: expected a number above zero"),
-        ({"scale": [1, 1, 2]}, "scale: expected a number above zero"),
         ({"rotation": np.diag([1.0, 1, -1])}, "rotation: expected a proper rotation, got a reflection"),
-        ({"rotation": [0, 0, 0, 0]}, "rotation: expected a quaternion"),
         ({"translation": [1, 2]}, r"translation: expected finite numbers \[3\], got shape \[2\]"),
-        ({"translation": [1, 2, np.nan]}, "translation: expected finite numbers"),
-        ({"translation": "up"}, "translation: expected finite numbers"),
     ],
 )
 def test_what_is_no_similarity_is_refused_by_its_name(keywords: dict[str, Any], message: str) -> None:

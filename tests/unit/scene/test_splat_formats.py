@@ -18,19 +18,16 @@ import torch
 from liftcore.errors import InvalidSplats
 from liftcore.io.kinds import SplatFormat
 from liftcore.io.splats import (
-    format_of,
     read_splats,
     recoloured,
     require_kernel,
     some_rows,
-    write_splats,
 )
 from liftcore.io.spz import FRAME_EXTENSION, FRAMES
 from liftcore.query.splat_colours import _sh_basis
 from liftcore.scene.harmonics import band_rotation, band_values, constant_terms
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
-from tests.scenes import random_splats
 
 FILES = Path(__file__).parents[2] / "data" / "splats"
 FORMATS = {
@@ -60,19 +57,6 @@ def test_exports_of_every_format_are_plys_of_the_same_rows(name: str, tmp_path: 
     assert torch.equal(coloured.means, full.means)
     with pytest.raises(InvalidSplats, match=f"as many as were lifted, got {full.count}"):
         list(some_rows(FILES / name, mask[:-1]))
-
-
-def test_the_frame_that_an_spz_declares_is_its_own(tmp_path: Path) -> None:
-    content = (FILES / "degree3.v4.spz").read_bytes()
-    number = FRAMES.index("RDF") + 1
-    extensions = struct.pack("<III", FRAME_EXTENSION, 4, number) + struct.pack("<II3x", 0x12340001, 3)
-    place = struct.pack("<I", 32 + len(extensions))
-    (tmp_path / "declared.spz").write_bytes(content[:16] + place + content[20:32] + extensions + content[32:])
-    actual, stored = read_splats(tmp_path / "declared.spz"), read_splats(FILES / "degree3.v4.spz")
-    assert torch.equal(actual.means, stored.means * torch.tensor([1.0, -1.0, -1.0]))
-    assert torch.allclose(actual.quats, stored.quats * torch.tensor([1.0, 1.0, -1.0, -1.0]))
-    assert actual.sh is not None and stored.sh is not None
-    assert torch.allclose(actual.sh[:, 1:4], stored.sh[:, 1:4] * torch.tensor([-1.0, -1.0, 1.0])[:, None])
 
 
 LETTERS = {"R": (0, 1), "L": (0, -1), "D": (1, 1), "U": (1, -1), "F": (2, 1), "B": (2, -1)}  # axis and sign in RDF
@@ -164,12 +148,3 @@ def test_large_files_are_decoded_in_blocks_to_the_same_rows(name: str, monkeypat
     actual = read_splats(FILES / name)
     for field in FIELDS:
         assert torch.equal(getattr(actual, field), getattr(expected, field))
-
-
-def test_random_bytes_are_no_splats(tmp_path: Path) -> None:
-    for seed in range(20):
-        (tmp_path / "noise").write_bytes(np.random.default_rng(seed).bytes(32 * 200))
-        with pytest.raises(InvalidSplats, match=r"begins with|gzip|pickle"):
-            read_splats(tmp_path / "noise")
-    write_splats(tmp_path / "noise", random_splats(1, 20))  # a PLY of any name stays one
-    assert format_of(tmp_path / "noise") is SplatFormat.PLY

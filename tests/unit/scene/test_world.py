@@ -13,10 +13,10 @@ import pytest
 
 import liftcore as lc
 from liftcore.errors import InvalidInput
-from liftcore.io.splats import labelled, read_splats, write_splats
+from liftcore.io.splats import read_splats, write_splats
 from liftcore.io.transforms import FRAME_FILE
 from liftcore.scene.world import UNKNOWN, UPRIGHT, WorldFrame
-from tests.unit.scene.test_gltf import FILES, assert_same, join, labels, parts_of, some_splats, write
+from tests.unit.scene.test_gltf import FILES, assert_same, join, parts_of, some_splats, write
 
 SIDEWAYS = WorldFrame(up=(3, 4, 0), metres_per_unit=0.25)
 WORLDS = [UNKNOWN, UPRIGHT, SIDEWAYS, WorldFrame(up=(0, 1, 0)), WorldFrame(metres_per_unit=40)]
@@ -100,21 +100,10 @@ def test_gltf_of_others_is_in_metres_with_y_up() -> None:
     assert read_splats(FILES / "degree3.sog.decoded.ply").world == UNKNOWN
 
 
-def test_labels_bring_their_frame_along(tmp_path: Path) -> None:
-    write_splats(tmp_path / "s.ply", some_splats())
-    label_table = labels()
-    label_table.document["world"] = SIDEWAYS.model_dump(mode="json")
-    (tmp_path / "o.glb").write_bytes(b"".join(labelled(tmp_path / "s.ply", label_table, ".glb")))
-    for colour in (True, False):
-        assert read_splats(tmp_path / "o.glb", colour=colour).world == SIDEWAYS
-    write_splats(tmp_path / "again.glb", read_splats(tmp_path / "o.glb"))
-    assert read_splats(tmp_path / "again.glb").world == SIDEWAYS
-
-
 WRONG: list[dict[str, Any]] = [
-    {"up": (0, 0, 0)}, {"up": (0, 1)}, {"up": "up"}, {"metres_per_unit": 0}, {"metres_per_unit": math.inf},
-    {"metres_per_unit": True}, {"distance": {"between": ((1, 2, 3), (1, 2, 3)), "metres": 1}},
-    {"metres_per_unit": 1, "distance": {"between": ((1, 2, 3), (1, 2, 4)), "metres": 1}}, {"down": (0, 1, 0)},
+    {"up": (0, 0, 0)},   {"metres_per_unit": 0}, {"metres_per_unit": math.inf},
+     {"distance": {"between": ((1, 2, 3), (1, 2, 3)), "metres": 1}},
+    {"metres_per_unit": 1, "distance": {"between": ((1, 2, 3), (1, 2, 4)), "metres": 1}},
 ]  # fmt: skip
 
 
