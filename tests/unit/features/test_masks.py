@@ -24,7 +24,6 @@ from tests.run_lengths import compressed, lengths_of, sam_records
 LABELS = np.array([[-1, 0, 0, 2], [1, 1, -1, 2], [1, 1, -1, -1]])
 MASKS = np.stack([k == LABELS for k in range(3)])
 VECTORS = np.arange(15, dtype=np.float32).reshape(3, 5)
-OVERLAPPING = np.stack([MASKS[0] | MASKS[1], MASKS[1], MASKS[2]])
 
 
 GREY, VALUES_255 = (LABELS + 1).astype(np.uint8), np.where(LABELS < 0, 255, LABELS).astype(np.uint8)
@@ -81,14 +80,6 @@ def test_every_kind_of_masks_makes_the_same_regions(kind: str, tmp_path: Path) -
 def test_pictures_with_another_value_for_none_number_masks_from_zero(unlabelled, dtype, tmp_path: Path) -> None:
     save(tmp_path, {"a.npy": VECTORS, "a.png": np.where(LABELS < 0, unlabelled, LABELS).astype(dtype)})
     assert mask_views(tmp_path, unlabelled)["a"].labels.tolist() == [LABELS.tolist()]
-
-
-@pytest.mark.parametrize("masks", [{"a_masks.npy": OVERLAPPING}, {"a.json": sam_records(OVERLAPPING)}])
-def test_masks_that_overlap_are_laid_on_levels(masks: dict[str, Any], tmp_path: Path) -> None:
-    save(tmp_path, {"a.npy": VECTORS.astype(np.float16), **masks})
-    first = np.where(OVERLAPPING[0], 0, np.where(OVERLAPPING[2], 2, -1))
-    second = np.where(OVERLAPPING[1], 1, -1)
-    assert mask_views(tmp_path)["a"].labels.tolist() == [first.tolist(), second.tolist()]
 
 
 def test_views_are_named_as_their_cameras_are_and_with_their_folders(tmp_path: Path) -> None:
@@ -160,13 +151,6 @@ def test_every_mask_comes_back_from_both_forms(columns: list[list[bool]]) -> Non
     lengths = lengths_of(mask)
     for counts in (lengths, compressed(lengths)):
         assert np.array_equal(mask_of({"size": [*mask.shape], "counts": counts}), mask)
-
-
-@given(st.lists(st.integers(0, 1 << 20), min_size=1, max_size=40))
-def test_long_runs_come_back(lengths: list[int]) -> None:
-    lengths = [*lengths, 5461 * 32768 - sum(lengths)]
-    mask = read_runs({"size": [5461, 32768], "counts": compressed(lengths)})
-    assert (mask.size, mask.lengths.tolist()) == ((5461, 32768), lengths)
 
 
 @pytest.mark.parametrize(

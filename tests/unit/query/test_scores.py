@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.scores import combine, cosines, cosines_about, mean_direction, norms_of, relevancy
+from liftcore.query.scores import cosines, cosines_about, mean_direction, norms_of
 
 
 def test_texts_in_one_pass_equal_one_by_one_and_no_feature_scores_the_minimum() -> None:
@@ -23,12 +23,6 @@ def test_texts_in_one_pass_equal_one_by_one_and_no_feature_scores_the_minimum() 
     for wrong in (torch.zeros(96), torch.full((96,), torch.nan), torch.ones(95)):
         with pytest.raises(InvalidQuery):
             cosines(features, norms, wrong[None].numpy())
-
-
-def test_relevancy_is_the_least_softmax_over_negatives() -> None:
-    similarities = torch.rand(100, 5, dtype=torch.float64) - 0.5
-    pairs = [torch.softmax(10 * similarities[:, [0, n]], dim=1)[:, 0] for n in range(1, 5)]
-    np.testing.assert_allclose(relevancy(similarities.numpy(), 1), torch.stack(pairs).amin(dim=0).numpy(), rtol=1e-6)
 
 
 @given(
@@ -52,13 +46,3 @@ def test_cosines_about_the_mean_equal_their_definition(seed: int, cone: float, d
     expected = torch.nn.functional.cosine_similarity((unit - mean)[:, None], (unit[:3] - mean)[None], dim=2)
     about = cosines_about(rows, norms, actual, examples.numpy())
     np.testing.assert_allclose(about[norms > 0], expected.numpy()[norms > 0], atol=3e-3)
-
-
-def test_several_positives_are_as_good_as_the_nearest_one() -> None:
-    similarities = torch.rand(100, 5) - 0.5
-    scores = similarities.numpy()
-    assert np.array_equal(combine(scores[:, :3], 3), scores[:, :3].max(axis=1))
-    against = torch.softmax(
-        10 * torch.stack([similarities[:, :3].amax(1), similarities[:, 3:].amax(1)], dim=1), dim=1
-    )
-    np.testing.assert_allclose(relevancy(scores, 3), against[:, 0].numpy(), rtol=1e-5)

@@ -109,25 +109,6 @@ def test_cells_of_grids_take_no_part() -> None:
     assert (consensus_of(W, np.full_like(levels, -1)) == 1.0).all()
 
 
-def test_a_mask_of_two_things_weighs_less() -> None:
-    W, levels = of_things([[0, 1, 2, 3], [0, 1, 2, 3], [0, 1, 2, 3], [0, 0, 1, 2]])
-    consensus = entries(W, mask_consensus(W, levels))
-    merged = int(W.offsets[3])
-    assert (consensus[:30, merged] < 0.7).all()
-    assert (consensus[30:45, merged + 1] > 0.9).all()
-
-
-def test_a_whole_beside_its_parts_is_no_mistake() -> None:
-    parts, wholes = [0, 1, 2, 3], [0, 0, 1, 1]
-    view = np.zeros((SPLATS, 6))
-    for number in range(4):
-        rows = slice(15 * number, 15 * number + 15)
-        view[rows, parts[number]] = view[rows, 4 + wholes[number]] = 1.0
-    W = stacked([of_dense(view)] * 3, SPLATS)
-    levels = np.array([0, 0, 0, 0, 1, 1] * 3, np.int8)
-    np.testing.assert_allclose(consensus_of(W, levels), 1.0, rtol=1e-6)
-
-
 def test_more_tuples_than_the_first_table_holds_are_distinguished() -> None:
     rng = np.random.default_rng(1)
     views, splats = 14, np.arange(SPLATS)
@@ -200,18 +181,3 @@ def test_reliability_and_confidence_equal_their_definition(seed: int) -> None:
     np.testing.assert_allclose(entries(W, (W.weight * got.factors).numpy()), after, rtol=2e-3, atol=1e-5)
     assert got.confidence is not None
     np.testing.assert_allclose(got.confidence.numpy(), confidence, rtol=2e-3, atol=1e-5)
-
-
-def test_a_region_with_a_wrong_word_loses_weight_everywhere() -> None:
-    W, _ = of_things([[0, 1, 2, 3]] * 5)
-    words = torch.eye(4)
-    wrong = words[[1, 1, 2, 3]]  # of the last view's first region
-    books = [words] * 4 + [wrong]
-    without_reliability, with_reliability = (
-        reweighting_of(W, codebook_of(books), masks=mask).factors for mask in (None, all_regions(W))
-    )
-    lying = int(W.offsets[4])
-    assert float(with_reliability[W.region == lying].max()) <= float(without_reliability[W.region == lying].min())
-    got = reweighting_of(W, codebook_of(books), masks=all_regions(W))
-    assert got.confidence is not None
-    assert float(got.confidence[15:].min()) > 0.5

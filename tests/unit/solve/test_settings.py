@@ -12,8 +12,6 @@ from liftcore.errors import InvalidSettings
 from liftcore.values.lift_options import LiftOptions
 from liftcore.values.settings import LiftSettings, Preset
 
-LEVELS = "'rows' or a valid integer"
-
 
 @pytest.mark.parametrize(
     ("name", "value", "expected"),
@@ -39,10 +37,6 @@ def test_json_may_write_whole_numbers_with_a_point() -> None:
     assert isinstance(settings.stride, int)
 
 
-def test_texts_may_stand_for_numbers_on_a_command_line() -> None:
-    assert LiftSettings.of(stride="2", gain="1.5") == LiftSettings.of_json({"stride": 2, "gain": 1.5})
-
-
 @pytest.mark.parametrize("read_settings", [LiftSettings.of_json, lambda values: LiftSettings.of(**values)])
 def test_errors_are_in_the_words_of_settings(read_settings: Any) -> None:
     with pytest.raises(
@@ -61,10 +55,6 @@ def test_published_schema_has_every_setting_and_what_a_new_lift_may_have() -> No
                 LiftSettings.of_json({name: field[end]})
     with pytest.raises(InvalidSettings):
         LiftSettings.of_json({"diagnostic_rays": fields["diagnostic_rays"]["maximum"] + 1})
-
-
-def test_regions_are_kept_from_the_papers_tau_on() -> None:
-    assert LiftSettings.of().aggregation_iou == 0.75  # tau of the paper, Post Aggregation Filtering
 
 
 @pytest.mark.parametrize("preset", list(Preset))

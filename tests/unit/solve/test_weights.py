@@ -12,7 +12,7 @@ import torch
 from liftcore.errors import Unavailable
 from liftcore.values import region_weights as weights
 from liftcore.values.region_weights import RegionWeights, stacked
-from tests.unit.solve.sparse_views import dense, of_dense, random_view
+from tests.unit.solve.sparse_views import of_dense, random_view
 
 SPLATS = 300
 
@@ -25,20 +25,6 @@ def assert_same(actual: RegionWeights, expected: RegionWeights) -> None:
     assert actual.views == expected.views
     for name, view_list in actual.tensors().items():
         assert torch.equal(view_list, getattr(expected, name)), name
-
-
-def test_stacked_views_are_their_matrices_side_by_side():
-    view_list = views()
-    W = stacked(view_list, SPLATS)
-    assert np.array_equal(dense(W, SPLATS), np.hstack([dense(view, SPLATS) for view in view_list]))
-    assert W.indptr.shape == (SPLATS + 1,) and W.splats.tolist() == list(range(SPLATS))
-    assert W.offsets.tolist() == [0, 4, 9, 15, 22, 30]
-    rows = np.split(W.region.numpy(), W.indptr.numpy()[1:-1])
-    assert all((np.diff(row) > 0).all() for row in rows)
-    total_weight = np.bincount(np.concatenate([view.splats.numpy() for view in view_list]), minlength=SPLATS)
-    assert np.array_equal(np.flatnonzero(total_weight), W.total_weight_splats.numpy())
-    assert np.array_equal(total_weight[total_weight > 0], W.total_weight.numpy())
-    np.testing.assert_allclose(W.row_sums().numpy(), dense(W, SPLATS).sum(axis=1), rtol=1e-12)
 
 
 def test_no_view_and_views_without_splats_are_rows_without_entries():

@@ -74,8 +74,6 @@ CHANGES: dict[str, Callable[[lc.Splats], lc.Splats]] = {
     "in another order": lambda splats: splats[::-1],
     "moved": lambda splats: splats.transformed(translation=[0.5, 0, 0]),
     "turned": lambda splats: splats.transformed(rotation=[0.9, 0.1, 0, 0]),
-    "of another scene": lambda splats: random_splats(9, splats.count),
-    "cropped elsewhere": lambda splats: splats[np.r_[1 : splats.count, 0]],
 }
 
 
