@@ -274,7 +274,7 @@ def reweighted(
     if not scene.settings.robust:
         return block.W, None
     scores, consensus = np.zeros((2, block.means.shape[0])), consensus_of(scene, piece, block.W, threads)
-    factors, turns = torch.empty(0), range(len(compared_regions(scene)))
+    factors, turns = torch.empty(0, dtype=torch.float32), range(len(compared_regions(scene)))
     for turn, (W, entries) in zip(turns, by_level(scene, block.W, turns), strict=True):
         part = scene.writable(scene.load(f"cosines-{turn}", piece)["cosines"])
         of_level = None if consensus is None else consensus[entries]

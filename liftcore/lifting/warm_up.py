@@ -29,7 +29,7 @@ def warm_up_lift(kernel: Kernel, device: Device, settings: LiftSettings) -> None
     first, unit = torch.zeros(1, dtype=torch.int32), torch.ones(1, dtype=torch.float32)
     W = one_view(first, torch.tensor([0, 1]), first, unit, first, unit, regions=1)
     geometry = Geometry(W, Codebook((ViewCodebook(unit[None]),)), (), (), np.zeros(1, np.int8))
-    scene = scene_of(geometry, torch.zeros(1, 3), settings, ("view",), threads=1)
+    scene = scene_of(geometry, torch.zeros(1, 3, dtype=torch.float32), settings, ("view",), threads=1)
     algebra = Algebra(scene, LocalEngine(1), silent, 1)
     if settings.objects:
         algebra.find_objects()

@@ -119,7 +119,8 @@ class SceneConsistency:
             sums: [2, M + 1] f64. mask: [M] bool, the regions with a reliability; None: none.
         """
         confirmed, total = sums[:, -1]
-        mean_cosine, regions = float(confirmed / total) if total > 0 else 0.0, torch.ones(sums.shape[1] - 1)
+        mean_cosine = float(confirmed / total) if total > 0 else 0.0
+        regions = torch.ones(sums.shape[1] - 1, dtype=torch.float32)
         if mask is None:
             return cls(mean_cosine, regions, 1.0)
         has_sum, reliable = _reliabilities(sums[:, :-1], mask)

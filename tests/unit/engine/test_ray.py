@@ -104,7 +104,7 @@ def test_workers_and_nodes_may_die(
     expected = in_blocks(LocalEngine(1), stored, settings)
     folder = tmp_path / "killed"
     assert_same(in_blocks(Deadly("auto"), stored, settings, folder=folder), expected)
-    steps = ("compare", "contain", "gather", "label", "relate", "share", "solve", "weigh")
+    steps = ("compare", "contain", "gather", "join", "label", "relate", "share", "solve", "weigh")
     assert sorted(path.name for path in folder.rglob("*.died")) == [f"{step}-1.died" for step in steps]
     third = cluster.add_node(num_cpus=1, object_store_memory=80_000_000)
 
