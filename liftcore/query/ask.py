@@ -40,6 +40,7 @@ from liftcore.query.question import (
 from liftcore.query.scores import LEAST_LIKENESS, LOWEST_COSINE, combine, cosines, cosines_about
 from liftcore.query.selection import (
     LEAST_FIRST,
+    NEAR,
     SAME_WORD,
     CompetingWords,
     add_objects,
@@ -50,7 +51,7 @@ from liftcore.query.selection import (
     part_nodes,
 )
 from liftcore.query.terms import Vector
-from liftcore.query.threshold import explain_no_selection, find_threshold
+from liftcore.query.threshold import explain_no_selection, find_threshold, has_one_mode
 from liftcore.runtime.cores import cores
 from liftcore.runtime.one_thread import one_thread
 from liftcore.text import TextEncoder
@@ -61,6 +62,7 @@ MOST_RIVALS = 3  # competing words in an answer
 LEAST_RIVAL = 0.1  # least share of the selected total weight to which such a word is the nearest
 LEAST_RIVAL_OF_CLEAR = 0.5  # the same for a clear answer
 WHOLE_SHARE = 0.9  # of an object's splats, from which a selection is no part of it
+SAME_AS_WORD = 0.9  # cosine of all splats to a word without competitors, from which all are of it
 _OF_ANSWER = ("rivals", "candidates", "threshold", "clear", "statistics", "present", "presence", "reason")
 _QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 
@@ -389,19 +391,30 @@ def _select(
     """
     query, positives = request.query, len(request.query.positives)
     valid_scores = scores if scene.all_have_features else scores[scene.has_feature]
+    in_words = (request.by_cosine & mask)[:positives]
+    competitors = _competing_words(request, request.rows[:positives][in_words])
+    is_automatic = query.threshold == "auto" and in_words.any() and in_words.sum() == mask[:positives].sum()
+    has_references = bool(competitors) and isinstance(request.references, References)
     lack = explain_no_selection(valid_scores)
+    if lack and is_automatic and valid_scores.any() and _is_all(scene, valid_scores, scores, competitors):
+        return _whole(scene, valid_scores)
     if lack:
         method = query.threshold if isinstance(query.threshold, str) else "fixed"
         threshold = Threshold(value=math.inf, method=method, explanation=lack, clear=False)
         return threshold, np.zeros_like(scene.has_feature)
-    in_words = (request.by_cosine & mask)[:positives]
     least = -math.inf if in_words.any() else LEAST_LIKENESS
     threshold = find_threshold(valid_scores, query.threshold, scene.weights, least)
     selected = scene.has_feature & (scores >= np.float32(threshold.value))
-    competitors = _competing_words(request, request.rows[:positives][in_words])
-    if query.threshold != "auto" or not competitors or in_words.sum() < mask[:positives].sum():
+    if not is_automatic:
+        return threshold, selected
+    if not has_references and has_one_mode(valid_scores, threshold.value, scene.weights):
+        threshold = _whole(scene, valid_scores)[0]
+        selected = scene.has_feature.copy()
+    if not competitors:
         return threshold, selected
     comparison = compare_ranks(scene, scores, threshold.value, competitors[0])
+    if has_references and comparison.rest >= NEAR:
+        return _whole(scene, valid_scores)
     if comparison.lowest > threshold.value:
         retry = find_threshold(valid_scores, "auto", scene.weights, comparison.lowest)
         value = max(retry.value, comparison.lowest)
@@ -424,6 +437,24 @@ def _select(
             update={"explanation": f"{threshold.explanation.removesuffix('.')}; {addition}."}
         )
     return threshold, selected
+
+
+def _is_all(
+    scene: OpenedLift, valid_scores: np.ndarray, scores: np.ndarray, competitors: Sequence[CompetingWords]
+) -> bool:
+    """Return True if equal scores are those of the word: against competing words, or without any by themselves."""
+    if competitors:
+        return compare_ranks(scene, scores, math.inf, competitors[0]).rest >= NEAR
+    return float(valid_scores.min()) >= SAME_AS_WORD
+
+
+def _whole(scene: OpenedLift, valid_scores: np.ndarray) -> tuple[Threshold, np.ndarray]:
+    """Return the threshold of a scene of one thing, and all of its splats, [P] bool."""
+    low, explanation = (
+        float(valid_scores.min()),
+        "No part stands apart, as all is of one thing: it is selected whole.",
+    )
+    return Threshold(value=low, method="auto", explanation=explanation), scene.has_feature.copy()
 
 
 def _select_each(

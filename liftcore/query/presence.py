@@ -47,6 +47,7 @@ LEAST_WORDS = 200  # of a table, to be references
 WORD_STEP = 4  # an encoder without references encodes each 4th of the shipped words: 301 take seconds
 MOST_NEARER = 0.0033  # share of the references that may be nearer to a splat than its own word: synonyms, wrong masks
 _ITSELF = 0.9  # similarity about the mean from which a word is one of the references
+WHOLE = 0.9  # share of a scene, at which a word is among the nearest, from which all of it is of one thing
 RELATED = 0.55  # of the similarity of a word's nearest reference, from which references are left out
 MOST_SPLATS = 256  # of the best ones that are compared, those with the largest total weight
 _FIRST = 1_024  # splats among which the best ones are searched first
@@ -125,6 +126,11 @@ def estimate_presence(
         rows, norms, scene.rough_mean, direction[None], references.vectors[reference_rows]
     )
     shares = [float(weights[counts <= limit].sum() / weights.sum()) for counts in (nearer, contrast)]
+    if (
+        shares[0] >= 0.5 > shares[1]
+        and _near_share(scene, direction, references.vectors[reference_rows], limit) >= WHOLE
+    ):
+        shares[1] = shares[0]  # all is of one thing, so nothing sets its splats apart from the rest
     presence = min(shares)
     if presence >= 0.5:
         facts = f"at {presence:.0%} of its best splats at most {limit} of {count} other words are nearer"
@@ -147,6 +153,15 @@ def estimate_presence(
         )
     reason = f"Whether {name} is there is not sure: {facts}."
     return Presence(present=None, presence=presence, reason=reason, comparison=comparison)
+
+
+def _near_share(scene: OpenedLift, direction: np.ndarray, references: np.ndarray, limit: int) -> float:
+    """Return the share of a scene, by a sample of its splats, at which at most ``limit`` references are nearer."""
+    rows = np.flatnonzero(scene.has_feature)
+    rows = rows[:: -(-len(rows) // MOST_SPLATS) or 1]
+    own_cosines, reference_cosines = products(scene.features[rows], scene.norms[rows], direction[None], references)
+    near = (reference_cosines >= own_cosines).sum(axis=1) <= limit
+    return float(np.average(near, weights=scene.total_weight[rows] + np.float32(1e-30)))
 
 
 def nearer_counts(

@@ -6,6 +6,7 @@ splats above the automatic threshold are compared with other words, of two kinds
 - **Reference words** (`liftcore.query.presence`): for 90 % of the selected total weight the query's word must be
   among the nearest; else a new threshold is searched above the score from which this holds. (With 50 %, a similar and
   no larger object beside the target would pass.)
+  Where the word is among the nearest for as much of the rest, too, the scene is of one thing, and is selected whole.
 - **The other words of a pack** or of a short table are all that its author distinguishes: a splat to which one of
   them is nearer is not selected.
 
@@ -91,6 +92,7 @@ class RankComparison:
 
     lowest: float  # lowest score at or above which the word is among the nearest for NEAR of the total weight
     first: float  # share, of the total weight at which the word is the nearest of all, at or above a threshold
+    rest: float  # share of the total weight below the threshold for which the word is among the nearest
 
 
 def compare_ranks(
@@ -114,6 +116,8 @@ def compare_ranks(
     ranked = np.argsort(nearer[:best], kind="stable")
     middle = nearer[ranked[np.searchsorted(np.cumsum(counts[ranked]), counts[:best].sum() / 2)]]
     near = np.cumsum(np.where(nearer <= max(competitors.nearer_limit, int(middle)), counts, 0.0))
+    below = scores[rows] < np.float32(threshold)
+    rest = counts[below & (nearer <= competitors.nearer_limit)].sum() / max(counts[below].sum(), 1e-30)
     passing = np.flatnonzero(near >= NEAR * sums)
     above = scores[rows] >= np.float32(threshold)
     first = np.where(nearer == 0, counts, 0.0)
@@ -122,7 +126,7 @@ def compare_ranks(
     lowest = scores[rows[last]]
     if passing.size and last + 1 < len(rows):
         lowest = min(lowest, np.nextafter(scores[rows[last + 1]], np.float32(np.inf)))
-    return RankComparison(float(lowest), share)
+    return RankComparison(float(lowest), share, float(rest))
 
 
 def nearest_to_query(scene: OpenedLift, selected: np.ndarray, competitors: CompetingWords) -> np.ndarray:

@@ -23,6 +23,7 @@ from liftcore.query.question import METHODS, Threshold
 BINS = 300
 SMOOTHING = BINS / 64  # bins, standard deviation of the Gaussian that removes a histogram's ripples
 LEAST_SHARE = 3e-4  # of the scores: a smaller share above a threshold is noise (SAM drops masks this small)
+LEAST_DEVIATIONS, LEAST_GAP = 3.0, 0.25  # of a valley's depth, and of the range: less may be one hill by chance
 MOST_SHARE = 0.8  # queries that select four fifths of a scene are rare; .5 to .9 give equal results (docs/method.md)
 
 
@@ -125,6 +126,27 @@ def explain_no_selection(scores: np.ndarray) -> str:
     if high == 0 and low < 0:
         return "No score is above zero: nothing is similar to the query, so nothing is selected."
     return explain_equal_scores(low, high)
+
+
+def has_one_mode(scores: np.ndarray, value: float, weights: np.ndarray | None) -> bool:
+    """Return True if no valley of the scores [n] f32 at a threshold is told from chance, and no wide gap lies there.
+
+    The counts in the valley and in the hills on both sides are compared, each under the width of the smoothing. They
+    are effective ones, ``(sum w)^2 / sum w^2``, as weights [n] differ.
+    """
+    low, high = float(scores.min()), float(scores.max())
+    histogram = _count(scores, low, high, weights)
+    if histogram is None:
+        return True
+    count = (
+        len(scores) if weights is None else float(weights.sum() ** 2 / max(float(np.square(weights).sum()), 1e-30))
+    )
+    expected = histogram.smoothed() * count * 2 * math.sqrt(math.pi) * SMOOTHING
+    place = min(int((value - low) / histogram.width), BINS - 1)
+    hill = min(expected[: place + 1].max(), expected[place:].max())
+    filled = np.flatnonzero(histogram.mass)
+    gap = filled[filled > place].min(initial=BINS) - filled[filled <= place].max(initial=0)
+    return gap < LEAST_GAP * BINS and hill - expected[place] < LEAST_DEVIATIONS * math.sqrt(hill + expected[place])
 
 
 def _count(scores: np.ndarray, low: float, high: float, weights: ArrayLike | None) -> Histogram | None:

@@ -68,6 +68,30 @@ def test_an_answer_says_how_a_phrase_was_read(scene: lc.Scene) -> None:
     assert answer.text == ["red mugs", "bowls"]
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.1, 0.25])
+def test_a_scene_of_one_thing_is_selected_whole_or_not_at_all(noise: float) -> None:
+    alone = scene_with(photo_vectors(["mug"] * 80, noise))
+    answers = {word: alone.ask(word, encoder="lvis", places=False) for word in ("mug", "bowl", "lamp")}
+    assert [answer.count for answer in answers.values()] == [80, 0, 0]
+    assert [answer.present for answer in answers.values()] == [True, False, False]
+    assert "all is of one thing" in answers["mug"].threshold.explanation
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3, 1e-2, 0.1])
+def test_a_valley_between_equals_is_none(noise: float, tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    encoders = [
+        write_table(tmp_path / f"{count}.safetensors", OBJECTS[:count], np.eye(3)[:count]) for count in (1, 3)
+    ]
+    mugs, weights = np.eye(3)[[0] * 80] + noise * rng.normal(size=(80, 3)), rng.exponential(size=80) + 0.01
+    for scene in (scene_with(mugs), scene_with(mugs, weights)):
+        assert [scene.ask("mug", encoder=encoder, places=False).count for encoder in encoders] == [80, 80]
+        assert scene.lift.query(np.eye(3)[0]).count == 80
+    two = mugs.copy()
+    two[:5] += [[-1, 1, 0]]
+    assert [scene_with(two).ask(word, encoder=encoders[1], places=False).count for word in OBJECTS[:2]] == [75, 5]
+
+
 def test_words_of_a_table_are_themselves_whatever_is_in_them(tmp_path: Path) -> None:
     words = ["mug and bowl", "no parking", "bowl on a lamp"]
     scene = scene_with(np.repeat(np.eye(3), SPLATS, axis=0))
