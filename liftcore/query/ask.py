@@ -396,8 +396,8 @@ def _select(
     is_automatic = query.threshold == "auto" and in_words.any() and in_words.sum() == mask[:positives].sum()
     has_references = bool(competitors) and isinstance(request.references, References)
     lack = explain_no_selection(valid_scores)
-    if lack and is_automatic and valid_scores.any() and _is_all(scene, valid_scores, scores, competitors):
-        return _whole(scene, valid_scores)
+    if lack and is_automatic and valid_scores.any() and _are_of_word(scene, valid_scores, scores, competitors):
+        return _select_all(scene, valid_scores)
     if lack:
         method = query.threshold if isinstance(query.threshold, str) else "fixed"
         threshold = Threshold(value=math.inf, method=method, explanation=lack, clear=False)
@@ -408,13 +408,13 @@ def _select(
     if not is_automatic:
         return threshold, selected
     if not has_references and has_one_mode(valid_scores, threshold.value, scene.weights):
-        threshold = _whole(scene, valid_scores)[0]
+        threshold = _select_all(scene, valid_scores)[0]
         selected = scene.has_feature.copy()
     if not competitors:
         return threshold, selected
     comparison = compare_ranks(scene, scores, threshold.value, competitors[0])
     if has_references and comparison.rest >= NEAR:
-        return _whole(scene, valid_scores)
+        return _select_all(scene, valid_scores)
     if comparison.lowest > threshold.value:
         retry = find_threshold(valid_scores, "auto", scene.weights, comparison.lowest)
         value = max(retry.value, comparison.lowest)
@@ -439,7 +439,7 @@ def _select(
     return threshold, selected
 
 
-def _is_all(
+def _are_of_word(
     scene: OpenedLift, valid_scores: np.ndarray, scores: np.ndarray, competitors: Sequence[CompetingWords]
 ) -> bool:
     """Return True if equal scores are those of the word: against competing words, or without any by themselves."""
@@ -448,7 +448,7 @@ def _is_all(
     return float(valid_scores.min()) >= SAME_AS_WORD
 
 
-def _whole(scene: OpenedLift, valid_scores: np.ndarray) -> tuple[Threshold, np.ndarray]:
+def _select_all(scene: OpenedLift, valid_scores: np.ndarray) -> tuple[Threshold, np.ndarray]:
     """Return the threshold of a scene of one thing, and all of its splats, [P] bool."""
     low, explanation = (
         float(valid_scores.min()),

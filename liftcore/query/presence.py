@@ -47,7 +47,7 @@ LEAST_WORDS = 200  # of a table, to be references
 WORD_STEP = 4  # an encoder without references encodes each 4th of the shipped words: 301 take seconds
 MOST_NEARER = 0.0033  # share of the references that may be nearer to a splat than its own word: synonyms, wrong masks
 _ITSELF = 0.9  # similarity about the mean from which a word is one of the references
-WHOLE = 0.9  # share of a scene, at which a word is among the nearest, from which all of it is of one thing
+LEAST_OF_SCENE = 0.9  # share of a scene, at which a word is among the nearest, from which all of it is of one thing
 RELATED = 0.55  # of the similarity of a word's nearest reference, from which references are left out
 MOST_SPLATS = 256  # of the best ones that are compared, those with the largest total weight
 _FIRST = 1_024  # splats among which the best ones are searched first
@@ -128,7 +128,7 @@ def estimate_presence(
     shares = [float(weights[counts <= limit].sum() / weights.sum()) for counts in (nearer, contrast)]
     if (
         shares[0] >= 0.5 > shares[1]
-        and _near_share(scene, direction, references.vectors[reference_rows], limit) >= WHOLE
+        and _near_share(scene, direction, references.vectors[reference_rows], limit) >= LEAST_OF_SCENE
     ):
         shares[1] = shares[0]  # all is of one thing, so nothing sets its splats apart from the rest
     presence = min(shares)

@@ -144,8 +144,8 @@ def has_one_mode(scores: np.ndarray, value: float, weights: np.ndarray | None) -
     expected = histogram.smoothed() * count * 2 * math.sqrt(math.pi) * SMOOTHING
     place = min(int((value - low) / histogram.width), BINS - 1)
     hill = min(expected[: place + 1].max(), expected[place:].max())
-    filled = np.flatnonzero(histogram.mass)
-    gap = filled[filled > place].min(initial=BINS) - filled[filled <= place].max(initial=0)
+    filled_bins = np.flatnonzero(histogram.mass)
+    gap = filled_bins[filled_bins > place].min(initial=BINS) - filled_bins[filled_bins <= place].max(initial=0)
     return gap < LEAST_GAP * BINS and hill - expected[place] < LEAST_DEVIATIONS * math.sqrt(hill + expected[place])
 
 

@@ -70,8 +70,8 @@ def test_an_answer_says_how_a_phrase_was_read(scene: lc.Scene) -> None:
 
 @pytest.mark.parametrize("noise", [0.0, 0.1, 0.25])
 def test_a_scene_of_one_thing_is_selected_whole_or_not_at_all(noise: float) -> None:
-    alone = scene_with(photo_vectors(["mug"] * 80, noise))
-    answers = {word: alone.ask(word, encoder="lvis", places=False) for word in ("mug", "bowl", "lamp")}
+    mugs = scene_with(photo_vectors(["mug"] * 80, noise))
+    answers = {word: mugs.ask(word, encoder="lvis", places=False) for word in ("mug", "bowl", "lamp")}
     assert [answer.count for answer in answers.values()] == [80, 0, 0]
     assert [answer.present for answer in answers.values()] == [True, False, False]
     assert "all is of one thing" in answers["mug"].threshold.explanation
