@@ -473,7 +473,7 @@ def _check_features(
     """Measure features: medians over some views, and messages of what is wrong."""
     views = pair(features, cameras)[0]
     grids: list[np.ndarray] = []
-    rows: list[tuple[float, float]] = []
+    rows: list[list[float]] = []
     for name in evenly_spaced(views.views, VIEWS):
         observed = views[name]
         if isinstance(observed, FeatureGrid):
@@ -547,7 +547,7 @@ def _likeness(views: Views, camera: Camera, file: Path) -> float:
         np.concatenate([np.linalg.norm(np.diff(values, axis=axis), axis=2).ravel() for axis in (0, 1)])
         for values in (cells, colours)
     ]
-    return float(np.corrcoef(*changes)[0, 1]) if min(map(np.ptp, changes)) > 0 else 0.0
+    return float(np.corrcoef(np.stack(changes))[0, 1]) if min(map(np.ptp, changes)) > 0 else 0.0
 
 
 def _edges(labels: np.ndarray, photo: np.ndarray) -> float:

@@ -94,7 +94,7 @@ class Regions:
                 level overlap; or as the constructor has it.
         """
         argument = f"{context} masks".strip()
-        if not len(masks) and np.ndim(vectors) == 2 and not len(vectors):  # nothing was found in this view
+        if np.ndim(vectors) == 2 and not len(vectors) and np.shape(masks)[:1] == (0,):  # nothing was found here
             size = np.shape(masks)[-2:] if np.ndim(masks) >= 3 else (1, 1)
             return cls(np.full(size, NO_LABEL, np.int32), np.zeros((1, vectors.shape[1]), np.float32))
         try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import liftcore as lc
 import numpy as np
@@ -31,7 +32,7 @@ def scene() -> tuple[lc.Splats, lc.Cameras, np.ndarray]:
     rng, count = np.random.default_rng(2), 2500
     means = np.zeros((count, 3), np.float32)
     means[:, :2] = np.stack(np.meshgrid(*[np.linspace(-1.96, 1.96, 50)] * 2), axis=-1).reshape(-1, 2)
-    patches, quats = patch_of(means[:, 0], means[:, 1]), np.tile(np.float32([1, 0, 0, 0]), (count, 1))
+    patches, quats = patch_of(means[:, 0], means[:, 1]), np.tile(np.eye(1, 4, dtype=np.float32), (count, 1))
     sh = ((COLOURS[patches] - 0.5) / 0.28209479).astype(np.float32)[:, None]
     sizes, logits = np.full((count, 3), -3.2, np.float32), np.full(count, 4, np.float32)
     centres = rng.normal((0, 0, -3.2), (0.7, 0.7, 0.2), (6, 3))
@@ -56,7 +57,7 @@ def map_of(camera: lc.Camera, fit: str) -> np.ndarray:
     return np.eye(16, dtype=np.float32)[patches]
 
 
-def share_right(scene: tuple[lc.Splats, lc.Cameras, np.ndarray], true_fit: str, fit: str) -> float:
+def share_right(scene: tuple[lc.Splats, lc.Cameras, np.ndarray], true_fit: str, fit: Any) -> float:
     splats, cameras, patches = scene
     views = {name: lc.FeatureGrid(map_of(camera, true_fit), fit=fit) for name, camera in cameras.items()}
     result = lc.lift(splats, cameras, views, preset="row-sum", progress=False)

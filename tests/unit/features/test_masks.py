@@ -104,7 +104,7 @@ EMPTY_FILES: dict[str, dict[str, Any]] = {
 def test_view_in_which_nothing_was_found_has_no_label(kind: str, tmp_path: Path) -> None:
     save(tmp_path, {"a.npy": VECTORS, "a_masks.npy": MASKS, **EMPTY_FILES[kind]})
     pack_folder(tmp_path, tmp_path / "p.safetensors", "masks")
-    views = read_features(tmp_path / "p.safetensors")
+    views: Any = read_features(tmp_path / "p.safetensors")
     assert (views["b"].labels == -1).all() and views["b"].codebook.shape[1] == 5
     assert views["a"].labels.max() == 2
     warnings = inspect_file(tmp_path / "p.safetensors", "features")["warnings"]
