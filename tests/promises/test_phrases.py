@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import liftcore as lc
 import numpy as np
@@ -86,7 +87,8 @@ def test_a_valley_between_equals_is_none(noise: float, tmp_path: Path) -> None:
     mugs, weights = np.eye(3)[[0] * 80] + noise * rng.normal(size=(80, 3)), rng.exponential(size=80) + 0.01
     for scene in (scene_with(mugs), scene_with(mugs, weights)):
         assert [scene.ask("mug", encoder=encoder, places=False).count for encoder in encoders] == [80, 80]
-        assert scene.lift.query(np.eye(3)[0]).count == 80
+        lift: Any = scene.lift
+        assert lift.query(np.eye(3)[0]).count == 80
     two = mugs.copy()
     two[:5] += [[-1, 1, 0]]
     assert [scene_with(two).ask(word, encoder=encoders[1], places=False).count for word in OBJECTS[:2]] == [75, 5]
