@@ -250,6 +250,7 @@ def test_answer_is_corrected_by_hand_and_undone(page: Browser) -> None:
     page.press("#by-hand")
     page.until(is_done.format(0))
     assert page.value("splatlift.query.current.count") == lamp
+    assert page.value("document.querySelector('#hand').hidden") is False
     x, y = splat_at(page, APPLE)
     page.drag("#scene", (x, y - 0.2), (x, y + 0.2))
     page.until(is_done.format(1))

@@ -70,6 +70,7 @@ export class SelectionEditor {
     const { lift, ...query } = this.query.requestBody(now);
     try {
       this.setSelection(await post(`/lifts/${lift}/selections`, { name: this.questionLabel(now).slice(0, 100), edit: { operation: "set", query } }));
+      this.setOpen(true);
       this.setTool("brush");
       await this.query.askSets([`selection:${this.selection.id}`]);
     } catch (problem) { notify(problemText(problem), true); }
