@@ -160,20 +160,13 @@ class Camera:
             viewmat[3] = pose_matrix[3]  # refused if it is no pose's
         return cls(viewmat, K, width, height, name=name)
 
-    def transformed(
-        self,
-        matrix: Numbers | None = None,
-        *,
-        scale: float = 1.0,
-        rotation: Numbers | None = None,
-        translation: Numbers | None = None,
-    ) -> Camera:
+    def transformed(self, matrix: Numbers) -> Camera:
         """Return the camera in another frame of the world, ``p' = scale R p + translation`` (`Splats.transformed`).
 
         Raises:
             InvalidInput: it is no similarity.
         """
-        move = Similarity.of(matrix, scale, rotation, translation)
+        move = Similarity.of(matrix)
         rotation_product = self.viewmat[:3, :3] @ move.rotation.T
         pose = np.eye(4)
         pose[:3, :3] = rotation_product
@@ -418,24 +411,14 @@ class Cameras(Mapping[str, Camera]):
         listing = ", ".join(repr(name[-NAME_SHOWN:]) for name in list(self)[:2]) + (", ..." if len(self) > 2 else "")
         return one_line(self, f"{len(self)} views: {listing}")
 
-    def transformed(
-        self,
-        matrix: Numbers | None = None,
-        *,
-        scale: float = 1.0,
-        rotation: Numbers | None = None,
-        translation: Numbers | None = None,
-    ) -> Cameras:
+    def transformed(self, matrix: Numbers) -> Cameras:
         """Return all cameras in another frame of the world (`Camera.transformed`).
 
         Raises:
             InvalidInput: it is no similarity.
         """
-        cameras = [
-            camera.transformed(matrix, scale=scale, rotation=rotation, translation=translation)
-            for camera in self.values()
-        ]
-        world = self.world.transformed(Similarity.of(matrix, scale, rotation, translation))
+        cameras = [camera.transformed(matrix) for camera in self.values()]
+        world = self.world.transformed(Similarity.of(matrix))
         return Cameras(cameras, world=world, warnings=self.warnings)
 
     @property

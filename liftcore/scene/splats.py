@@ -235,27 +235,19 @@ class Splats:
         extras = {name: column[rows.to(column.device)] for name, column in self.extras.items()}
         return replace(self, **columns, extras=extras)
 
-    def transformed(
-        self,
-        matrix: Numbers | None = None,
-        *,
-        scale: float = 1.0,
-        rotation: Numbers | None = None,
-        translation: Numbers | None = None,
-    ) -> Splats:
+    def transformed(self, matrix: Numbers) -> Splats:
         """Return the splats in another frame, ``p' = scale R p + translation``: places, sizes, turns and colours.
 
         Spherical harmonics of all degrees, the lobes of DBS and normals turn with them, so that cameras moved alike
         (`Camera.transformed`) see the same.
 
         Args:
-            matrix: [4, 4], (s R | t); or its parts,
-            scale: above zero. rotation: [3, 3], or a quaternion [4] w x y z. translation: [3], scene units.
+            matrix: [4, 4] or [3, 4], (s R | t), scene units.
 
         Raises:
             InvalidInput: it is no similarity, such as a reflection or a scale for each axis.
         """
-        move = Similarity.of(matrix, scale, rotation, translation)
+        move = Similarity.of(matrix)
         turn, place = torch.from_numpy(move.rotation), self.means.device
         fields: dict[str, Any] = {"log_scales": (self.log_scales.double() + math.log(move.scale)).float()}
         origin = None

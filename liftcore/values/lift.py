@@ -166,14 +166,7 @@ class Lift:
         }
         return replace(self, **columns, metadata=self.metadata.model_copy(update=changes))
 
-    def transformed(
-        self,
-        matrix: Numbers | None = None,
-        *,
-        scale: float = 1.0,
-        rotation: Numbers | None = None,
-        translation: Numbers | None = None,
-    ) -> Self:
+    def transformed(self, matrix: Numbers) -> Self:
         """Return the lift of splats that were moved alike (`Splats.transformed`), ``p' = scale R p + translation``.
 
         Features, total weight and objects know no frame and stay. What it remembers of places moves along; it forgets
@@ -183,7 +176,7 @@ class Lift:
 
         from liftcore.scene.similarity import Similarity
 
-        move, metadata = Similarity.of(matrix, scale, rotation, translation), self.metadata
+        move, metadata = Similarity.of(matrix), self.metadata
         rows, places = [row for row, *_ in metadata.landmarks], [place for _, *place in metadata.landmarks]
         positions = move.points(np.array(places).reshape(-1, 3)).tolist()
         changes = {

@@ -425,7 +425,7 @@ def test_colours_turn_with_their_splats() -> None:
     """The harmonics of degree 1 are a vector along which a colour grows: it turns as positions do."""
     splats = random_splats(5, 20, degree=1)
     rotation = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
-    moved_splats = splats.transformed(rotation=rotation)
+    moved_splats = splats.transformed(np.column_stack([rotation, np.zeros(3)]))
     assert splats.sh is not None and moved_splats.sh is not None
     gradients = [-sh[:, [3, 1, 2]].numpy() * np.array([1, 1, -1])[:, None] for sh in (splats.sh, moved_splats.sh)]
     np.testing.assert_allclose(gradients[1], np.einsum("ij,njc->nic", rotation, gradients[0]), atol=1e-5)

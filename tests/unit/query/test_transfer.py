@@ -9,10 +9,11 @@ import torch
 from liftcore.errors import InvalidSplats
 from liftcore.query.result import LiftResult
 from liftcore.query.scene import Scene
-from liftcore.scene.similarity import Similarity
+from liftcore.scene.quaternions import rotation_matrices
 from liftcore.scene.splats import Splats
 
-MOVE = {"scale": 2.5, "rotation": (0.8, 0.2, -0.4, 0.3), "translation": (10.0, -4.0, 7.0)}
+TURN = rotation_matrices(np.array((0.8, 0.2, -0.4, 0.3)))
+MATRIX = np.column_stack([2.5 * TURN, (10.0, -4.0, 7.0)])
 
 
 @pytest.fixture
@@ -59,10 +60,8 @@ def test_splats_of_elsewhere_find_no_partner_and_have_no_feature(lifted: tuple[L
 def test_a_moved_scene_needs_the_matrix_of_its_motion(lifted: tuple[LiftResult, Splats]) -> None:
     result, splats = lifted
     order = np.random.default_rng(2).permutation(splats.count)
-    transformed = splats[order].transformed(**MOVE)
-    move = Similarity.of(**MOVE)
-    matrix = np.column_stack([move.scale * move.rotation, move.translation])
-    other = result.transferred(splats, transformed, matrix=matrix)
+    transformed = splats[order].transformed(MATRIX)
+    other = result.transferred(splats, transformed, matrix=MATRIX[:3])
     assert torch.equal(other.features, result.features[order]) and not other.metadata.cameras.path
     with pytest.raises(InvalidSplats, match="give the matrix"):
         result.transferred(splats, transformed)

@@ -88,7 +88,7 @@ def test_a_file_of_another_program_is_read_as_the_ply_that_it_was_made_of(tmp_pa
 def test_what_the_format_has_no_word_for_is_kept(tmp_path: Path) -> None:
     splats = replace(some_splats(), render_mode="antialiased")
     assert read_splats(write(tmp_path / "s.glb", splats)).antialiased
-    far = some_splats().transformed(translation=(500_000.0, 5_400_000.0, 300.0))
+    far = some_splats().transformed(np.column_stack([np.eye(3), (500_000.0, 5_400_000.0, 300.0)]))
     assert any(far.origin)
     assert_same(read_splats(write(tmp_path / "s.glb", far)), far)
 
@@ -105,9 +105,9 @@ def test_nodes_move_what_they_hold(tmp_path: Path) -> None:
     scene = read_splats(join(tmp_path / "moved.glb", document, binary))
     assert scene.count == 2 * P
     in_our_frame = TO_FILE @ turn @ TO_FILE
-    assert_same(scene[:P], splats.transformed(scale=2.0, rotation=in_our_frame, translation=TO_FILE @ [1, 2, 3]))
+    assert_same(scene[:P], splats.transformed(np.column_stack([2 * in_our_frame, TO_FILE @ [1, 2, 3]])))
     shift = TO_FILE @ (turn @ [5, 0, 0] + [1, 2, 3])
-    assert_same(scene[P:], splats.transformed(rotation=in_our_frame, translation=shift))
+    assert_same(scene[P:], splats.transformed(np.column_stack([in_our_frame, shift])))
 
 
 def labels() -> Labels:

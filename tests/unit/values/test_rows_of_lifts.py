@@ -12,7 +12,7 @@ from liftcore.values.lift import InputFile
 from liftcore.values.lift_file import found_input, input_file
 from tests.scenes import random_camera, random_splats, write_scene
 
-MOVE = {"scale": 2.0, "rotation": np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), "translation": [1.0, 2.0, 3.0]}
+MATRIX = {"scale": 2.0, "rotation": np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), "translation": [1.0, 2.0, 3.0]}
 
 
 @pytest.fixture(scope="module")
@@ -62,9 +62,9 @@ def test_objects_and_clusters_without_splats_go_and_the_others_are_numbered_anew
 
 def test_a_lift_moves_with_its_splats(scene) -> None:
     splats, _, result = scene
-    transformed = result.transformed(**MOVE)
+    transformed = result.transformed(MATRIX)
     assert torch.equal(transformed.features, result.features) and transformed.metadata.poses == ""
-    answer = transformed.query(np.eye(1, 6), splats=splats.transformed(**MOVE))
+    answer = transformed.query(np.eye(1, 6), splats=splats.transformed(MATRIX))
     assert np.array_equal(answer.selected, result.query(np.eye(1, 6), splats=splats).selected)
     with pytest.raises(lc.InvalidSplats, match=r"row for row, got others: .*result\.transformed"):
         transformed.query(np.eye(1, 6), splats=splats)
@@ -72,8 +72,8 @@ def test_a_lift_moves_with_its_splats(scene) -> None:
 
 CHANGES: dict[str, Callable[[lc.Splats], lc.Splats]] = {
     "in another order": lambda splats: splats[::-1],
-    "moved": lambda splats: splats.transformed(translation=[0.5, 0, 0]),
-    "turned": lambda splats: splats.transformed(rotation=[0.9, 0.1, 0, 0]),
+    "moved": lambda splats: splats.transformed([[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0]]),
+    "turned": lambda splats: splats.transformed([[1, 0, 0, 0], [0, 0.8, -0.6, 0], [0, 0.6, 0.8, 0]]),
 }
 
 
