@@ -209,34 +209,18 @@ def add_world(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--metres-per-unit", type=float, metavar="M", help="length of a scene unit; default: likewise"
     )
-    distance_help = "instead of --metres-per-unit: two points, and their distance in metres"
-    parser.add_argument(
-        "--distance", type=float, nargs=7, metavar=("X", "Y", "Z", "X2", "Y2", "Z2", "METRES"), help=distance_help
-    )
 
 
 def world_of(options: argparse.Namespace) -> WorldFrame:
     """Return the frame of the splats from the options.
 
     Raises:
-        InvalidInput: a zero direction, a length not above zero, or two lengths of a unit.
+        InvalidInput: a zero direction, or a length not above zero.
     """
     from liftcore import WorldFrame
 
-    values: dict[str, Any] = {"up": options.up, "metres_per_unit": options.metres_per_unit}
-    if options.distance is not None and options.metres_per_unit is not None:
-        raise InvalidInput("--distance", expected="one of --distance and --metres-per-unit", got="both")
-    if options.distance is not None:
-        *points, metres = options.distance
-        values["distance"] = {"between": (points[:3], points[3:]), "metres": metres}
-    with option_errors(
-        {
-            "up": "--up",
-            "metres_per_unit": "--metres-per-unit",
-            **dict.fromkeys(("distance", "distance.between", "distance.metres"), "--distance"),
-        }
-    ):
-        return WorldFrame(**values)
+    with option_errors({"up": "--up", "metres_per_unit": "--metres-per-unit"}):
+        return WorldFrame(up=options.up, metres_per_unit=options.metres_per_unit)
 
 
 def open_lift(options: argparse.Namespace) -> Scene:

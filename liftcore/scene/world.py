@@ -1,16 +1,16 @@
 """Direction of up in a scene, and length of its unit, as far as they are known.
 
 Splats and COLMAP's models have neither. glTF and USD have both, nerfstudio's frames the up axis; users can set it
-(``--up``, ``--metres-per-unit``, a distance that they know). Nothing is estimated. Without it sizes and distances are
+(``--up``, ``--metres-per-unit``). Nothing is estimated. Without it sizes and distances are
 in scene units, and no object is on another.
 """
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, ConfigDict, Field
 from pydantic_core import PydanticCustomError
 
 from liftcore.errors import InvalidInput
@@ -35,22 +35,6 @@ def _direction(direction: Point) -> Point:
     return x, y, z
 
 
-def _check_points(points: tuple[Point, Point]) -> tuple[Point, Point]:
-    if not 1 / LARGEST <= math.dist(*points) <= LARGEST:
-        raise _wrong("two points x y z, finite and apart")
-    return points
-
-
-class KnownDistance(Body):
-    """Two points of a scene, and their distance."""
-
-    model_config = ConfigDict(frozen=True)
-    between: Annotated[tuple[Point, Point], AfterValidator(_check_points)] = Field(
-        description="two points, x y z each, in the frame of the splats"
-    )
-    metres: Positive = Field(description="from one to the other")
-
-
 class WorldFrame(Body):
     """Direction of up and length of a unit in the frame of some splats; null is not known."""
 
@@ -61,27 +45,6 @@ class WorldFrame(Body):
         default=None, description="the direction against gravity, in the frame of the splats"
     )
     metres_per_unit: Positive | None = Field(default=None, description="the length of a scene unit")
-    distance: KnownDistance | None = Field(
-        default=None, exclude=True, description="in place of metres_per_unit: two points whose distance is known"
-    )
-
-    @field_validator("distance")
-    @classmethod
-    def _check_unit_or_distance(cls, distance: KnownDistance | None, info: ValidationInfo) -> KnownDistance | None:
-        if distance is not None and info.data.get("metres_per_unit") is not None:
-            raise _wrong("either a distance or metres per unit, not both")
-        return distance
-
-    @model_validator(mode="after")
-    def _apply_distance(self) -> Self:
-        if self.distance is None:
-            return self
-        metres = self.distance.metres / math.dist(*self.distance.between)
-        changes = {"metres_per_unit": min(max(metres, 1 / LARGEST), LARGEST), "distance": None}
-        for name, value in changes.items():
-            object.__setattr__(self, name, value)
-        self.model_fields_set.symmetric_difference_update(changes)
-        return self
 
     @property
     def unit(self) -> Literal["metres", "scene units"]:

@@ -71,7 +71,6 @@ REFUSALS = {  # words behind the lift -> what the line says
     "segment --table {t} --example nothing": "--example: expected",
     "objects --vocabulary nope --table {t}": "--vocabulary: expected a file of words",
     "objects --csv {m}.xlsx": "ending in .csv",
-    "objects --distance 0 0 0 1 0 0 2 --metres-per-unit 2": "one of --distance and --metres-per-unit, got both",
 }
 
 
