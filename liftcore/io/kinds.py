@@ -106,11 +106,8 @@ class FileKind:
         return "" if self.format is None else SUFFIX[self.format]
 
 
-_WEB_PAGE = FileKind(None, "a web page", DOWNLOAD)
-_VIEWER = FileKind(
-    None,
-    "a web page that shows splats",
-    "export them from SuperSplat's editor as .ply or .sog in place of the viewer",
+_WEB_PAGE = FileKind(
+    None, "a web page", f"{DOWNLOAD}; of a viewer export the splats as .ply or .sog, from SuperSplat's editor"
 )
 _GLTF = FileKind(None, "a glTF model without splats (KHR_gaussian_splatting)", f"a mesh has none: {NOT_CONVERTED}")
 _USD = FileKind(
@@ -167,7 +164,7 @@ _MAGIC: tuple[tuple[int, bytes, FileKind], ...] = (
 _BY_SUFFIX: dict[str, FileKind] = {
     ".ksplat": FileKind(None, "splats in GaussianSplats3D's .ksplat format", CONVERT),
     **dict.fromkeys((".usdz", ".usdc", ".usda", ".usd"), _USD),
-    **dict.fromkeys((".html", ".htm"), _VIEWER),
+    **dict.fromkeys((".html", ".htm"), _WEB_PAGE),
     **dict.fromkeys((".obj", ".fbx", ".stl"), _MESH),
     **dict.fromkeys((".las", ".laz", ".e57", ".pcd", ".xyz"), _CLOUD),
     **dict.fromkeys((".mp4", ".mov", ".avi", ".mkv", ".webm"), _VIDEO),
@@ -178,10 +175,6 @@ _BY_SUFFIX: dict[str, FileKind] = {
     **dict.fromkeys((".gz", ".tgz", ".bz2", ".xz", ".zst", ".tar", ".7z", ".rar"), _ARCHIVE),
 }
 _COLMAP_POINTS = ("points3D.bin", "points3D.txt", "frames.bin", "rigs.bin", "frames.txt", "rigs.txt")
-_TRAINERS = {  # by what lies in their folders
-    "cfg_args": "3DGS's trainer", "ckpts/": "gsplat's trainer", "nerfstudio_models/": "nerfstudio",
-    "point_cloud/iteration_": "3DGS's trainer",
-}  # fmt: skip
 _STEP = re.compile(r"(?:iteration|point_cloud|export|step|ckpt|splat)s?[_-]?0*([0-9]+)")
 _CHECKPOINT = re.compile(r"(^|/)(ckpt_[0-9]+[^/]*\.pt|step-[0-9]+\.ckpt)$")
 _NO_SCENE = re.compile(r"(^|/)(points?3d|sparse_pc|input|fused|dense|mesh|poisson|meshed)[^/]*\.ply$", re.IGNORECASE)
@@ -348,12 +341,11 @@ def _by_magic(head: bytes) -> FileKind | None:
 def _by_text(path: Path, head: bytes, size: int) -> FileKind | None:
     """Return the kind of a text: JSON, a page, a mesh, COLMAP's text, or a server's error."""
     start = head[:HEAD_BYTES].lstrip(b"\xef\xbb\xbf \t\r\n")
-    lower, suffix = start.lower(), path.suffix.lower()
+    lower = start.lower()
     if start[:1] in (b"{", b"["):
         return _json(path, size)
     if lower.startswith((b"<!doctype html", b"<html", b"<head", b"<!--")):
-        is_viewer = suffix in (".html", ".htm") or (size > HEAD_BYTES and b"splat" in head.lower())
-        return _VIEWER if is_viewer else _WEB_PAGE
+        return _WEB_PAGE
     if re.match(rb"#[^\n]*list with one line of data per", lower):
         return _colmap_part(path)
     return None
@@ -411,8 +403,6 @@ def _object_rules(document: dict[str, Any], path: Path) -> Iterator[FileKind | N
     hint = "'splatlift pack prompts' makes a feature pack of its folder"
     yield FileKind(None, "masks as JSON (COCO)", hint) if keys >= {"annotations", "images"} else None
     yield _BY_SUFFIX.get(path.suffix.lower())
-    is_answer = len(keys) <= 6 and keys & {"error", "errors", "detail", "message", "Message"}
-    yield FileKind(None, f"an answer of a server ({str(document)[:TEXT_SHOWN]!r})", DOWNLOAD) if is_answer else None
     listing = ", ".join(map(str, list(keys)[:5]))[:TEXT_SHOWN]
     yield FileKind(None, f"a JSON object with {listing or 'nothing'}", recognised=False)
 
@@ -509,9 +499,9 @@ def _folder_rules(path: Path) -> Iterator[FileKind | None]:
     yield _STREAMED if (path / LOD_META).is_file() else None
     names = _names_below(path)
     splats = _splat_files(names, lambda name: _has_splats(path / name))
-    folder_name = _folder_name(names, splats)
-    yield FileKind("cameras", folder_name or "a folder of cameras", splats=splats) if _has_cameras(path) else None
-    yield FileKind(None, folder_name or "a folder", f"give {path / splats[0]}", splats=splats) if splats else None
+    label = f"a folder with {len(splats)} files of splats in it" if len(splats) > 1 else ""
+    yield FileKind("cameras", label or "a folder of cameras", splats=splats) if _has_cameras(path) else None
+    yield FileKind(None, label or "a folder of splats", f"give {path / splats[0]}", splats=splats) if splats else None
     suffixes = {PurePosixPath(name).suffix.lower() for name in names}
     is_langsplat = all(any(name.endswith(end) for name in names) for end in ("_f.npy", "_s.npy"))
     hint = f"'splatlift pack langsplat {path} -o PACK.safetensors' makes a feature pack of it"
@@ -538,15 +528,6 @@ def _has_splats(path: Path) -> bool:
     with suppress(OSError), open_regular(path) as handle:
         return _begins_with_splats(handle.read(MAX_HEADER_BYTES))
     return False
-
-
-def _folder_name(names: Sequence[str], splats: Sequence[str]) -> str:
-    """Return the trainer of a folder, as far as that shows, and how many files of splats are in it."""
-    trainer = next((program for sign, program in _TRAINERS.items() if any(sign in name for name in names)), None)
-    if trainer is None and any(re.search(r"(^|/)export_[0-9]+\.ply$", name) for name in names):
-        trainer = "Brush"
-    label = f"a folder of {trainer}" if trainer else "a folder" if len(splats) > 1 else ""
-    return f"{label} with {len(splats)} files of splats in it" if len(splats) > 1 else label
 
 
 def _names_below(folder: Path) -> list[str]:
