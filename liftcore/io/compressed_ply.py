@@ -25,7 +25,7 @@ SH_RANGE = 8.0  # of a higher harmonic, from -4 to 4
 def read_compressed_ply(path: Path, *, colour: bool = True) -> Fields:
     """Read the fields of a compressed PLY."""
     head, size = read_head(path)
-    lines, elements, offset = parse_elements(head, str(path))
+    lines, elements, offset = parse_elements(head)
     mode, warnings = mode_of_comments(lines)
     tables: dict[str, np.ndarray] = {}
     total = offset + sum(element.count * element.dtype.itemsize for element in elements)

@@ -13,14 +13,14 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from liftcore.errors import InvalidSplats
+from liftcore.errors import InvalidSplats, reading
 from liftcore.io.files import open_regular
 from liftcore.runtime.one_line import join_names
 from liftcore.scene.harmonics import SH_C0, constant_terms
@@ -103,16 +103,15 @@ def read_ply(path: Path, kernel: Kernel | str = "auto", *, colour: bool = True) 
     if mode is None:
         mode = RenderMode(RenderModel.ANTIALIASED, MIP_SPLATTING) if FILTER in header.names else mode_beside(path)
     kernel = recognise_kernel(header.names, mode) if kernel == "auto" else kernel_named(kernel)
-    slots = model_slots(header.names, kernel, str(path))
+    slots = model_slots(header.names, kernel)
     warnings += (*tail_warnings(header.tail), *unread_warnings(header.names, slots))
     for name in slots:
         code = header.dtype[name].str[1:]
         if code not in ("f4", "f8"):
             hint = "quantised splats must be exported as plain ones"
-            argument = f"{path} property {name!r}"
-            raise InvalidSplats(argument, expected="float or double", got=SPELLING[code], hint=hint)
+            raise ValueError(f"float or double as property {name!r}, got {SPELLING[code]}; {hint}")
     if header.count == 0:
-        raise InvalidSplats(str(path), expected="at least one splat", got="an empty scene")
+        raise ValueError("at least one splat, got an empty scene")
     extra_names = [name for name in header.names if name not in slots]
     if not colour:
         slots = {name: slot for name, slot in slots.items() if slot.field not in COLOUR}
@@ -143,7 +142,8 @@ def ply_blocks(splats: Splats) -> Iterator[bytes]:
     columns = _columns_of(splats, layout)
     source = None
     if splats.header:  # describes the columns unless the layout was changed
-        header = parse_header(header_bytes(splats.header), "header")
+        with reading("header", InvalidSplats, "the header of a PLY"):
+            header = parse_header(header_bytes(splats.header))
         source = header if header.names == splats.layout else None
     codes = {name: source.dtype[name].str[1:] if source else "f4" for name in layout}
     positions = () if source else "xyz"  # doubles where there is an origin
@@ -165,19 +165,22 @@ def ply_blocks(splats: Splats) -> Iterator[bytes]:
 
 
 def some_rows(path: Path, mask: np.ndarray) -> Iterator[bytes]:
-    """Yield a PLY with some of its rows, byte for byte, a block of rows at a time.
-
-    Args:
-        path: the file.
-        mask: [P] bool, the rows to keep, in the order of the file.
-
-    Yields:
-        The bytes of the copy, in blocks.
-    """
+    """Yield a PLY with some of its rows, those of a mask [P], byte for byte, a block of rows at a time."""
     header = _header_of(path, len(mask))
-    yield header_bytes(header.lines_for(int(np.count_nonzero(mask))))
-    for first, rows in _blocks(path, header):
-        yield rows[mask[first : first + len(rows)]].tobytes()
+    lines = header.lines_for(int(np.count_nonzero(mask)))
+    return _rewritten(path, header, lines, lambda block, rows: rows[mask[block]])
+
+
+def _rewritten(
+    path: Path, header: PlyHeader, lines: Sequence[str], change: Callable[[slice, np.ndarray], np.ndarray]
+) -> Iterator[bytes]:
+    """Yield a PLY with another header, whose blocks of rows are changed; read, not mapped, to bound memory."""
+    yield header_bytes(lines)
+    with path.open("rb", buffering=0) as source:
+        source.seek(header.data_offset)
+        for first in range(0, header.count, BLOCK_ROWS):
+            rows = np.fromfile(source, header.dtype, min(BLOCK_ROWS, header.count - first))
+            yield change(slice(first, first + len(rows)), rows).tobytes()
 
 
 def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
@@ -194,29 +197,31 @@ def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
         The bytes of the copy, in blocks.
     """
     header = _header_of(path, len(colours))
-    slots = model_slots(header.names, recognise_kernel(header.names), str(path))
+    slots = model_slots(header.names, recognise_kernel(header.names))
     harmonics = {name: slot.index for name, slot in slots.items() if slot.field == "sh"}
     lobes = {name: slot.index for name, slot in slots.items() if slot.field == "sb_params"}
     channels = () if harmonics else channel_names(header.names)
     if not harmonics and not channels:
-        raise InvalidSplats(str(path), expected="colours (f_dc_0, ...) to show scores in", got="a file without any")
+        raise ValueError("colours (f_dc_0, ...) to show scores in, got a file without any")
     levels = np.empty((len(colours), len(channels)))
     if channels:
         stored = _read_columns(path, header, {}, channels)[1]
         levels = (0.5 + SH_C0 * colours) * full_level(np.stack([stored[name] for name in channels], axis=1))
     fixed = {name: 0.0 for name, (row, _) in harmonics.items() if row > 0}
     fixed |= {name: DARK_LOBE for name, (_, channel) in lobes.items() if channel < LOBE_COLOURS}
-    yield header_bytes(header.lines)
-    for first, rows in _blocks(path, header):
+
+    def change(block: slice, rows: np.ndarray) -> np.ndarray:
         for name, value in fixed.items():
             rows[name] = value
         for name, (row, channel) in harmonics.items():
             if row == 0:
-                rows[name] = colours[first : first + len(rows), channel]
+                rows[name] = colours[block, channel]
         for channel, name in enumerate(channels):
-            column = levels[first : first + len(rows), channel]
+            column = levels[block, channel]
             rows[name] = column if header.dtype[name].kind == "f" else np.rint(column)
-        yield rows.tobytes()
+        return rows
+
+    return _rewritten(path, header, header.lines, change)
 
 
 def with_columns(path: Path, columns: Mapping[str, np.ndarray]) -> Iterator[bytes]:
@@ -238,29 +243,24 @@ def with_columns(path: Path, columns: Mapping[str, np.ndarray]) -> Iterator[byte
     replaced = {line for line in properties if line.split()[-1] in columns}
     *lines, end = (line for line in header.lines if line not in replaced)
     ending = "\r" if end.endswith("\r") else ""
-    yield header_bytes([*lines, *(f"property {SPELLING[code]} {name}{ending}" for name, code in codes.items()), end])
-    for first, rows in _blocks(path, header):
-        block = np.empty(len(rows), dtype)
+    properties = [f"property {SPELLING[code]} {name}{ending}" for name, code in codes.items()]
+
+    def change(block: slice, rows: np.ndarray) -> np.ndarray:
+        changed_rows = np.empty(len(rows), dtype)
         for name in unchanged_names:
-            block[name] = rows[name]
+            changed_rows[name] = rows[name]
         for name, values in columns.items():
-            block[name] = values[first : first + len(rows)]
-        yield block.tobytes()
+            changed_rows[name] = values[block]
+        return changed_rows
+
+    return _rewritten(path, header, [*lines, *properties, end], change)
 
 
 def _header_of(path: Path, count: int) -> PlyHeader:
     header = read_header(path)
     if header.count != count:
-        raise InvalidSplats(str(path), expected=f"{count} splats, as many as were lifted", got=str(header.count))
+        raise ValueError(f"{count} splats, as many as were lifted, got {header.count}")
     return header
-
-
-def _blocks(path: Path, header: PlyHeader) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield the first row's index, and a block of rows with a field a column; read, not mapped, to bound memory."""
-    with path.open("rb", buffering=0) as source:
-        source.seek(header.data_offset)
-        for first in range(0, header.count, BLOCK_ROWS):
-            yield first, np.fromfile(source, header.dtype, min(BLOCK_ROWS, header.count - first))
 
 
 def _read_columns(
@@ -300,7 +300,7 @@ def _apply_filter(
     """
     if (negative := deviations < 0).any():
         got = f"{float(deviations[negative][0]):g} in splat {int(negative.argmax())}"
-        raise InvalidSplats(FILTER, expected="values of zero or more", got=got, hint="export the splats again")
+        raise ValueError(f"values of {FILTER} of zero or more, got {got}")
     deviations = np.where(np.isposinf(deviations), np.nan, deviations)  # a size that is no number
     scales, theta = log_scales.astype(np.float64), opacity_logits.astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):  # a deviation of zero changes nothing; so do logs of it
@@ -321,7 +321,8 @@ def _default_layout(splats: Splats) -> tuple[str, ...]:
 
 def _columns_of(splats: Splats, layout: Sequence[str]) -> dict[str, np.ndarray]:
     """Column name -> [P]; normals that the splats never had are left out and stay zero."""
-    slots = model_slots(layout, splats.kernel, "layout")
+    with reading("layout", InvalidSplats, "columns of the splats"):
+        slots = model_slots(layout, splats.kernel)
     columns: dict[str, np.ndarray] = {}
     for name in layout:
         if name in slots:
@@ -399,31 +400,28 @@ def usual_layout(kernel: Kernel, sh_rows: int, lobes: int) -> tuple[str, ...]:
     return (first, *remaining[:2], *NORMALS, *remaining[2:])
 
 
-def model_slots(names: Sequence[str], kernel: Kernel, source: str) -> dict[str, Slot]:
+def model_slots(names: Sequence[str], kernel: Kernel) -> dict[str, Slot]:
     """Return the columns that are fields of the model; the others are extras."""
     for name in SCAFFOLD:
         if name in names:
             got = f"anchors of Scaffold-GS, which its networks turn into splats (property {name!r})"
-            raise InvalidSplats(source, expected="splats", got=got, hint="export the splats themselves")
+            raise ValueError(f"splats, got {got}; export the splats themselves")
     for name in _columns(kernel, 0, 0, beta_names=False):
         if name not in names:
             listing = ", ".join([*names[:8], "..."] if len(names) > 8 else names)
-            expected, got = (
-                f"the property {name!r} of a {kernel} splat",
-                f"{len(names)} properties without it ({listing})",
-            )
-            raise InvalidSplats(source, expected=expected, got=got, hint=_nearest(names))
+            got = f"{len(names)} properties without it ({listing}); {_nearest(names)}"
+            raise ValueError(f"the property {name!r} of a {kernel} splat, got {got}")
     beta_names = "sh0_0" in names
     first, rest = ("sh0", "shN") if beta_names else ("f_dc", "f_rest")
-    base, higher = _count_numbered(names, first, source), _count_numbered(names, rest, source)
+    base, higher = _count_numbered(names, first), _count_numbered(names, rest)
     complete = [3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGREE + 1)]
     if (base, higher) != (0, 0) and (base != 3 or higher not in complete):
         counts = ", ".join(map(str, complete))
         expected = f"3 properties {first}_* and {counts} properties {rest}_* (degree 0..{MAX_SH_DEGREE})"
-        raise InvalidSplats(source, expected=expected, got=f"{base} and {higher}", hint=_nearest(names))
-    lobes = _count_numbered(names, "sb_params", source) if kernel is Kernel.BETA else 0
+        raise ValueError(f"{expected}, got {base} and {higher}; {_nearest(names)}")
+    lobes = _count_numbered(names, "sb_params") if kernel is Kernel.BETA else 0
     if lobes % LOBE_CHANNELS:
-        raise InvalidSplats(source, expected=f"a multiple of {LOBE_CHANNELS} properties sb_params_*", got=str(lobes))
+        raise ValueError(f"a multiple of {LOBE_CHANNELS} properties sb_params_*, got {lobes}")
     return _columns(kernel, (base + higher) // 3, lobes // LOBE_CHANNELS, beta_names=beta_names)
 
 
@@ -442,14 +440,14 @@ def _columns(kernel: Kernel, sh_rows: int, lobes: int, *, beta_names: bool) -> d
     return slots | {f"rot_{i}": Slot("quats", (i,)) for i in range(4)}
 
 
-def _count_numbered(names: Sequence[str], stem: str, source: str) -> int:
+def _count_numbered(names: Sequence[str], stem: str) -> int:
     """Count the columns ``stem_0, stem_1, ...``, which must have no gap."""
     pattern = re.compile(re.escape(stem) + r"_(0|[1-9][0-9]{0,5})")
     indices = sorted(int(match[1]) for match in map(pattern.fullmatch, names) if match)
     for expected_index, index in enumerate(indices):
         if index != expected_index:
-            expected, got = f"the property '{stem}_{expected_index}'", f"'{stem}_{index}' without it"
-            raise InvalidSplats(source, expected=expected, got=got, hint=_nearest(names))
+            got = f"'{stem}_{index}' without it; {_nearest(names)}"
+            raise ValueError(f"the property '{stem}_{expected_index}', got {got}")
     return len(indices)
 
 
@@ -490,7 +488,7 @@ def read_header(path: Path) -> PlyHeader:
     Bytes behind all elements count in ``tail``, but for zeros and blanks: viewers open such files, too.
     """
     head, size = read_head(path)
-    header = parse_header(head, str(path))
+    header = parse_header(head)
     length, stride = size - header.data_offset, header.dtype.itemsize
     data_bytes = header.count * stride + (header.after or 0)
     tail = 0 if header.after is None else max(0, length - data_bytes)
@@ -502,7 +500,7 @@ def read_header(path: Path) -> PlyHeader:
             hint = "the rows are longer than their properties in the header: export the file again"
         element_bytes = f" and {header.after} bytes of other elements" if header.after else ""
         expected = f"{header.count} rows of {stride} bytes{element_bytes} = {data_bytes} bytes after the header"
-        raise InvalidSplats(str(path), expected=expected, got=f"{length} bytes", hint=hint)
+        raise ValueError(f"{expected}, got {length} bytes; {hint}")
     return replace(header, tail=tail - padding)
 
 
@@ -522,22 +520,18 @@ def padding_bytes(path: Path, size: int, tail: int) -> int:
 
 def read_head(path: Path) -> tuple[bytes, int]:
     """Read as many bytes of a file as a header may take, and return them with the file's size."""
-    try:
-        with open_regular(path) as handle:
-            return handle.read(MAX_HEADER_BYTES), handle.seek(0, 2)
-    except OSError as error:
-        got = f"one that does not open ({error.strerror})"
-        raise InvalidSplats(str(path), expected="a splat file", got=got) from None
+    with open_regular(path) as handle:
+        return handle.read(MAX_HEADER_BYTES), handle.seek(0, 2)
 
 
-def parse_header(head: bytes, source: str) -> PlyHeader:
-    """Parse the first bytes of a PLY of plain splats; ``source`` names the file in errors."""
-    lines, elements, offset = parse_elements(head, source)
+def parse_header(head: bytes) -> PlyHeader:
+    """Parse the first bytes of a PLY of plain splats."""
+    lines, elements, offset = parse_elements(head)
     first, *remaining = elements
     if first.name != "vertex":
-        raise _header_error(source, "'vertex' as the first element", repr(first.name[:60]))
+        raise _header_error("'vertex' as the first element", repr(first.name[:60]))
     if first.list_column is not None:
-        raise _header_error(source, "scalar properties ('property float x')", f"a list {first.list_column[:60]!r}")
+        raise _header_error("scalar properties ('property float x')", f"a list {first.list_column[:60]!r}")
     has_lists = any(element.count and element.list_column is not None for element in remaining)
     after = None if has_lists else sum(element.count * element.dtype.itemsize for element in remaining)
     ends = [i for i, line in enumerate(lines) if line.split()[:1] == ["element"]][1:2] or [len(lines) - 1]
@@ -554,7 +548,7 @@ class Element:
     list_column: str | None  # the first of its columns that is a list
 
 
-def parse_elements(head: bytes, source: str) -> tuple[tuple[str, ...], list[Element], int]:
+def parse_elements(head: bytes) -> tuple[tuple[str, ...], list[Element], int]:
     """Return the lines of a binary little-endian header, its elements, at least one, and its length in bytes."""
     from plyfile import (
         PlyData,
@@ -562,36 +556,36 @@ def parse_elements(head: bytes, source: str) -> tuple[tuple[str, ...], list[Elem
         PlyParseError,
     )  # imported here: processes that read no PLY start faster
 
-    lines, offset = _header_lines(head, source)
+    lines, offset = _header_lines(head)
     counts: list[int] = []
     empty: list[str] = []  # the same header of no rows, which plyfile reads without any data
     for line in lines:
         words, element = line.split(), _ELEMENT.fullmatch(line)
         if words[:1] == ["element"] and element is None:
             expected = "the name of an element and a count of zero or more"
-            raise _header_error(source, expected, repr(" ".join(words)[:60]))
+            raise _header_error(expected, repr(" ".join(words)[:60]))
         counts += [int(element[2])] if element else []
         if words and not line.startswith(_REMARKS):
             empty.append(f"element {element[1]} 0" if element else " ".join(words))
     try:
         ply = PlyData.read(io.BytesIO(header_bytes(empty)))
     except (PlyParseError, ValueError) as error:
-        raise _header_error(source, "a header of PLY 1.0", f"one that does not parse ({str(error)[:120]})") from None
+        raise _header_error("a header of PLY 1.0", f"one that does not parse ({str(error)[:120]})") from None
     if ply.text or ply.byte_order != "<":
         kind = "ascii" if ply.text else "binary_big_endian"
-        raise _header_error(source, "'format binary_little_endian 1.0'", f"'format {kind} 1.0'", REWRITE)
+        raise _header_error("'format binary_little_endian 1.0'", f"'format {kind} 1.0'", REWRITE)
     elements = []
     for element, count in zip(ply.elements, counts, strict=True):
         lists = [column.name for column in element.properties if isinstance(column, PlyListProperty)]
         scalars = [(column.name, "<" + column.val_dtype) for column in element.properties if column.name not in lists]
         elements.append(Element(element.name, count, np.dtype(scalars), lists[0] if lists else None))
     if not elements or not (elements[0].dtype.names or elements[0].list_column):
-        raise _header_error(source, "an element 'vertex' with properties", "a header without one")
+        raise _header_error("an element 'vertex' with properties", "a header without one")
     return lines, elements, offset
 
 
-def _header_error(source: str, expected: str, got: str, hint: str = EXPORT) -> InvalidSplats:
-    return InvalidSplats(f"{source} header", expected=expected, got=got, hint=hint)
+def _header_error(expected: str, got: str, hint: str = EXPORT) -> ValueError:
+    return ValueError(f"{expected} in its header, got {got}; {hint}")
 
 
 def header_bytes(lines: Sequence[str]) -> bytes:
@@ -599,29 +593,29 @@ def header_bytes(lines: Sequence[str]) -> bytes:
     return "".join(f"{line}\n" for line in lines).encode("latin-1")
 
 
-def _header_lines(head: bytes, source: str) -> tuple[tuple[str, ...], int]:
+def _header_lines(head: bytes) -> tuple[tuple[str, ...], int]:
     """Return the lines of a header without their line feeds, and its length in bytes."""
     if head[:4] not in (b"ply\n", b"ply\r"):
-        raise InvalidSplats(source, expected="a PLY file (first line 'ply')", got=repr(head[:8]), hint=EXPORT)
+        raise ValueError(f"a PLY file (first line 'ply'), got {head[:8]!r}; {EXPORT}")
     end = _END.search(head)
     if end is None:
         limit = f"'end_header' within the first {MAX_HEADER_BYTES} bytes"
-        raise InvalidSplats(source, expected=limit, got=f"none in {len(head)} bytes", hint=EXPORT)
+        raise ValueError(f"{limit}, got none in {len(head)} bytes; {EXPORT}")
     lines = tuple(head[: end.end() - 1].decode("latin-1").split("\n"))
     if not all(line.isascii() or line.startswith(_REMARKS) for line in lines):
         expected, got = "ASCII characters in all lines but comments", "other characters in it"
-        raise _header_error(source, expected, got)
+        raise _header_error(expected, got)
     if len(lines) > MAX_HEADER_LINES:
         limit, hint = f"at most {MAX_HEADER_LINES} header lines", "leave out properties that are no splat's"
-        raise InvalidSplats(source, expected=limit, got=str(len(lines)), hint=hint)
-    _refuse_clouds(lines, source)
+        raise ValueError(f"{limit}, got {len(lines)}; {hint}")
+    _refuse_clouds(lines)
     return lines, end.end()
 
 
-def _refuse_clouds(lines: tuple[str, ...], source: str) -> None:
+def _refuse_clouds(lines: tuple[str, ...]) -> None:
     if cloud := cloud_without_splats(lines):
         expected = "splats (properties such as 'opacity', 'scale_0', 'rot_0')"
-        raise InvalidSplats(source, expected=expected, got=f"{cloud[0]} without any of them", hint=cloud[1])
+        raise ValueError(f"{expected}, got {cloud[0]} without any of them; {cloud[1]}")
 
 
 def cloud_without_splats(lines: Sequence[str]) -> tuple[str, str] | None:

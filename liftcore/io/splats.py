@@ -210,14 +210,14 @@ def format_of(path: Path) -> SplatFormat:
 
 def quick_count(path: Path) -> int | None:
     """P of a file by its header or size alone; None where it must be read to be counted, or does not open."""
-    with suppress(InvalidSplats, OSError):
+    with suppress(InvalidSplats, OSError, ValueError):
         match format_of(path):
             case SplatFormat.PLY:
                 return ply.read_header(path).count
             case SplatFormat.SPLAT:
                 return path.stat().st_size // ROW.itemsize
             case SplatFormat.COMPRESSED_PLY:
-                elements = ply.parse_elements(ply.read_head(path)[0], str(path))[1]
+                elements = ply.parse_elements(ply.read_head(path)[0])[1]
                 return next((element.count for element in elements if element.name == "vertex"), None)
             case _:
                 pass
@@ -233,7 +233,8 @@ def require_kernel(path: Path, kernel: Kernel, source: str) -> None:
     """Refuse a kernel that a file lacks a property of, by its header alone."""
     splat_format = format_of(path)
     if splat_format is SplatFormat.PLY:
-        ply.model_slots(ply.read_header(path).names, kernel, source)
+        with reading(source, InvalidSplats, EXPECTED):
+            ply.model_slots(ply.read_header(path).names, kernel)
     elif kernel is Kernel.BETA:
         raise InvalidSplats(
             source, expected="the property 'beta' of a dbs splat", got=f"{splat_format}, which has none"
@@ -251,7 +252,7 @@ def some_rows(path: Path, mask: np.ndarray, suffix: str = ".ply", world: WorldFr
     """
     write = _writer_of(suffix, "suffix")
     if suffix == ".ply" and format_of(path) is SplatFormat.PLY:
-        return ply.some_rows(path, mask)
+        return _named(path, ply.some_rows, mask)
     splats = _of_count(path, len(mask))
     frame = {} if world is None else {"world": world}
     return write(replace(splats[mask], extras={}, layout=(), header=(), **frame), None)
@@ -271,7 +272,7 @@ def labelled(path: Path, labels: Labels, suffix: str = ".ply", mask: np.ndarray 
     if suffix not in WITH_COLUMNS:
         raise InvalidSplats("suffix", expected=" or ".join(WITH_COLUMNS) + ", which hold labels", got=repr(suffix))
     if suffix == ".ply" and mask is None and format_of(path) is SplatFormat.PLY:
-        return ply.with_columns(path, labels.columns)
+        return _named(path, ply.with_columns, labels.columns)
     import torch
 
     splats = _of_count(path, len(next(iter(labels.columns.values()))))
@@ -294,7 +295,7 @@ def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
     """
     terms = constant_terms(colours / 255).astype(np.float32)
     if format_of(path) is SplatFormat.PLY:
-        return ply.recoloured(path, terms)
+        return _named(path, ply.recoloured, terms)
     return ply.ply_blocks(replace(_of_count(path, len(terms), colour=False), sh=terms[:, None]))
 
 
@@ -303,6 +304,11 @@ def _of_count(path: Path, count: int, *, colour: bool = True) -> Splats:
     if splats.count != count:
         raise InvalidSplats(str(path), expected=f"{count} splats, as many as were lifted", got=str(splats.count))
     return splats
+
+
+def _named(path: Path, rewrite: Callable[[Path, Any], Iterator[bytes]], change: Any) -> Iterator[bytes]:
+    with _naming(path):
+        yield from rewrite(path, change)
 
 
 @contextmanager
