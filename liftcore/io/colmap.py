@@ -3,13 +3,14 @@
 import mmap
 import struct
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from liftcore.errors import InvalidCameras
+from liftcore.errors import InvalidCameras, reading
 from liftcore.io.files import refuse_pointer
 from liftcore.scene.cameras import (
     Camera,
@@ -28,8 +29,6 @@ MAX_TEXT_LINE = 64 * 1024 * 1024  # bytes; a line of an image's points runs to a
 MAX_NAME_BYTES = 4096
 POINT_BYTES = 24  # x, y and the id of its 3D point
 MODEL_FILES = ("cameras.bin", "cameras.txt", "images.bin", "images.txt")
-RE_EXPORT = "export the sparse model again"
-T = TypeVar("T")
 
 
 UNDISTORT = "undistort the photos first, with 'colmap image_undistorter', and train and lift on its output"
@@ -122,11 +121,9 @@ def read_colmap(folder: Path) -> Cameras:
     for path in (camera_file, image_file):
         if not path.is_file():
             raise InvalidCameras(str(folder), expected=f"the file {path.name}", got="a folder without it")
-    if camera_file.suffix == ".bin":
-        sensors, images = _read_binary(camera_file, image_file)
-    else:
-        sensors = dict(_check_counts(_text_sensors(camera_file), camera_file))
-        images = list(_check_counts(_text_images(image_file), image_file))
+    with _reading(camera_file):
+        sensors = dict((_binary_sensors if camera_file.suffix == ".bin" else _text_sensors)(camera_file))
+    images = _read_images(image_file)
     with cameras_from(str(folder)):
         names = view_names([image.name for image in images])
         files = camera_file, image_file
@@ -141,12 +138,16 @@ def read_colmap(folder: Path) -> Cameras:
 
 def read_image_names(folder: Path) -> list[str]:
     """Read the names of a sparse model's views, without their cameras."""
-    path = model_files(folder)[1]
-    if path.suffix == ".bin":
-        images: list[_Image] = _binary_images(path)
-    else:
-        images = list(_check_counts(_text_images(path), path))
-    return view_names([image.name for image in images])
+    return view_names([image.name for image in _read_images(model_files(folder)[1])])
+
+
+def _read_images(path: Path) -> list[_Image]:
+    with _reading(path):
+        return list((_binary_images if path.suffix == ".bin" else _text_images)(path))
+
+
+def _reading(path: Path) -> AbstractContextManager[None]:
+    return reading(path, InvalidCameras, "a file of a sparse model", "export the sparse model again")
 
 
 def _cameras(name: str, image: _Image, sensors: Mapping[int, _Sensor], files: tuple[Path, Path]) -> list[Camera]:
@@ -193,46 +194,36 @@ class _Bytes:
         (count,) = self.take("<Q")
         if count * least_bytes > len(self.data) - self.offset:
             rest = len(self.data) - self.offset
-            raise InvalidCameras(
-                self.source,
-                expected=f"{count} {noun}",
-                got=f"a file that ends {rest} bytes after their number",
-                hint=RE_EXPORT,
-            )
+            raise ValueError(f"{count} {noun}, got a file that ends {rest} bytes after their number")
         return count
 
     def name(self) -> str:
         end = self.data.find(b"\0", self.offset, self.offset + MAX_NAME_BYTES)
         if end < 0:
-            raise InvalidCameras(self.source, expected="an image name that ends", got="none", hint=RE_EXPORT)
+            raise ValueError("an image name that ends, got none")
         raw, self.offset = bytes(self.data[self.offset : end]), end + 1
         return raw.decode("utf-8", errors="replace")
 
     def skip(self, count: int) -> None:
         if count > len(self.data) - self.offset:
-            got = f"a file that ends after {len(self.data)}"
-            raise InvalidCameras(
-                self.source, expected=f"{self.offset + count} bytes or more", got=got, hint=RE_EXPORT
-            )
+            raise ValueError(f"{self.offset + count} bytes or more, got a file that ends after {len(self.data)}")
         self.offset += count
 
 
-def _read_binary(camera_file: Path, image_file: Path) -> tuple[dict[int, _Sensor], list[_Image]]:
-    cameras = _Bytes(camera_file)
-    sensors = dict(_binary_sensor(cameras) for _ in cameras.views("cameras", 24 + 2 * 8))
-    return sensors, _binary_images(image_file)
+def _binary_sensors(path: Path) -> Iterator[tuple[int, _Sensor]]:
+    cameras = _Bytes(path)
+    return (_binary_sensor(cameras) for _ in cameras.views("cameras", 24 + 2 * 8))
 
 
-def _binary_images(path: Path) -> list[_Image]:
+def _binary_images(path: Path) -> Iterator[_Image]:
     images = _Bytes(path)
-    return [_binary_image(images) for _ in images.views("images", 64 + 1 + 8)]
+    return (_binary_image(images) for _ in images.views("images", 64 + 1 + 8))
 
 
 def _binary_sensor(data: _Bytes) -> tuple[int, _Sensor]:
     number, model, width, height = data.take("<IiQQ")
     if not 0 <= model < len(COLMAP_MODELS):
-        got = f"camera model id {model}"
-        raise InvalidCameras(data.source, expected=f"a camera of {READ_MODELS}", got=got, hint=UNDISTORT)
+        raise ValueError(f"a camera of {READ_MODELS}, got camera model id {model}; {UNDISTORT}")
     parameters = data.take(f"<{COLMAP_MODELS[model].parameters}d")
     return number, _Sensor(width, height, COLMAP_MODELS[model], parameters)
 
@@ -250,11 +241,12 @@ def _text_lines(path: Path) -> Iterator[str]:
         handle.seek(0)
         while line := handle.readline(MAX_TEXT_LINE):
             if len(line) == MAX_TEXT_LINE:
-                raise InvalidCameras(str(path), expected=f"lines under {MAX_TEXT_LINE} bytes", got="a longer one")
+                raise ValueError(f"lines under {MAX_TEXT_LINE} bytes, got a longer one")
             yield line.decode("utf-8", errors="replace").strip().lstrip("\ufeff")
 
 
 def _text_sensors(path: Path) -> Iterator[tuple[int, _Sensor]]:
+    count = 0
     for line in _text_lines(path):
         if not line or line.startswith("#"):
             continue
@@ -263,13 +255,15 @@ def _text_sensors(path: Path) -> Iterator[tuple[int, _Sensor]]:
             parameters = tuple(float(value) for value in values)
             camera, size = int(number), (int(width), int(height))
         except ValueError:
-            raise _bad_line(path, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", line) from None
+            raise _bad_line("CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", line) from None
+        count += 1
+        check_count(count, str(path))
         unknown = CameraModel(model[:60], len(parameters), 0, None)
         yield camera, _Sensor(*size, MODELS_BY_NAME.get(model, unknown), parameters)
 
 
 def _text_images(path: Path) -> Iterator[_Image]:
-    lines = _text_lines(path)
+    lines, count = _text_lines(path), 0
     for line in lines:
         if not line or line.startswith("#"):
             continue
@@ -278,24 +272,19 @@ def _text_images(path: Path) -> Iterator[_Image]:
             pose = tuple(float(number) for number in numbers)
             if len(pose) != 7:
                 raise ValueError(line)
+            count += 1
+            check_count(count, str(path))
             yield _Image(name, int(camera), pose[:4], pose[4:])
         except ValueError:
-            raise _bad_line(path, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line) from None
+            raise _bad_line("IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line) from None
         points = next(lines, "").split()  # of the previous image: X Y POINT3D_ID, any number of times
         if len(points) % 3 or (points and not points[-1].lstrip("-").isdigit()):
             expected = "X Y POINT3D_ID of each point of an image after its line, or an empty line"
-            raise InvalidCameras(str(path), expected=expected, got=repr(" ".join(points)[:80]), hint=RE_EXPORT)
+            raise ValueError(f"{expected}, got {' '.join(points)[:80]!r}")
 
 
-def _check_counts(records: Iterator[T], path: Path) -> Iterator[T]:
-    """Yield the records of a text, which announces no number, and check their number against a scene's limit."""
-    for count, record in enumerate(records, start=1):
-        check_count(count, str(path))
-        yield record
-
-
-def _bad_line(path: Path, expected: str, line: str) -> InvalidCameras:
-    return InvalidCameras(str(path), expected=f"lines {expected!r}", got=repr(line[:80]), hint=RE_EXPORT)
+def _bad_line(expected: str, line: str) -> ValueError:
+    return ValueError(f"lines {expected!r}, got {line[:80]!r}")
 
 
 def calibration(model: CameraModel, parameters: Sequence[float], source: str) -> tuple[Intrinsics, Distortion | None]:
