@@ -165,6 +165,26 @@ def map_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     return {name: _array(mapped, start, entry) for name, entry in header.items() if name != "__metadata__"}, metadata
 
 
+def check_arrays(arrays: Mapping[str, np.ndarray], schema: Mapping[str, tuple[str, str]]) -> dict[str, int]:
+    """Return the length of each axis of arrays that have the types and axes of a schema; a ValueError names others.
+
+    Args:
+        schema: name -> types as NumPy has them, and letters of axes, such as ("f2 f4", "P F"); equal letters are
+        equally long in all arrays. Names that are missing are not checked.
+    """
+    lengths: dict[str, int] = {}
+    for name, (types, axes) in schema.items():
+        array, letters = arrays.get(name), axes.split()
+        if array is None:
+            continue
+        fits = array.ndim == len(letters) and array.dtype in [np.dtype(code) for code in types.split()]
+        sides = dict(zip(letters, array.shape, strict=fits))
+        if not fits or any(lengths.setdefault(letter, side) != side for letter, side in sides.items()):
+            known_sides = "".join(f", {letter} = {side}" for letter, side in lengths.items() if letter in letters)
+            raise ValueError(f"{name} {types} [{axes}]{known_sides}, got {array.dtype} {list(array.shape)}")
+    return lengths
+
+
 def map_file(file: IO[bytes]) -> mmap.mmap:
     """Map a whole file privately, without keeping it open as Python's own maps do: there may be thousands."""
     if sys.platform == "win32":

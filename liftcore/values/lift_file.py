@@ -26,7 +26,7 @@ import numpy as np
 from liftcore.errors import InvalidInput, InvalidLift
 from liftcore.io.files import open_regular, visible_files
 from liftcore.io.kinds import wrong_kind
-from liftcore.io.safetensors_file import map_tensors
+from liftcore.io.safetensors_file import check_arrays, map_tensors
 from liftcore.io.shards import INDEX, SUFFIX, map_shards, write_shards
 from liftcore.runtime.arguments import as_path
 
@@ -49,7 +49,13 @@ OBJECT_TENSORS = ("object", "object_views")  # in lifts that looked for objects
 NODE_TENSORS = ("node", "node_parents", "node_views", "node_confidence", "node_features")  # beside objects
 MOST_DEPTH = 63  # of a tree of nodes
 EMBEDDINGS = "embeddings"  # in lifts of packs with words
-ALL = (*TENSORS, CONFIDENCE, *CLUSTER_TENSORS, *OBJECT_TENSORS, *NODE_TENSORS, EMBEDDINGS)
+SCHEMA = {  # types, and axes: P splats, F channels, C clusters, O objects, V views, N nodes, W words
+    "features": ("f2 f4", "P F"), "total_weight": ("f4", "P"), "has_feature": ("?", "P"), CONFIDENCE: ("f4", "P"),
+    "cluster": ("i4", "P"), "cluster_features": ("f2 f4", "C F"),
+    "object": ("i4", "P"), "object_views": ("i4", "O V"),
+    "node": ("i4", "P"), "node_parents": ("i4", "N"), "node_views": ("i4", "N V"), "node_confidence": ("f4", "N"),
+    "node_features": ("f2", "N F"), EMBEDDINGS: ("f4", "W F"),
+}  # fmt: skip
 
 
 def save_lift(lift: Lift, path: Path | str) -> None:
@@ -78,7 +84,7 @@ def save_lift(lift: Lift, path: Path | str) -> None:
 
 def tensors_of(lift: Lift) -> dict[str, Tensor]:
     """Return the tensors of a lift by their names, in the order of its file."""
-    return {name: getattr(lift, name) for name in ALL if getattr(lift, name) is not None}
+    return {name: getattr(lift, name) for name in SCHEMA if getattr(lift, name) is not None}
 
 
 def open_lift(path: Path | str) -> Lift:
@@ -112,14 +118,14 @@ def _read_arrays(source: Path, path: Path | str) -> tuple[dict[str, np.ndarray],
         if missing:
             _check_format(header["splatlift"], path)
             raise ValueError(f"no {missing[0]} in it")
-        arrays = {name: tensors[name] for name in ALL if name in tensors}
+        arrays = {name: tensors[name] for name in SCHEMA if name in tensors}
+        _check_tensors(arrays)
     except FileNotFoundError as error:
         lacking = Path(str(error.filename or ""))
         got = f"no {lacking.name} in it" if lacking.parent == source else "no such file"
         raise InvalidLift(str(path), expected="a lift file", got=got) from None
     except (SafetensorError, OSError, ValueError) as error:
         raise _no_lift(path, error) from None
-    _check_shapes(arrays, path)
     return arrays, header["splatlift"]
 
 
@@ -145,65 +151,34 @@ def _check_format(text: str, path: Path | str) -> None:
 
 def _no_lift(path: Path | str, error: Exception) -> InvalidLift:
     got = f"a file that does not open as one: {error}"
-    return InvalidLift(str(path), expected="a lift file (.safetensors)", got=got)
+    hint = "copy the file again, or lift again"
+    return InvalidLift(str(path), expected="a lift file (.safetensors)", got=got, hint=hint)
 
 
-def _check_shapes(arrays: dict[str, np.ndarray], path: Path | str) -> None:
-    features = arrays["features"]
-    rows = features.shape[:1]
-    fits = features.ndim == 2 and features.dtype in (np.float16, np.float32) and features.size
-    columns = (("total_weight", np.float32), ("has_feature", np.bool_))
-    columns += ((CONFIDENCE, np.float32),) if CONFIDENCE in arrays else ()
-    if not fits or any(arrays[name].shape != rows or arrays[name].dtype != dtype for name, dtype in columns):
-        shapes = {name: list(arrays[name].shape) for name in TENSORS}
-        raise InvalidLift(str(path), expected="one row a splat in every tensor of a lift", got=str(shapes))
-    words = arrays.get(EMBEDDINGS)
-    if words is not None and (words.shape[1:] != features.shape[1:] or words.dtype != np.float32):
-        expected, got = "a vector of the features' channels for each word", f"{list(words.shape)} {words.dtype}"
-        raise InvalidLift(str(path), expected=expected, got=got)
-    for pair, channels, dtype in (
-        (CLUSTER_TENSORS, features.shape[1], features.dtype),
-        (OBJECT_TENSORS, None, np.dtype(np.int32)),
-    ):
-        column, table = (arrays.get(name) for name in pair)
-        if column is None and table is None:
-            continue
-        if column is None or table is None:
-            raise InvalidLift(str(path), expected=f"{pair[0]} and {pair[1]}, or neither", got="one of them")
-        fits = column.shape == rows and column.dtype == np.int32 and table.ndim == 2 and table.dtype == dtype
-        fits &= channels is None or table.shape[1] == channels
-        if not fits or int(column.min()) < -1 or int(column.max()) >= len(table):
-            got = f"{list(column.shape)} {column.dtype} and {list(table.shape)} {table.dtype}"
-            raise InvalidLift(str(path), expected=f"a {pair[0]} of -1 or a row of {pair[1]} for each splat", got=got)
-    _check_tree(arrays, path)
-
-
-def _check_tree(arrays: dict[str, np.ndarray], path: Path | str) -> None:
-    """Refuse a tree whose tensors do not fit together, or that is none."""
-    parts = {name: arrays[name] for name in NODE_TENSORS if name in arrays}
-    if not parts:
-        return
-    rows, channels = arrays["features"].shape
-    shapes = {name: f"{list(part.shape)} {part.dtype}" for name, part in parts.items()}
-    count = len(parts["node_views"]) if parts.get("node_views") is not None and parts["node_views"].ndim else -1
-    wide = parts["node_views"].shape[-1] if count >= 0 else 0
-    expected = {
-        "node": f"[{rows}] int32",
-        "node_parents": f"[{count}] int32",
-        "node_views": f"[{count}, {wide}] int32",
-        "node_confidence": f"[{count}] float32",
-        "node_features": f"[{count}, {channels}] float16",
-    }
-    if shapes != expected or len(arrays.get(OBJECT_TENSORS[1], ())) > count:
-        raise InvalidLift(str(path), expected=f"of a tree {expected}", got=str(shapes))
-    node, parents = parts["node"], parts["node_parents"]
-    inside = all(int(part.min(initial=-1)) >= -1 and int(part.max(initial=-1)) < count for part in (node, parents))
-    above = np.append(parents, np.int32(-1)) if inside else parents
-    for _ in range(MOST_DEPTH.bit_length() if inside else 0):  # each step leads twice as far up
+def _check_tensors(arrays: dict[str, np.ndarray]) -> None:
+    """Refuse tensors that do not fit together; a ValueError names what is wrong."""
+    lengths = check_arrays(arrays, SCHEMA)
+    if not arrays["features"].size:
+        raise ValueError("features of at least one splat and channel, got none")
+    for names in (CLUSTER_TENSORS, OBJECT_TENSORS, NODE_TENSORS):
+        present = [name for name in names if name in arrays]
+        if present and len(present) < len(names):
+            raise ValueError(f"{', '.join(names)} together, got {', '.join(present)} alone")
+    clusters = arrays.get("cluster_features")
+    if clusters is not None and clusters.dtype != arrays["features"].dtype:
+        raise ValueError(f"cluster_features {arrays['features'].dtype} as features, got {clusters.dtype}")
+    for name, axis in (("cluster", "C"), ("object", "O"), ("node", "N"), ("node_parents", "N")):
+        numbers = arrays.get(name, np.empty(0, np.int32))
+        if int(numbers.min(initial=-1)) < -1 or int(numbers.max(initial=-1)) >= lengths.get(axis, 0):
+            raise ValueError(f"{name} of -1..{lengths[axis] - 1}, got {numbers.min()}..{numbers.max()}")
+    above = arrays.get("node_parents", np.empty(0, np.int32))
+    if lengths.get("O", 0) > len(above) > 0:
+        raise ValueError(f"a node for each of {lengths['O']} objects, got {len(above)}")
+    above = np.append(above, np.int32(-1))
+    for _ in range(MOST_DEPTH.bit_length()):  # each step leads twice as far up
         above = above[above]
-    if not inside or (above >= 0).any():
-        expected = f"nodes of a tree, each -1 or a part of another, at most {MOST_DEPTH} deep"
-        raise InvalidLift(str(path), expected=expected, got="others")
+    if (above >= 0).any():
+        raise ValueError(f"nodes of a tree, at most {MOST_DEPTH} deep, got others")
 
 
 def input_files(splats: Path, cameras: Path, features: Sequence[Path]) -> list[InputFile]:
