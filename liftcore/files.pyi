@@ -6,6 +6,7 @@ from liftcore.io.files import visible_files as visible_files
 from liftcore.io.files import whole_file as whole_file
 from liftcore.io.json_file import finite as finite
 from liftcore.io.kinds import identify as identify
+from liftcore.io.kinds import page_table as page_table
 from liftcore.io.kinds import wrong_kind as wrong_kind
 from liftcore.io.outputs import check_output as check_output
 from liftcore.io.outputs import writing as writing

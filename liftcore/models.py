@@ -12,11 +12,12 @@ from liftcore.query.question import (
     SelectionSummary,
     SuggestedWords,
     Viewpoint,
+    page_fields,
 )
 from liftcore.query.terms import NOTATIONS
 from liftcore.runtime.fields import Body, NoBoolean, takes
 
 __all__ = [
     "NOTATIONS", "BestWords", "Body", "Box", "Edit", "LabelSummary", "ListedObjects", "NoBoolean",
-    "Notation", "OwnCamera", "SceneTree", "SelectionSummary", "SuggestedWords", "Viewpoint", "takes",
+    "Notation", "OwnCamera", "SceneTree", "SelectionSummary", "SuggestedWords", "Viewpoint", "page_fields", "takes",
 ]  # fmt: skip

@@ -28,6 +28,7 @@ SHARED_SOURCES = (
     "raster/cpu/project.py",
     "raster/cpu/simd.py",
     "scene/compositing.py",
+    "solve/shared_rows.py",
 )
 
 

@@ -25,7 +25,7 @@ from service.app import create_app, logging_to_stderr
 from service.auth import is_loopback
 from service.errors import Misconfigured
 from service.settings import ServiceSettings, read_settings, require_encoder_files, variables
-from service.store import Store, admit
+from service.store import DATABASE, Store, connect, list_keys
 
 CONNECTIONS = 400  # that may be open; requests over more get 503
 STOP_SECONDS = 10  # that open requests have to end in a stop
@@ -79,6 +79,7 @@ def add_arguments(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the service until it is stopped."""
     settings = settings_of(options)
+    require_keys(settings)
     require_encoder_files(settings)
 
     def announce(address: str) -> None:
@@ -97,7 +98,6 @@ def serve(
         with data_directory_errors():
             store = Store(settings.data, settings.disk_floor_bytes)
         with closing(store):
-            require_keys(settings, store)
             prepare(store)
             hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
             with suppress(ValueError, OSError):  # some kernels have a lower limit than they report
@@ -138,13 +138,20 @@ def data_directory_errors() -> Iterator[None]:
         raise Misconfigured("data", expected="a directory to read and write", got=str(error)) from error
 
 
-def require_keys(settings: ServiceSettings, store: Store) -> None:
+def require_keys(settings: ServiceSettings) -> None:
     """Require keys if the service is reachable from other machines."""
-    if not (is_loopback(settings.host) or admit(store, None)[0]):
-        raise Misconfigured(
-            "host", expected="a loopback address such as 127.0.0.1, as there are no keys", got=settings.host,
-            hint=f"make one first: splatlift keys create --name NAME --scopes read,write --data {settings.data}",
-        )  # fmt: skip
+    if is_loopback(settings.host):
+        return
+    with data_directory_errors():
+        path = settings.data / DATABASE
+        if path.exists():
+            with closing(connect(path, "ro")) as connection:
+                if list_keys(connection):
+                    return
+    raise Misconfigured(
+        "host", expected="a loopback address such as 127.0.0.1, as there are no keys", got=settings.host,
+        hint=f"make one first: splatlift keys create --name NAME --scopes read,write --data {settings.data}",
+    )  # fmt: skip
 
 
 def bind(host: str, port: int) -> socket.socket:

@@ -20,8 +20,8 @@ from fastapi.staticfiles import StaticFiles
 from prometheus_client import generate_latest
 
 from liftcore import __version__
-from liftcore.io.kinds import page_table
-from liftcore.query.question import page_fields
+from liftcore.files import page_table
+from liftcore.models import page_fields
 from service.errors import Busy
 from service.models import Status
 from service.routes import BINARY, Deps

@@ -75,7 +75,8 @@ def photos_of(splats: lc.Splats, cameras: lc.Cameras, folder: Path) -> Path:
     """Write renders on black of splats of degree 0 as photos."""
     assert splats.sh is not None
     colours = (0.5 + 0.28209479 * splats.sh[:, 0]).clamp(0, 1)
-    for name, image in lc.render(splats, cameras, colours).items():
+    for name, camera in cameras.items():
+        image = lc.render(splats, camera, colours)
         Image.fromarray((255 * image.numpy().clip(0, 1)).round().astype(np.uint8)).save(folder / f"{name}.png")
     return folder
 

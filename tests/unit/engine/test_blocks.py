@@ -22,7 +22,7 @@ from liftcore.lifting.engines.lift import block_folder
 from liftcore.lifting.inputs import LiftInputs
 from liftcore.lifting.planning.plan import Plan
 from liftcore.runtime.progress import Timings
-from liftcore.values.lift_file import ALL
+from liftcore.values.lift_file import SCHEMA
 from liftcore.values.pack import write_pack
 from liftcore.values.settings import LiftSettings
 from tests.scenes import look_at, random_splats
@@ -97,7 +97,7 @@ def in_blocks(engine: Any, scene: dict[str, Any], settings: LiftSettings, **keyw
 
 
 def assert_same(left: lc.LiftResult, right: lc.LiftResult) -> None:
-    for name in ALL:
+    for name in SCHEMA:
         first, second = getattr(left, name), getattr(right, name)
         assert (first is None) == (second is None), name
         if first is not None:
