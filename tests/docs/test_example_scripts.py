@@ -1,8 +1,12 @@
 """The scripts of ``examples/`` run, and do what they say."""
 
+import json
+import runpy
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,9 +16,12 @@ import liftcore as lc
 from liftcore.text.table import TableEncoder
 from liftcore.values.pack import write_pack
 from tests import tiny_scene
+from tests.run_lengths import sam_records
 from tests.scenes import write_scene
 
 from .readme import ROOT
+
+pytestmark = pytest.mark.slow
 
 
 def run(script: str, *arguments: object) -> str:
@@ -37,7 +44,6 @@ def tiny(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.slow
 def test_label_voting_gives_each_splat_its_class_and_how_sure_it_is(tiny: Path) -> None:
     run("label_voting.py", tiny / "splats.ply", tiny / "cameras.json", tiny / "labels", tiny / "voted.ply")
     columns = lc.read_splats(tiny / "voted.ply").extras
@@ -46,7 +52,6 @@ def test_label_voting_gives_each_splat_its_class_and_how_sure_it_is(tiny: Path) 
     assert (np.asarray(columns["share"]) > 0.5).all() and (np.asarray(columns["entropy"]) < np.log(2)).all()
 
 
-@pytest.mark.slow
 def test_sam_masks_become_things_that_are_exported(tiny: Path) -> None:
     (tiny / "masks").mkdir()
     for view, labels in tiny_scene.labels().items():
@@ -57,21 +62,18 @@ def test_sam_masks_become_things_that_are_exported(tiny: Path) -> None:
     assert sorted(np.unique(lc.read_splats(tiny / "things.ply").extras["instance_id"])) == [1, 2, 3]  # 0 is none
 
 
-@pytest.mark.slow
 def test_where_is_it_tells_places_before_the_camera_that_asks(tiny: Path) -> None:
     arguments = (tiny / "lift.safetensors", "lamp", "--view", "middle", "--table", tiny / "table.safetensors")
     x, y, z = (float(word) for word in run("where_is_it.py", *arguments).split() if word[0] in "+-")
     assert np.allclose([x, y, z], [1.2, 0.0, tiny_scene.DISTANCE], atol=0.25)
 
 
-@pytest.mark.slow
 def test_things_are_exported_with_the_words_nearest_to_them(tiny: Path) -> None:
     output = run("exports.py", tiny / "lift.safetensors", tiny / "table.safetensors", tiny / "out")
     assert sorted(output.splitlines()[-3:]) == [f"{word}: 20 splats" for word in tiny_scene.WORDS]
     assert {file.suffix for file in (tiny / "out").iterdir()} == {".glb", ".ply", ".json"}
 
 
-@pytest.mark.slow
 def test_shared_folder_opens_wherever_it_is_put(tiny: Path, tmp_path: Path) -> None:
     output = run(
         "share_folder.py", tiny / "splats.ply", tiny / "cameras.json", tiny / "features.safetensors", tiny / "shared"
@@ -86,12 +88,10 @@ def test_shared_folder_opens_wherever_it_is_put(tiny: Path, tmp_path: Path) -> N
     assert len(scene.catalogue().objects) == 3 and scene.render("middle", "rgb").max() > 0
 
 
-@pytest.mark.slow
 def test_training_loop_finds_the_red_blob_alone() -> None:
     assert run("training_loop.py") == "200 of 200 red splats, 0 others\n"
 
 
-@pytest.mark.slow
 def test_lift_and_mask_writes_masks_of_all_views_and_the_scores(tmp_path: Path) -> None:
     splats, cameras, pack = write_scene(tmp_path, 3)
     words = TableEncoder("words", ["red", "green", "blue"], np.eye(3, 6, dtype=np.float32))
@@ -103,3 +103,58 @@ def test_lift_and_mask_writes_masks_of_all_views_and_the_scores(tmp_path: Path) 
         assert mask.shape == (camera.height, camera.width) and set(np.unique(mask)) <= {0, 255}
     columns = lc.read_splats(tmp_path / "out" / "scores.ply").extras
     assert set(columns["selected"].tolist()) <= {0, 1} and columns["score"].shape == (50,)
+
+
+def test_nerfstudio_cameras_move_to_the_frame_of_its_splats(tiny: Path) -> None:
+    document, move, scale = tiny_scene.cameras_document(), np.array([1.0, 2.0, 3.0]), 0.5
+    for frame in document["frames"]:  # where the photos were taken, before the run centred and scaled them
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, 3] = pose[:3, 3] / scale - move
+        frame["transform_matrix"] = pose.tolist()
+    for folder in ("data", "run"):
+        (tiny / folder).mkdir()
+    (tiny / "data" / "transforms.json").write_text(json.dumps(document), encoding="utf-8")
+    frame = {"transform": np.column_stack([np.eye(3), move]).tolist(), "scale": scale}
+    (tiny / "run" / "dataparser_transforms.json").write_text(json.dumps(frame), encoding="utf-8")
+    inputs = (tiny / "splats.ply", tiny / "data", tiny / "run", tiny / "features.safetensors")
+    output = run("nerfstudio_scene.py", *inputs, tiny / "out")
+    assert output == "3 cameras moved to the frame of the splats; 60 of 60 splats have a feature\n"
+    features, expected = (lc.load_lift(folder / "lift.safetensors").features for folder in (tiny / "out", tiny))
+    assert np.allclose(np.asarray(features.float()), np.asarray(expected.float()), atol=1e-3)
+
+
+def test_written_pack_has_the_labels_and_vectors_of_its_folders(tiny: Path) -> None:
+    for name in ("ids", "vectors"):
+        (tiny / name).mkdir()
+    for view, labels in tiny_scene.labels().items():
+        np.save(tiny / "ids" / f"{view}.npy", labels[0])
+        np.save(tiny / "vectors" / f"{view}.npy", tiny_scene.codebook())
+    run("write_pack.py", tiny / "ids", tiny / "vectors", tiny / "own.safetensors")
+    expected = lc.read_features(tiny / "features.safetensors")
+    for name, view in lc.read_features(tiny / "own.safetensors").items():
+        right = expected[name]
+        assert isinstance(view, lc.Regions) and isinstance(right, lc.Regions)
+        assert np.array_equal(np.asarray(view.labels), np.asarray(right.labels))
+        assert np.allclose(np.asarray(view.codebook.float()), tiny_scene.codebook(), atol=1e-3)
+
+
+def test_segmented_photos_are_masks_that_are_packed(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a segmenter whose masks are what is of one grey, by the names that the example uses of it."""
+    (tiny / "photos").mkdir()
+    for view, labels in tiny_scene.labels().items():
+        Image.fromarray((80 * labels[0] + 40).astype(np.uint8)).save(tiny / "photos" / f"{view}.jpg")
+
+    def generate(image: np.ndarray) -> list[dict[str, Any]]:
+        return sam_records(np.stack([np.rint((image[..., 0] - 40.0) / 80) == k for k in range(3)]))
+
+    module, generator = ModuleType("segment_anything"), SimpleNamespace(generate=generate)
+    vars(module)["SamAutomaticMaskGenerator"] = lambda sam, output_mode: generator
+    vars(module)["build_sam_vit_h"] = lambda checkpoint: SimpleNamespace(to=lambda device: None)
+    monkeypatch.setitem(sys.modules, "segment_anything", module)
+    runpy.run_path(str(ROOT / "examples" / "segment_photos.py"))["main"](str(tiny / "photos"), str(tiny / "sam"))
+    for view in tiny_scene.VIEWS:
+        np.save(tiny / "sam" / f"{view}.npy", tiny_scene.codebook())
+    lc.pack_folder(tiny / "sam", tiny / "sam.safetensors", "masks", progress=False)
+    view = lc.read_features(tiny / "sam.safetensors")["middle"]
+    assert isinstance(view, lc.Regions)
+    assert np.array_equal(np.asarray(view.labels), tiny_scene.labels()["middle"])

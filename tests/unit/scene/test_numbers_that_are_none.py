@@ -152,6 +152,10 @@ def test_questions_take_what_the_lift_took(tmp_path: Path) -> None:
     scene = lc.Scene(lc.lift(splats, cameras, views, "row-sum"), splats, cameras)
     first = int(np.flatnonzero(scene.has_feature)[0])
     answer = scene.ask(lc.Query(like=[f"splat:{first}"], threshold=-1.0))
-    assert not answer.selected[~VALID_ROWS.numpy()].any() and np.isfinite(answer.box).all()
-    assert all(np.isfinite(item.box).all() for item in scene.objects(answer).objects)
+    assert (
+        not answer.selected[~VALID_ROWS.numpy()].any()
+        and answer.box is not None
+        and np.isfinite(np.array(answer.box)).all()
+    )
+    assert all(np.isfinite(np.array(item.box)).all() for item in scene.objects(answer).objects)
     assert scene.attention(answer, "v0").max() > 0 and np.isfinite(scene.render("v0")).all()

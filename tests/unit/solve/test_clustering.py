@@ -61,6 +61,7 @@ def test_a_feature_far_from_every_cluster_stays_unclustered():
         torch.zeros(100, 4),
         torch.full((300, 4), 6e4).half(),
         torch.full((300, 4), 1e-38),
+        torch.tensor([[1.0, 0.0], [0.0, 1.0]]),
     ],
 )
 def test_features_without_clusters_give_none(features):
