@@ -192,20 +192,25 @@ class Recorder:
                 await answer_to(error, scope["path"][:200])(scope, receive, send_marked)
         except LocalProtocolError:
             if sent_bytes:
-                raise  # else uvicorn has refused the rest of the request, and ended the connection
+                raise
+            while (await receive())["type"] != "http.disconnect":  # uvicorn has refused the rest of the request
+                pass
         finally:
-            seconds, route = time.monotonic() - start, getattr(scope.get("route"), "path", "(no route)")
-            method = scope["method"] if scope["method"] in METHODS else "other"  # as labels
-            self._requests.labels(method, route, status).inc()
-            self._seconds.labels(method, route).observe(seconds)
-            key = scope.get("state", {}).get("key")
-            fields = {
-                "method": scope["method"][:20], "route": route, "path": scope["path"][:200],  # never the query string
-                "status": status, "seconds": round(seconds, 6), "sent": sent_bytes,
-                "client": (scope.get("client") or (None,))[0], "key": key and key.id,
-            }  # fmt: skip
-            access.info("%s %s %d", method, route, status, extra={"fields": fields})
+            self._record(scope, status, time.monotonic() - start, sent_bytes)
             REQUEST_ID.reset(token)
+
+    def _record(self, scope: Scope, status: int, seconds: float, sent_bytes: int) -> None:
+        """Count and log a request."""
+        route, key = getattr(scope.get("route"), "path", "(no route)"), scope.get("state", {}).get("key")
+        method = scope["method"] if scope["method"] in METHODS else "other"  # as labels
+        self._requests.labels(method, route, status).inc()
+        self._seconds.labels(method, route).observe(seconds)
+        fields = {
+            "method": scope["method"][:20], "route": route, "path": scope["path"][:200],  # never the query string
+            "status": status, "seconds": round(seconds, 6), "sent": sent_bytes,
+            "client": (scope.get("client") or (None,))[0], "key": key and key.id,
+        }  # fmt: skip
+        access.info("%s %s %d", method, route, status, extra={"fields": fields})
 
 
 def request_id_of(scope: Scope) -> str:

@@ -12,7 +12,7 @@ from liftcore.values.lift import InputFile
 from liftcore.values.lift_file import found_input, input_file
 from tests.scenes import random_camera, random_splats, write_scene
 
-MATRIX = {"scale": 2.0, "rotation": np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), "translation": [1.0, 2.0, 3.0]}
+MATRIX = np.array([[0.0, -2, 0, 1], [2, 0, 0, 2], [0, 0, 2, 3]])
 
 
 @pytest.fixture(scope="module")
