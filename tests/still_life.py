@@ -55,7 +55,8 @@ def write_still_life(folder: Path) -> None:
     vectors = np.random.default_rng(7).standard_normal((len(WORDS), 64)).astype(np.float32)
     shares = torch.nn.functional.one_hot(torch.from_numpy(owners), len(WORDS)).float()
     views = {}
-    for name, image in lc.render(splats, cameras, shares).items():
+    for name, camera in cameras.items():
+        image = lc.render(splats, camera, shares)
         labels = torch.where(image.sum(dim=2) > 0.5, image.argmax(dim=2), -1)
         views[name] = lc.Regions(labels.int(), vectors)
     lc.write_splats(folder / "point_cloud.ply", splats)

@@ -63,15 +63,6 @@ class Scene(OpenedLift):
     selections: dict[str, Selection]
     """selections by their names (`select`)"""
 
-    selections: dict[str, Selection]
-    """selections by their names (`select`)"""
-
-    selections: dict[str, Selection]
-    """selections by their names (`select`)"""
-
-    selections: dict[str, Selection]
-    """selections by their names (`select`)"""
-
     def __repr__(self) -> str:
         objects = "" if self.object_views is None else f", {len(self.object_views)} objects"
         return f"Scene({len(self.features)} splats, {self.channels} channels{objects})"
