@@ -47,6 +47,7 @@ SAFE_HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",  # other sites must not embed renders and photos
     "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
 }
+REFUSAL_SECONDS = 10  # that a client may take to leave after its request was refused
 COMPRESSED = re.compile(r"/|/web/.*|/lifts/[^/]+/splats")
 
 access = logging.getLogger("service.access")
@@ -193,8 +194,9 @@ class Recorder:
         except LocalProtocolError:
             if sent_bytes:
                 raise
-            while (await receive())["type"] != "http.disconnect":  # uvicorn has refused the rest of the request
-                pass
+            with anyio.move_on_after(REFUSAL_SECONDS):  # uvicorn has refused the rest of the request
+                while (await receive())["type"] != "http.disconnect":
+                    pass
         finally:
             self._record(scope, status, time.monotonic() - start, sent_bytes)
             REQUEST_ID.reset(token)

@@ -534,7 +534,10 @@ def _fit_of_maps(views: Views, cameras: Cameras, files: Mapping[str, Path]) -> t
 
 def _likeness(views: Views, camera: Camera, file: Path) -> float:
     """Correlate the changes between neighbouring cells of a map with those of its photo's colours under them."""
-    observed, window = views[camera.name], views.window(camera.name, camera)
+    window = views.window(camera.name, camera)
+    if window is not None and min(window.right - window.left, window.bottom - window.top) < 1:
+        return 0.0  # no whole cell lies in the photo
+    observed = views[camera.name]
     assert isinstance(observed, FeatureGrid)
     cells = torch.nn.functional.normalize(observed.grid.float(), dim=2).numpy()
     image, (width, height) = read_image(file, camera.photo_size)[0], camera.photo_size
@@ -547,7 +550,8 @@ def _likeness(views: Views, camera: Camera, file: Path) -> float:
         np.concatenate([np.linalg.norm(np.diff(values, axis=axis), axis=2).ravel() for axis in (0, 1)])
         for values in (cells, colours)
     ]
-    return float(np.corrcoef(np.stack(changes))[0, 1]) if min(map(np.ptp, changes)) > 0 else 0.0
+    has_changes = all(change.size and np.ptp(change) > 0 for change in changes)
+    return float(np.corrcoef(np.stack(changes))[0, 1]) if has_changes else 0.0
 
 
 def _edges(labels: np.ndarray, photo: np.ndarray) -> float:

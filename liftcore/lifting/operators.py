@@ -99,7 +99,11 @@ def weights_at(
         Unavailable: the device does not exist.
     """
     raster, params = _open_view(splats, camera, params, device, threads)
-    places, size = np.asarray(pixels), (camera.width, camera.height)
+    try:
+        places, size = np.asarray(pixels), (camera.width, camera.height)
+    except (TypeError, ValueError) as error:  # ragged lists, tensors of a GPU
+        expected = "integers [n, 2], the x and y of each pixel"
+        raise InvalidSettings("pixels", expected=expected, got=str(error).splitlines()[0]) from None
     if places.ndim != 2 or places.shape[1] != 2 or not np.issubdtype(places.dtype, np.integer):
         got = f"{places.dtype} {list(places.shape)}"
         raise InvalidSettings("pixels", expected="integers [n, 2], the x and y of each pixel", got=got)

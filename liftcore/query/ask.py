@@ -407,7 +407,8 @@ def _select(
     selected = scene.has_feature & (scores >= np.float32(threshold.value))
     if not is_automatic:
         return threshold, selected
-    if not has_references and has_one_mode(valid_scores, threshold.value, scene.weights):
+    is_unclear = not has_references and has_one_mode(valid_scores, threshold.value, scene.weights)
+    if is_unclear and _are_of_word(scene, valid_scores, scores, competitors):
         threshold = _select_all(scene, valid_scores)[0]
         selected = scene.has_feature.copy()
     if not competitors:
@@ -442,7 +443,7 @@ def _select(
 def _are_of_word(
     scene: OpenedLift, valid_scores: np.ndarray, scores: np.ndarray, competitors: Sequence[CompetingWords]
 ) -> bool:
-    """Return True if equal scores are those of the word: against competing words, or without any by themselves."""
+    """Return True if scores without a valley are those of the word: against competing words, or by themselves."""
     if competitors:
         return compare_ranks(scene, scores, math.inf, competitors[0]).rest >= NEAR
     return float(valid_scores.min()) >= SAME_AS_WORD

@@ -143,10 +143,11 @@ def has_one_mode(scores: np.ndarray, value: float, weights: np.ndarray | None) -
     )
     expected = histogram.smoothed() * count * 2 * math.sqrt(math.pi) * SMOOTHING
     place = min(int((value - low) / histogram.width), BINS - 1)
-    hill = min(expected[: place + 1].max(), expected[place:].max())
+    left, right = int(expected[: place + 1].argmax()), place + int(expected[place:].argmax())
+    hill, valley = min(expected[left], expected[right]), expected[left : right + 1].min()
     filled_bins = np.flatnonzero(histogram.mass)
     gap = filled_bins[filled_bins > place].min(initial=BINS) - filled_bins[filled_bins <= place].max(initial=0)
-    return gap < LEAST_GAP * BINS and hill - expected[place] < LEAST_DEVIATIONS * math.sqrt(hill + expected[place])
+    return gap < LEAST_GAP * BINS and hill - valley < LEAST_DEVIATIONS * math.sqrt(hill + valley)
 
 
 def _count(scores: np.ndarray, low: float, high: float, weights: ArrayLike | None) -> Histogram | None:

@@ -70,7 +70,11 @@ def camera_of(window: Window | None, camera: Camera) -> Camera:
         )
         raise InvalidFeatures(f"view {camera.name!r}", expected=expected, got="pad or crop", hint=hint)
     sides = window.right - window.left, window.bottom - window.top
-    width, height = (max(1, round(side)) for side in sides)
+    if min(sides) < 1:
+        expected, got = "a map with whole cells in the photo", f"none in {camera.width} x {camera.height} pixels"
+        hint = "say another fit of the maps, or encode the photos in smaller cells"
+        raise InvalidFeatures(f"view {camera.name!r}", expected=expected, got=got, hint=hint)
+    width, height = map(round, sides)
     across, down = width / sides[0], height / sides[1]
     return camera.replace(
         width=width, height=height, fx=camera.fx * across, fy=camera.fy * down,

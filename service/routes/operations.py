@@ -74,7 +74,7 @@ class PageFiles(StaticFiles):
     def file_response(self, full_path: Any, *arguments: Any, **options: Any) -> Response:
         """Return the answer with a file; browsers compare those that change with their own."""
         answer = super().file_response(full_path, *arguments, **options)
-        is_library = Path(full_path).is_relative_to(WEB / "libraries")
+        is_library = WEB / "libraries" in Path(full_path).parents[1:]  # below a folder with a version
         answer.headers["Cache-Control"] = IMMUTABLE if is_library else "no-cache"
         if Path(full_path).suffix == ".gz":
             answer.headers["Content-Encoding"] = "gzip"
