@@ -9,6 +9,7 @@ import runpy
 import shlex
 import shutil
 import sys
+import tempfile
 import zipfile
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -197,9 +198,10 @@ CELLS = [cell for cell in json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cell
 
 
 def test_cells_run_in_order_and_print_what_is_saved(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     matplotlib.use("Agg")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(pyplot, "show", lambda: None)
     names: dict[str, Any] = {}
     for cell in CELLS:
