@@ -62,6 +62,7 @@ MOST_RIVALS = 3  # competing words in an answer
 LEAST_RIVAL = 0.1  # least share of the selected total weight to which such a word is the nearest
 LEAST_RIVAL_OF_CLEAR = 0.5  # the same for a clear answer
 WHOLE_SHARE = 0.9  # of an object's splats, from which a selection is no part of it
+LEAST_OF_WHOLE = 0.1  # of what a word selects in the whole scene, from which its splats in an object are a part
 SAME_AS_WORD = 0.9  # cosine of all splats to a word without competitors, from which all are of it
 _OF_ANSWER = ("rivals", "candidates", "threshold", "clear", "statistics", "present", "presence", "reason")
 _QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
@@ -216,7 +217,8 @@ def answers(scene: OpenedLift, requests: Sequence[ResolvedQuery]) -> list[Answer
 def _part_answer(scene: OpenedLift, request: ResolvedQuery) -> Answer:
     """Answer a query for a part of an object: the object first, then the part among its splats and nodes alone.
 
-    A phrase that may not mean a part (`PartPhrase`) is answered as a whole if no such part is found.
+    A phrase that may not mean a part (`PartPhrase`) is answered as a whole unless most of such a part, and a share of
+    what the whole scene has of the word, is in both answers: "boat cat" is no part of the boat.
     """
     assert request.part is not None
     phrase, part = request.part.phrase.object_phrase, request.part.part
@@ -233,8 +235,11 @@ def _part_answer(scene: OpenedLift, request: ResolvedQuery) -> Answer:
     else:
         answer, note = object_answer, "it" if object_answer.present is False else f"{phrase!r} is not found, and"
         reason = f"{object_answer.reason} So {note} has no parts."
-    if not answer.count and not request.part.phrase.sure:
-        return answers(scene, [replace(request, part=None)])[0]
+    if not request.part.phrase.sure:
+        whole = answers(scene, [replace(request, part=None)])[0]
+        shared = int((answer.selected & whole.selected).sum())
+        if shared <= max(answer.count / 2, LEAST_OF_WHOLE * whole.count):
+            return whole
     fields = {name: getattr(answer, name) for name in _OF_ANSWER} | {"reason": reason}
     if object_answer.present is False:
         fields |= {"present": False, "presence": object_answer.presence}

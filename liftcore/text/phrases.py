@@ -42,8 +42,8 @@ _PARTITIVES = frozenset({
 _TRAILING = frozenset({"here", "there", "please", "now", "too", "thanks", "is", "are", "only", "alone"})
 _OPENING = re.compile(
     r"(please|hey|hi|hello|ok|and|or|where|what|which|how|who|is|are|was|there|do|does|you|see|can|could|would|will|i|"
-    r"we|me|us|want|need|like|to|find|show|give|get|select|highlight|segment|mark|pick|detect|locate|search|look|for|"
-    r"all|every|each|any|only|just)\s+"
+    r"i'm|we|me|us|want|need|like|to|find|show|give|get|select|highlight|segment|mark|pick|detect|locate|search|look|"
+    r"looking|for|all|every|each|any|only|just|both(?=.*\sand\s)|either)\s+"
 )
 _PLACES = re.compile(
     r"(?:^|\s)(?:(?:to|on|at|in) the (?:left|right|front|back|top|bottom|side|middle)(?: side)?(?: of)?|"
@@ -62,7 +62,8 @@ _NUMBERS = frozenset({
 })  # fmt: skip
 _NEGATION = re.compile(
     r"(?:^|[\s,;]+)(?:but not|and not|or not|rather than|instead of|other than|apart from|aside from|except for|"
-    r"except|excluding|without|minus|but|not|no|non|never|neither|nor|isn't|isn\u2019t|aren't|aren\u2019t)(?=\s|$)"
+    r"except|excluding|exclude|remove|hide|delete|ignore|without|minus|but|not|no|non|never|neither|nor|isn't|aren't|"
+    r"don't)(?=\s|$)"
 )
 _ALTERNATIVES = frozenset({"but", "rather than", "instead of"})
 _UNIVERSALS = frozenset({
@@ -70,7 +71,7 @@ _UNIVERSALS = frozenset({
     "stuff", "rest", "whatever", "scene", "none",
 })  # fmt: skip
 _RELATIVE = re.compile(r"(?:\s+(?:that|which|who|is|are|has|have|but|and|,))+$")
-_COMMAS = re.compile(r"\s*[,;|]\s*|\s+[-/&+]\s+|(?<=[a-z]{3})/(?=[a-z]{3})")
+_COMMAS = re.compile(r"\s*[,;|]\s*|(?:^|\s)\d+[.)]\s|\s+[-/&+]\s+|(?<=[a-z]{3})/(?=[a-z]{3})")
 _CONJUNCTIONS = re.compile(r"\s+(?:and|or|and/or|plus|as well as|along with|together with)\s+")
 _QUALIFIER = re.compile(r"\s(?:with|from|for|that|which|who|made|is|are|has|having|to)(?=\s|$)")
 # Adjectives that "and" joins before a noun, as in "a black and white mug".
@@ -168,7 +169,8 @@ def _before_action(name: str, is_word: Callable[[str], bool] | None) -> str:
 
 
 def _tidy(text: str) -> str:
-    typed = " ".join(text.casefold().replace("_", " ").replace("\u2019", "'").split())
+    lines = ", ".join(line.strip("-*\u2022 ") for line in text.strip().splitlines())
+    typed = " ".join(lines.casefold().replace("_", " ").replace("\u2019", "'").split())
     return typed.strip(PUNCTUATION.replace("'", ""))
 
 

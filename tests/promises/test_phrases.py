@@ -16,7 +16,8 @@ SPLATS = 20  # of each
 READ = {
     "mug": "mug", "the small red mug": "mug", "mugs": "mug", "Where is the mug?": "mug", "mug, please": "mug",
     "please show me the mugs": "mug", "a photo of a mug": "mug", "the black and white mug": "mug",
-    "only the mug": "mug",
+    "only the mug": "mug", "I'm looking for the mug": "mug", "bowl mug": "mug",
+    "mug\nbowl": "mug bowl", "1. mug 2. bowl": "mug bowl", "both the mug and the bowl": "mug bowl",
     "mug, bowl": "mug bowl", "mug; bowl": "mug bowl", "the mug and the bowl": "mug bowl", "mug or lamp": "mug lamp",
     "mug & bowl": "mug bowl", "mug/bowl": "mug bowl", "a red mug, a bowl, and the lamps": "mug bowl lamp",
     "I want the bowl as well as the lamp": "bowl lamp", "mug, mug": "mug", "mug but not the bowl": "mug",
@@ -25,7 +26,8 @@ READ = {
 }  # fmt: skip
 REFUSALS = {
     "not the mug": "what it is not", "no mug": "what it is not", "everything except the mug": "what it is not",
-    "all but the mug": "what it is not", "neither mug nor bowl": "what it is not", "mug, not mug": "what it is not",
+    "all but the mug": "what it is not", "remove the mug": "what it is not", "don't show mugs": "what it is not",
+    "neither mug nor bowl": "what it is not", "mug, not mug": "what it is not",
     "the bowl to the left of the mug": "ask for 'bowl'", "mug in front of the bowl": "ask for 'mug'",
     "the mug next to the lamp": "ask for 'mug'", "lamp between mug and bowl": "ask for 'lamp'",
     "bowl on the mug": "ask for 'bowl'", "bowl sitting under the lamp": "ask for 'bowl'", "left mug": "ask for 'mug'",
