@@ -29,7 +29,7 @@ from liftcore.files import PhotoIndexes
 from service import errors
 from service.auth import Auth, with_keys
 from service.errors import METHODS, PROBLEM, REQUEST_ID, answer_to
-from service.models import BODY_BYTES
+from service.models import BITS_BYTES, BODY_BYTES
 from service.process import Children
 from service.query_client import QueryClient
 from service.routes import Parts, assets, jobs, lifts, operations, queries, selections
@@ -88,7 +88,8 @@ def create_app(settings: ServiceSettings, store: Store) -> FastAPI:
     app.add_middleware(Auth, store=store, settings=settings)
     app.add_middleware(Recorder, registry=app.state.registry)  # the last one is outside of the others
     errors.install(app)
-    for module in (operations, assets, jobs, selections, lifts, queries):
+    app.include_router(selections.router, max_body_size=BITS_BYTES)
+    for module in (operations, assets, jobs, lifts, queries):
         app.include_router(module.router, max_body_size=BODY_BYTES)
     app.mount("/web", operations.PageFiles(directory=operations.WEB))
     return app

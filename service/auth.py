@@ -18,7 +18,7 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service.errors import Forbidden, Misdirected, TooLarge, Unauthorized, UnclearEnd
-from service.models import BODY_BYTES, Key
+from service.models import BITS_BYTES, BODY_BYTES, Key
 from service.settings import ServiceSettings
 from service.store import SERVICE, Owner, Store, admit
 
@@ -52,7 +52,8 @@ class Auth:
             require_clear_end(headers, line)
             self._require_host(scope["method"], headers)
             owner, key = await self._caller(headers, line)
-            require_length(headers, self._upload_bytes if UPLOAD.fullmatch(line) else BODY_BYTES)
+            limit = BITS_BYTES if "/selections" in line else BODY_BYTES
+            require_length(headers, self._upload_bytes if UPLOAD.fullmatch(line) else limit)
             scope.setdefault("state", {}).update(owner=owner, key=key)
         await self._app(scope, receive, send)
 
@@ -115,7 +116,7 @@ def require_length(headers: Headers, limit: int) -> None:
     """Require that the head of a request announces no more than may come, before a client is told to go on."""
     length = headers.get("content-length", "0")
     if length.isdigit() and int(length[:20]) > limit:
-        hint = "several feature packs may make one lift, so features can be cut" if limit > BODY_BYTES else ""
+        hint = "several feature packs may make one lift, so features can be cut" if limit > BITS_BYTES else ""
         raise TooLarge("body", expected=f"at most {limit} bytes", got="more", hint=hint)
 
 
