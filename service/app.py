@@ -91,7 +91,6 @@ def create_app(settings: ServiceSettings, store: Store) -> FastAPI:
     app.include_router(selections.router, max_body_size=BITS_BYTES)
     for module in (operations, assets, jobs, lifts, queries):
         app.include_router(module.router, max_body_size=BODY_BYTES)
-    app.mount("/web", operations.PageFiles(directory=operations.WEB))
     return app
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import hashlib
+import mimetypes
 import os
 import re
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,6 +20,8 @@ from fastapi.openapi.docs import get_swagger_ui_html
 from fastapi.responses import FileResponse, HTMLResponse, StreamingResponse
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import generate_latest
+from starlette.datastructures import Headers
+from starlette.types import Scope
 
 from liftcore import __version__
 from liftcore.files import page_table
@@ -71,14 +75,29 @@ class PageFiles(StaticFiles):
         plain = super().lookup_path(path)
         return plain if plain[1] else super().lookup_path(f"{path}.gz")
 
-    def file_response(self, full_path: Any, *arguments: Any, **options: Any) -> Response:
+    def file_response(
+        self, full_path: Any, stat_result: os.stat_result, scope: Scope, status_code: int = 200
+    ) -> Response:
         """Return the answer with a file; browsers compare those that change with their own."""
-        answer = super().file_response(full_path, *arguments, **options)
+        answer = super().file_response(full_path, stat_result, scope, status_code)
+        encodings = Headers(scope=scope).get("accept-encoding", "gzip")
+        if Path(full_path).suffix == ".gz" and "gzip" not in encodings:
+            answer = StreamingResponse(decompress(full_path), media_type=mimetypes.guess_type(full_path)[0])
+        elif Path(full_path).suffix == ".gz":
+            answer.headers.update({"Content-Encoding": "gzip", "Vary": "Accept-Encoding"})  # as `Compression` adds
         is_library = WEB / "libraries" in Path(full_path).parents[1:]  # below a folder with a version
         answer.headers["Cache-Control"] = IMMUTABLE if is_library else "no-cache"
-        if Path(full_path).suffix == ".gz":
-            answer.headers["Content-Encoding"] = "gzip"
         return answer
+
+
+def decompress(file: str) -> Iterator[bytes]:
+    """Yield the blocks of a compressed file."""
+    with gzip.open(file) as content:
+        while block := content.read(BLOCK_BYTES):
+            yield block
+
+
+PAGE_FILES = PageFiles(directory=WEB)
 
 
 @router.get("/healthz")
@@ -138,6 +157,12 @@ def example_file(name: Annotated[str, PathParameter(pattern="|".join(EXAMPLE_FIL
         return FileResponse(EXAMPLE / name, media_type=BINARY)
     content = zstandard.ZstdDecompressor().decompress((EXAMPLE / f"{name}.zst").read_bytes())
     return Response(content, media_type=BINARY)
+
+
+@router.get("/web/{path:path}", include_in_schema=False)
+async def page_file(path: str, request: Request) -> Response:
+    """Get a file of the page."""
+    return await PAGE_FILES.get_response(path, request.scope)
 
 
 @router.get("/openapi.json", include_in_schema=False)

@@ -76,10 +76,15 @@ def test_page_serves_the_libraries_that_it_names_compressed(client: httpx.Client
         library = client.get(address.removeprefix("."))
         assert library.headers["content-encoding"] == "gzip" and "immutable" in library.headers["cache-control"]
         assert base64.b64encode(hashlib.sha256(library.content).digest()).decode() == digest.removeprefix("sha256-")
+        plain = client.get(address.removeprefix("."), headers={"Accept-Encoding": "identity"})
+        assert plain.content == library.content and "content-encoding" not in plain.headers
+        assert plain.headers["vary"] == library.headers["vary"] == "Accept-Encoding"
     script = "/web/src/main.js"
     for address in ("/", script, "/web/src/page.css", f"/lifts/{lift['id']}/splats"):
         reply = client.get(address)
         assert reply.headers["content-encoding"] == "gzip" and "immutable" not in reply.headers["cache-control"]
+        assert client.post(address).headers["allow"] == "GET"
+    assert 'route="/web/{path:path}"' in client.get("/metrics").text
     part = client.get(script, headers={"Range": "bytes=0-31"})
     assert part.status_code == 206 and "content-encoding" not in part.headers
     assert part.content == client.get(script).content[:32]
