@@ -15,7 +15,7 @@ from typing import Any
 
 import yaml
 
-from service.models import BODY_BYTES
+from service.models import BITS_BYTES
 from service.settings import ServiceSettings
 from tests.server import Server
 
@@ -44,7 +44,7 @@ def services() -> dict[str, Any]:
 
 def test_the_proxy_has_the_limits_of_the_service() -> None:
     caddy = text("docker/Caddyfile")
-    mib = BODY_BYTES >> 20
+    mib = BITS_BYTES >> 20
     assert f"max_size {DEFAULTS.upload_bytes >> 30}GiB # SPLATLIFT_UPLOAD_BYTES" in caddy
     assert all(f"\t{limit} " in caddy for limit in ("read_header 10s", "read_body 30m", "write 30m"))
     assert f"request_buffers {mib}MiB" in caddy  # a body of JSON that is slow to come waits there
