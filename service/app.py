@@ -48,7 +48,7 @@ SAFE_HEADERS = {
     "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
 }
 REFUSAL_SECONDS = 10  # that a client may take to leave after its request was refused
-COMPRESSED = re.compile(r"/|/web/.*|/lifts/[^/]+/splats")
+COMPRESSED = re.compile(r"/|/web/.*")
 
 access = logging.getLogger("service.access")
 
@@ -123,7 +123,7 @@ class Application(FastAPI):
 
 
 class Compression:
-    """ASGI middleware: compress the page and the splats that it draws; pictures and arrays gain little by it."""
+    """ASGI middleware: compress the page; pictures and arrays gain little by it."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app, self._compressing = app, GZipMiddleware(app, compresslevel=1)

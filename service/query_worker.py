@@ -22,6 +22,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import urlencode
 
+import zstandard
+
 from liftcore import (
     Answer,
     Camera,
@@ -321,7 +323,8 @@ class Answers:
             view_mask = self._view_mask(request) if operation in ("mask", "attention") else None
             kind = SPLATS_FILES[request["what"]] if operation == "splats" else operation
             return scene.blocks_of(self._answer(request), kind, view=view, view_mask=view_mask)
-        return scene.blocks_of(None, request.get("channel", "splats"), view=view)
+        blocks = scene.blocks_of(None, request.get("channel", "splats"), view=view)
+        return compressed(blocks) if request.get("compressed") else blocks
 
     def _export(self, request: Request) -> Iterable[bytes]:
         """Return a file with labels: those of answers, of words or of objects."""
@@ -383,6 +386,13 @@ def json_of(document: dict[str, Any]) -> bytes:
         return json.dumps(document, allow_nan=False, separators=(",", ":")).encode()
     except ValueError:
         return json.dumps(finite(document), allow_nan=False, separators=(",", ":")).encode()
+
+
+def compressed(blocks: Iterable[bytes]) -> Iterable[bytes]:
+    """Compress blocks as zstd, at the level that costs less time than any network takes for what it saves."""
+    compressor = zstandard.ZstdCompressor(level=1).compressobj()
+    yield from map(compressor.compress, blocks)
+    yield compressor.flush()
 
 
 def view_of(request: Request) -> str | Camera:

@@ -261,5 +261,9 @@ def get_viewer_file(
     """
     record = deps.store.lift(owner, lift)
     if file == "splats":
-        return respond(request, deps, scene_request("scene", record, deps), BINARY, f"scene-{record.id}.splat")
+        encoding = {"Content-Encoding": "zstd"} if "zstd" in request.headers.get("accept-encoding", "") else {}
+        work = scene_request("scene", record, deps) | {"compressed": bool(encoding)}
+        answer = respond(request, deps, work, BINARY, f"scene-{record.id}.splat")
+        answer.headers.update(encoding | {"Vary": "Accept-Encoding"})
+        return answer
     return respond(request, deps, scene_request("colours", record, deps) | {"what": what}, NPY)

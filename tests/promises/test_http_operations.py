@@ -80,11 +80,15 @@ def test_page_serves_the_libraries_that_it_names_compressed(client: httpx.Client
         assert plain.content == library.content and "content-encoding" not in plain.headers
         assert plain.headers["vary"] == library.headers["vary"] == "Accept-Encoding"
     script = "/web/src/main.js"
-    for address in ("/", script, "/web/src/page.css", f"/lifts/{lift['id']}/splats"):
+    for address in ("/", script, "/web/src/page.css"):
         reply = client.get(address)
         assert reply.headers["content-encoding"] == "gzip" and "immutable" not in reply.headers["cache-control"]
         assert client.post(address).headers["allow"] == "GET"
     assert 'route="/web/{path:path}"' in client.get("/metrics").text
+    splats = f"/lifts/{lift['id']}/splats"
+    plain, packed = (client.get(splats, headers={"Accept-Encoding": name}) for name in ("gzip", "zstd"))
+    assert "content-encoding" not in plain.headers and packed.headers["content-encoding"] == "zstd"
+    assert packed.content == plain.content and packed.headers["etag"] != plain.headers["etag"]
     part = client.get(script, headers={"Range": "bytes=0-31"})
     assert part.status_code == 206 and "content-encoding" not in part.headers
     assert part.content == client.get(script).content[:32]

@@ -282,7 +282,7 @@ async function open(id, fresh = false) {
     lift = newLift;
     byId("empty").hidden = true;
     document.body.classList.remove("no-lifts");
-    setLift(lift);
+    setLift(null); // its panels ask once the scene is on its way
     byId("mask").hidden = true;
     refreshLifts().catch(problem => notify(problemText(problem), true));
     share.setLift(lift).catch(problem => notify(problemText(problem), true));
@@ -292,11 +292,12 @@ async function open(id, fresh = false) {
     byId("poster").hidden = true;
     await layers.setLift(lift, parameters.get("view"));
     if (request !== openRequest) return;
-    const poster = showPoster(parameters, request); // asked for first, as it is shown first
+    // The poster is asked for and sent before the splats, whose first frame may also block the page for seconds.
+    await Promise.race([showPoster(parameters, request), new Promise(resolve => setTimeout(resolve, POSTER_WAIT))]);
     const progress = received => request === openRequest && showLoading(`Loading ${formatBytes(received)} of ${formatBytes(ROW_BYTES * lift.count)}`, received / ROW_BYTES / lift.count);
-    const content = layers.fallback ? null : await fetchBytes(`/lifts/${id}/splats`, { progress });
-    // The first frame of the splats may block the page for seconds, so the poster has to be shown before.
-    await Promise.race([poster, new Promise(resolve => setTimeout(resolve, POSTER_WAIT))]);
+    const splats = layers.fallback ? null : fetchBytes(`/lifts/${id}/splats`, { progress });
+    if (request === openRequest) setLift(lift);
+    const content = await splats;
     if (request !== openRequest) return;
     if (content) await loadSplats(content, parameters);
     describeScene();

@@ -1,23 +1,24 @@
-// Colours of splats by their scores. Scores are in a texture, a texel a splat, and the shader compares them with the
+// Colours of splats by their scores, and the histogram of the scores. Scores are in a texture, a texel a splat, and the shader compares them with the
 // threshold, so a slider writes one number whatever the size of the scene.
 import * as THREE from "three";
 import { dyno } from "@sparkjsdev/spark";
 
 export const COLOURS = ["#ffb000", "#38b6ff", "#ff5fa2", "#54d67f", "#b48cff", "#ff7a45"]; // of questions, by their order
-export const UNKNOWN = -0.999999; // splats without a feature score -1
+const UNKNOWN = -0.999999; // splats without a feature score -1
 const STOPS = [[34, 20, 66], [64, 48, 132], [42, 105, 140], [36, 152, 122], [120, 194, 72], [251, 233, 96]];
 const TEXTURE_WIDTH = 2048; // texels of a row, within the limit of every GPU
 const TINT = 0.52; // share of the question's colour in a selected splat
 const SHADE = 0.82; // share of dark grey in the other splats
 const HEAT = 0.93; // share of the heat colour
 const LAYER_UNDER_QUERY = 0.6; // opacity of a layer below a question
+const BINS = 96; // of the histogram
 
 export const rgb = colour => [1, 3, 5].map(index => parseInt(colour.slice(index, index + 2), 16));
 
 // The smallest float32 that is not below a float64: float32 scores pass both alike.
 const least = new Float32Array(1);
 const bits = new Int32Array(least.buffer);
-export function atLeast(cut) {
+function atLeast(cut) {
   least[0] = Math.max(-3e38, Math.min(3e38, cut));
   if (least[0] < cut) bits[0] += least[0] < 0 ? -1 : 1;
   return least[0];
@@ -152,4 +153,51 @@ function texture(data, width, textureRows, depth) {
   result.type = data instanceof Float32Array ? THREE.FloatType : THREE.UnsignedByteType;
   result.needsUpdate = true;
   return result;
+}
+
+// Count the scores from low to high in equal bins; splats without a feature are left out.
+export function histogram(scores, low, high) {
+  const bins = new Uint32Array(BINS);
+  const scale = high > low ? BINS / (high - low) : 0;
+  for (const score of scores) {
+    if (score > UNKNOWN) bins[Math.max(0, Math.min(BINS - 1, Math.floor((score - low) * scale)))] += 1;
+  }
+  return bins;
+}
+
+export function countFrom(scores, cut) {
+  const minimum = atLeast(cut);
+  let total = 0;
+  for (const score of scores) if (score >= minimum && score > UNKNOWN) total += 1;
+  return total;
+}
+
+// Scores that pass the cut where splats are selected, and nowhere else: an automatic answer is more than a threshold.
+export function passing(scores, selected, cut) {
+  const minimum = atLeast(cut);
+  return scores.map((score, index) => selected[index] ? Math.max(score, minimum) : score < minimum ? score : UNKNOWN);
+}
+
+// Draw a histogram: bars below the cut are pale, a dashed line marks the automatic cut.
+export function drawHistogram(canvas, { bins, low, high, cut, auto, colour }) {
+  const ratio = devicePixelRatio || 1;
+  const { clientWidth: width, clientHeight: height } = canvas;
+  canvas.width = Math.round(width * ratio);
+  canvas.height = Math.round(height * ratio);
+  const context = canvas.getContext("2d");
+  context.scale(ratio, ratio);
+  const tallest = Math.sqrt(Math.max(...bins, 1)); // square roots keep small bins visible
+  const barWidth = width / bins.length;
+  const paleColour = getComputedStyle(canvas).getPropertyValue("--quiet");
+  bins.forEach((bin, index) => {
+    const barHeight = bin ? Math.max(1.5, Math.sqrt(bin) / tallest * (height - 4)) : 0;
+    context.fillStyle = low + (index + 0.5) / bins.length * (high - low) >= cut ? colour : paleColour;
+    context.globalAlpha = low + (index + 0.5) / bins.length * (high - low) >= cut ? 1 : 0.4;
+    context.fillRect(index * barWidth + 0.5, height - barHeight, Math.max(1, barWidth - 1), barHeight);
+  });
+  if (auto === null || high <= low) return;
+  const x = (auto - low) / (high - low) * width;
+  context.globalAlpha = 0.9;
+  context.fillStyle = paleColour;
+  for (let y = 0; y < height; y += 6) context.fillRect(x - 0.5, y, 1.5, 3);
 }

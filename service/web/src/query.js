@@ -1,7 +1,6 @@
 // The panel Query: questions of words or examples, a colour each; their answers, thresholds and objects.
 import { byId, formatCount, el, percent, plural, notify } from "./dom.js";
-import { countFrom, drawHistogram, histogram, passing } from "./histogram.js";
-import { COLOURS, rgb } from "./painter.js";
+import { COLOURS, countFrom, drawHistogram, histogram, passing, rgb } from "./painter.js";
 import { changedFields, defaultFields, linkFields, readFields, queryString } from "./question.js";
 import { fetchBytes, fetchJson, readNpy, problemText } from "./service.js";
 import { Completions } from "./completions.js";
