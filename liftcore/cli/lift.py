@@ -34,8 +34,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--checkpoint", type=Path, metavar="DIR", help=f"store rasterized views: {checkpoint_help}")
     parser.add_argument("--threads", type=count, metavar="N", help="default: the number of cores")
     engine_help = "lift in blocks of bounded memory: local, in this process; ray, by the workers of a Ray cluster"
-    shards = "LIFT as X.shards is a folder of shards"
-    parser.add_argument("--engine", metavar="NAME", help=f"{engine_help}; {shards}")
+    parser.add_argument("--engine", metavar="NAME", help=engine_help)
     parser.add_argument("--address", metavar="HOST:PORT", help="of the Ray cluster, or auto; default: this machine")
 
 

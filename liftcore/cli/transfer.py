@@ -16,7 +16,7 @@ NUMBERS = (12, 16)  # of a matrix
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    parser.add_argument("lift", type=Path, help="a lift (.safetensors or .shards)")
+    parser.add_argument("lift", type=Path, help="a lift (.safetensors)")
     parser.add_argument("edited", type=Path, help="other splats of its scene, of any format")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="NEW", help="the lift to write")
     matrix_help = "transform of the scene, a text file of 3 or 4 rows of 4 numbers; default: none"

@@ -84,7 +84,7 @@ def inspect_file(path: Path | str, kind: str = "", *, trusted: bool = True) -> d
 
 
 def describe_lift_file(path: Path) -> dict[str, Any]:
-    """Describe a lift: a file or a folder of shards.
+    """Describe a lift.
 
     Raises:
         InvalidLift: it is malformed.

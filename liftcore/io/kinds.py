@@ -24,7 +24,6 @@ from liftcore.errors import InvalidInput
 from liftcore.io.colmap import MODEL_FILES
 from liftcore.io.files import BROKEN_ZIP, LFS_HINT, LFS_POINTER, first_bytes, is_system_file, open_regular, open_zip
 from liftcore.io.ply import MAX_HEADER_BYTES, cloud_without_splats
-from liftcore.io.shards import INDEX
 from liftcore.io.sog import META, is_sog_document, sog_folder
 from liftcore.io.splat import looks_like_splat
 from liftcore.io.spz import begins_like_spz
@@ -495,7 +494,6 @@ def _folder(path: Path) -> FileKind:
 
 def _folder_rules(path: Path) -> Iterator[FileKind | None]:
     yield _splats_as(SplatFormat.SOG) if (path / META).is_file() and _is_sog(path / META) else None
-    yield FileKind("lift", "lift") if (path / INDEX).is_file() else None
     yield _STREAMED if (path / LOD_META).is_file() else None
     names = _names_below(path)
     splats = _splat_files(names, lambda name: _has_splats(path / name))

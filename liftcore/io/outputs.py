@@ -27,7 +27,7 @@ OUTPUT_TYPES = {
     "ply": OutputType("a PLY", (".ply",), "splats"),
     "png": OutputType("a picture", (".png",), None, "a picture"),
     "npy": OutputType("an array", (".npy",), None, "a NumPy array"),
-    "lift": OutputType("a lift", (".safetensors", ".shards"), "lift"),
+    "lift": OutputType("a lift", (".safetensors",), "lift"),
     "pack": OutputType("a feature pack", (".safetensors",), "features"),
     "csv": OutputType("a table", (".csv",), None),
     "json": OutputType("JSON", (".json",), None, "JSON"),
@@ -38,21 +38,14 @@ CONVERTED = (".sog", ".html", ".csv", ".compressed.ply", ".splat", ".spz")  # wh
 def check_output(path: Path | str, inputs: Path | str | Iterable[Path | str], kind: str) -> Path | str:
     """Check that an output can be written, and is no folder, none of the inputs and no file of another kind.
 
-    A file of the kind that is written is replaced. Of a lift in shards the index is the file.
+    A file of the kind that is written is replaced.
 
     Args:
         path: as the user gave it. inputs: files, and folders of cameras, that are read for it. kind: what goes there,
             one of OUTPUT_TYPES.
-
-    Returns:
-        The file: the path itself, or the index of a folder of shards.
     """
-    from liftcore.io.shards import INDEX, SUFFIX
-
     check_choice("kind", kind, OUTPUT_TYPES)
     path = as_path(path, "output")
-    if kind == "lift" and path.suffix == SUFFIX:
-        path, kind = path / INDEX, "json"
     output = OUTPUT_TYPES[kind]
     with writing(path):
         if path.is_dir():

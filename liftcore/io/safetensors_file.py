@@ -191,27 +191,15 @@ def map_file(file: IO[bytes]) -> mmap.mmap:
         return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
     size = os.fstat(file.fileno()).st_size
     place = map_anonymous(size, NO_RESERVE)
-    map_over(place, 0, file, 0, size)
-    return place
-
-
-def map_over(place: mmap.mmap, offset: int, file: IO[bytes], begin: int, size: int) -> None:
-    """Map ``size`` bytes of a file, from the page at ``begin`` on, over ``place`` from ``offset`` on.
-
-    What is written there stays in memory. Windows maps nothing over addresses that are mapped: there it is a copy.
-    """
-    if sys.platform == "win32":
-        file.seek(begin)
-        place[offset : offset + size] = file.read(size)
-        return
-    address = ctypes.addressof(ctypes.c_char.from_buffer(place)) + offset
+    address = ctypes.addressof(ctypes.c_char.from_buffer(place))
     system = ctypes.CDLL(None, use_errno=True)
     system.mmap.restype = ctypes.c_void_p
     system.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long]
     flags = mmap.MAP_PRIVATE | FIXED | NO_RESERVE
-    if system.mmap(address, size, mmap.PROT_READ | mmap.PROT_WRITE, flags, file.fileno(), begin) != address:
+    if system.mmap(address, size, mmap.PROT_READ | mmap.PROT_WRITE, flags, file.fileno(), 0) != address:
         code = ctypes.get_errno()
         raise OSError(code, os.strerror(code), file.name)
+    return place
 
 
 def _array(mapped: mmap.mmap, start: int, entry: dict) -> np.ndarray:

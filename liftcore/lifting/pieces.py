@@ -40,7 +40,7 @@ class Pieces(ABC):
     usual_share: float | None = None  # the mean share of mask consensus; None where there is none
     levels_apart: bool = False  # True if regions are compared with those of their own level alone
     view_pieces: int = 1
-    rows: int = 0  # of a block of splats: pieces of sums, and whole pages of X; 0: all of them
+    rows: int = 0  # of a block of splats: pieces of sums; 0: all of them
 
     @property
     def splat_pieces(self) -> int:

@@ -146,7 +146,7 @@ def run(
             return lift if is_in_file else lift.to(plan.device.place)
         with timings.stage("geometry"):
             job, statistics = blocks.weigh(inputs, plan, on_plan, timings)
-        return blocks.deliver(job, _solve(job, blocks.engine, inputs, statistics, timings, threads))
+        return _solve(job, blocks.engine, inputs, statistics, timings, threads)  # X is mapped
 
 
 def _solve(

@@ -185,7 +185,7 @@ class LiftResult(Lift):
         """Write a lift file (`liftcore.values.lift_file`), whole or not at all.
 
         Args:
-            path: a file; with ``.shards`` at its end, a folder of shards.
+            path: a file.
             progress: as `liftcore.lift` has it; there is one step.
 
         Raises:

@@ -6,8 +6,7 @@ i32, -1 for splats in none, and ``cluster_features`` [K, F]; where objects were 
 none, and ``object_views`` [N, 5] i32, and of the tree of objects, parts and groups ``node`` [P] i32, ``node_parents``
 [T] i32, ``node_views`` [T, 5] i32, ``node_confidence`` [T] f32 and ``node_features`` [T, F] f16 (`Lift`); of packs
 with words their vectors, ``embeddings`` [n, F] f32. Its metadata hold settings, inputs with digests, the encoder,
-words, the diagnostics, timings and the version, as JSON. A lift too large for one file is a folder of shards with the
-same tensors (`liftcore.io.shards`).
+words, the diagnostics, timings and the version, as JSON.
 """
 
 from __future__ import annotations
@@ -27,7 +26,6 @@ from liftcore.errors import InvalidInput, InvalidLift
 from liftcore.io.files import open_regular, visible_files
 from liftcore.io.kinds import wrong_kind
 from liftcore.io.safetensors_file import check_arrays, map_tensors
-from liftcore.io.shards import INDEX, SUFFIX, map_shards, write_shards
 from liftcore.runtime.arguments import as_path
 
 if TYPE_CHECKING:
@@ -59,11 +57,7 @@ SCHEMA = {  # types, and axes: P splats, F channels, C clusters, O objects, V vi
 
 
 def save_lift(lift: Lift, path: Path | str) -> None:
-    """Write the lift whole or not at all (temporary file, fsync, rename), with no copy of X in memory.
-
-    Args:
-        path: a file; with ``.shards`` at its end, a folder of shards.
-    """
+    """Write the lift whole or not at all (temporary file, fsync, rename), with no copy of X in memory."""
     from liftcore.io.safetensors_file import write_tensors
 
     nodes, channels = lift.node_features, lift.features.shape[1]
@@ -73,13 +67,7 @@ def save_lift(lift: Lift, path: Path | str) -> None:
             "node_features", expected=expected, got=got, hint=f"replace {', '.join(NODE_TENSORS)} by None"
         )
 
-    metadata = lift.metadata.model_dump_json()
-    tensors = tensors_of(lift)
-    path = as_path(path)
-    if path.suffix == SUFFIX:
-        write_shards(path, tensors, metadata)
-    else:
-        write_tensors(path, tensors, {"splatlift": metadata})
+    write_tensors(as_path(path), tensors_of(lift), {"splatlift": lift.metadata.model_dump_json()})
 
 
 def tensors_of(lift: Lift) -> dict[str, Tensor]:
@@ -111,7 +99,7 @@ def _read_arrays(source: Path, path: Path | str) -> tuple[dict[str, np.ndarray],
     from safetensors import SafetensorError
 
     try:
-        tensors, header = map_shards(source) if (source / INDEX).is_file() else map_tensors(source)
+        tensors, header = map_tensors(source)
         if "splatlift" not in header:
             raise InvalidLift(str(path), expected="a lift file", got="safetensors without lift metadata")
         missing = [name for name in TENSORS if name not in tensors]
@@ -120,10 +108,8 @@ def _read_arrays(source: Path, path: Path | str) -> tuple[dict[str, np.ndarray],
             raise ValueError(f"no {missing[0]} in it")
         arrays = {name: tensors[name] for name in SCHEMA if name in tensors}
         _check_tensors(arrays)
-    except FileNotFoundError as error:
-        lacking = Path(str(error.filename or ""))
-        got = f"no {lacking.name} in it" if lacking.parent == source else "no such file"
-        raise InvalidLift(str(path), expected="a lift file", got=got) from None
+    except FileNotFoundError:
+        raise InvalidLift(str(path), expected="a lift file", got="no such file") from None
     except (SafetensorError, OSError, ValueError) as error:
         raise _no_lift(path, error) from None
     return arrays, header["splatlift"]

@@ -1,7 +1,7 @@
 """Files that no reader takes: one table of kind, name, content and a word of the message. Data and builders alone.
 
 ``BAD_FILES`` has single files, which readers, the command line and uploads all refuse. ``BAD_FOLDERS`` has what only
-a folder can be: models of several files, folders of masks, shards of a lift. Bombs are small files that say, or
+a folder can be: models of several files, folders of masks. Bombs are small files that say, or
 unpack to, large ones: they are refused without the memory.
 """
 
@@ -604,19 +604,8 @@ ARRAY_FOLDERS = [
     ("cut", {"a.npy": npy(np.zeros((2, 3, 4), np.float32))[:-4]}, "a.npy"),
     ("4 TB, as it says", {"a.npy": b"\x93NUMPY\x01\x00v\x00" + SHAPE.ljust(117) + b"\n"}, "a.npy"),
 ]
-INDEX, SHARD = "lift.safetensors.index.json", "features-00000.safetensors"
-SHARDS = [  # other files in a folder of shards
-    ("index of nothing", {INDEX: b"{}"}, "index"),
-    ("index of a number", {INDEX: b"3"}, "index"),
-    ("index that leads elsewhere", {INDEX: b'{"metadata": {}, "weight_map": {"a": "../../etc/x"}}'}, "index"),
-    ("shard of nothing", {SHARD: safetensors(b"{}      ")}, "shard"),
-    ("shard of a number", {SHARD: safetensors(b'{"features-00000": 1}')}, "shard"),
-    ("shard of other rows", {SHARD: tensors(8, **{"features-00000": tensor([1, 2], 0, 8)})}, "rows"),
-    ("shard of an unknown type", {SHARD: tensors(8, **{"features-00000": tensor([1, 2], 0, 8, "Q9")})}, "shard"),
-    ("shard of a negative shape", {SHARD: tensors(8, **{"features-00000": tensor([-1, -2], 0, 8)})}, "shard"),
-]
 BAD_FOLDERS = [
     BadFolder(kind, name, files, word)
-    for kind, rows in (("cameras", MODELS), ("masks", MASK_FOLDERS), ("npy", ARRAY_FOLDERS), ("lift", SHARDS))
+    for kind, rows in (("cameras", MODELS), ("masks", MASK_FOLDERS), ("npy", ARRAY_FOLDERS))
     for name, files, word in rows
 ]

@@ -246,7 +246,7 @@ def test_help_loads_nothing_heavy_and_closed_pipes_are_silent(scene: Path) -> No
 LIFTS = {
     "x.safetensors": ("--preset tikhonov --set dtype=float32", {"preset": "tikhonov", "dtype": "float32"}),
     "y.safetensors": ("--quality fast --set alpha_cap=0.5", {"quality": "fast", "alpha_cap": 0.5}),
-    "z.shards": ("--engine local --threads 2 --set objects=false", {"objects": False}),
+    "z.safetensors": ("--engine local --threads 2 --set objects=false", {"objects": False}),
 }
 
 

@@ -162,11 +162,10 @@ def test_checkpoints_are_read_as_the_tensors_in_them(trainer: str, tmp_path: Pat
         assert torch.equal(getattr(copy, name), getattr(splats, name)), name
 
 
-@pytest.mark.parametrize("suffix", [".safetensors", ".shards"])
-def test_lift_comes_back_with_every_array_and_its_settings(suffix: str, tmp_path: Path) -> None:
+def test_lift_comes_back_with_every_array_and_its_settings(tmp_path: Path) -> None:
     result = lc.lift(*random_scene().arguments(), progress=False)
-    result.save(tmp_path / f"lift{suffix}")
-    copy = lc.load_lift(tmp_path / f"lift{suffix}")
+    result.save(tmp_path / "lift.safetensors")
+    copy = lc.load_lift(tmp_path / "lift.safetensors")
     arrays, copies = result.arrays(), copy.arrays()
     assert list(arrays) == list(copies)
     for name, values in arrays.items():

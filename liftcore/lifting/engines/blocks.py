@@ -10,6 +10,7 @@ can see.
 
 from __future__ import annotations
 
+import os
 from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import closing
@@ -23,8 +24,7 @@ import torch
 from torch import Tensor
 
 from liftcore.errors import InvalidInput
-from liftcore.io.safetensors_file import map_tensors, write_tensors
-from liftcore.io.shards import features_file, map_rows, shard_at, write_rows
+from liftcore.io.safetensors_file import map_tensors, tensor_bytes, write_tensors
 from liftcore.lifting.geometry import WeightRequest, weight_request
 from liftcore.lifting.pieces import Pieces, Shape
 from liftcore.lifting.steps import Saved, part_of, row_arrays, saved_as, weights_of
@@ -46,6 +46,7 @@ from liftcore.values.pack import Views, pair, read_features
 from liftcore.values.region_weights import RegionWeights
 
 PIECE_VIEWS = 8  # some seconds of work, which is what is lost with a worker
+ROWS = 1 << 17  # splats of a block: with 512 channels of float16, 128 MiB
 SELECTED = 1 << 22  # splats beyond which a worker loads only those that its views see: 1 GB in the raster
 STEP = 1 << 18  # splats that are tested together for it
 SCENE = "scene.safetensors"
@@ -82,9 +83,10 @@ class Job(Pieces):
         """Return the file of a step of that piece, or of a table."""
         return self.folder / (f"{step}.safetensors" if number is None else f"{step}-{number:05}.safetensors")
 
-    def features_file(self, number: int) -> Path:
-        """Return the file of X of a block of splats."""
-        return self.folder / "lift" / features_file(number)
+    @property
+    def features_file(self) -> Path:
+        """The file of X, of row after row of all splats; each block has its place in it."""
+        return self.folder / "features"
 
     def has(self, step: str, number: int) -> bool:
         return self.piece_file(step, number).exists()
@@ -127,10 +129,16 @@ class Job(Pieces):
         return torch.zeros(last - first, self.channels, dtype=self.dtype)
 
     def save_features(self, piece: int, X: Tensor) -> None:
-        write_rows(self.features_file(piece), X)
+        handle = os.open(self.features_file, os.O_WRONLY | os.O_CREAT, 0o644)
+        with os.fdopen(handle, "wb") as file:
+            file.seek(self.bounds(piece)[0] * X.shape[1] * X.itemsize)
+            file.write(tensor_bytes(X))
+            file.flush()
+            os.fsync(file.fileno())  # the block counts as done once its columns are written
 
     def features(self) -> Tensor:
-        return torch.from_numpy(map_rows([shard_at(self.features_file(n)) for n in range(self.splat_pieces)]))
+        size = self.splats * self.channels
+        return torch.from_file(str(self.features_file), size=size, dtype=self.dtype).view(self.splats, self.channels)
 
     def samples(self) -> list[SampledRays]:
         return [read_view(self.view_file(number)).sample for number in range(len(self.names))]

@@ -21,13 +21,13 @@ from torch import Tensor
 
 from liftcore.errors import InvalidSettings, Unavailable
 from liftcore.io.safetensors_file import write_tensors
-from liftcore.io.shards import ROWS, write_index
 from liftcore.lifting.algebra import WeightStatistics
 from liftcore.lifting.checkpoint import Checkpoint
 from liftcore.lifting.engines.base import Engine, LocalEngine
 from liftcore.lifting.engines.blocks import (
     CODEBOOK,
     PIECE_VIEWS,
+    ROWS,
     SCENE,
     SELECTED,
     Job,
@@ -39,7 +39,6 @@ from liftcore.lifting.engines.blocks import (
 )
 from liftcore.lifting.inputs import LiftInputs
 from liftcore.lifting.planning.plan import Plan, plan_lift
-from liftcore.query.result import LiftResult, load_lift
 from liftcore.runtime.device import CPU, Device, choose_device
 from liftcore.runtime.folders import scratch_folder
 from liftcore.runtime.progress import Timings
@@ -157,7 +156,7 @@ class BlockFolder:
 
     engine: Engine
     folder: Path  # that all workers share
-    rows: int = ROWS  # splats of a block, whole pages of X
+    rows: int = ROWS  # splats of a block
     selected: int = SELECTED  # splats of scenes that workers load as a whole
 
     def plan(self, inputs: LiftInputs, device: Device, threads: int | None) -> Plan:
@@ -200,13 +199,6 @@ class BlockFolder:
         if job.packs:
             return job
         return replace(job, packs=tuple(_packs(source, set(views.unpaired), job.folder)))
-
-    @staticmethod
-    def deliver(job: Job, lift: LiftResult) -> LiftResult:
-        """Return a lift mapped from shards; their files may be deleted while it is open."""
-        columns = {name: part for name, part in vars(lift).items() if isinstance(part, Tensor) and name != "features"}
-        write_index(job.folder / "lift", columns, job.splat_pieces, lift.metadata.model_dump_json())
-        return load_lift(job.folder / "lift")
 
 
 @contextmanager

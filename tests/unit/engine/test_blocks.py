@@ -27,7 +27,7 @@ from liftcore.values.pack import write_pack
 from liftcore.values.settings import LiftSettings
 from tests.scenes import look_at, random_splats
 
-ROWS = 1 << 15  # of a shard, whose rows fill pages with two bytes a channel
+ROWS = 1 << 15  # of a block
 COUNT = 2 * ROWS + 500
 VIEWS = 10  # two pieces
 
