@@ -37,7 +37,7 @@ kernels: $(READY)
 	$(BIN)/python -m tests.kernels
 
 # Another torch than the lock's build brings the triton that it was made with: that one stays.
-gpu:  ## all that a card is for: CUDA's torch, conformance, speed, accuracy, gsplat beside; prints figures
+gpu:  ## all that a card is for: CUDA's torch, conformance, speed, accuracy; prints figures
 	@nvidia-smi -L 2>/dev/null | grep -q GPU || { echo "make gpu: nvidia-smi lists no card here, so nothing was run" >&2; exit 2; }
 	@$(MAKE) --no-print-directory setup
 	@$(BIN)/python -c 'import sys, torch; sys.exit(torch.version.cuda is None)' || { echo "installing torch's CUDA build" \
@@ -45,7 +45,6 @@ gpu:  ## all that a card is for: CUDA's torch, conformance, speed, accuracy, gsp
 	&& awk '/^[a-z]/ { kept = !/^(torch|torchvision|triton)==/ } kept' requirements.lock \
 	| $(BIN)/python -m pip install --quiet --require-hashes -r /dev/stdin; }
 	@$(BIN)/python -m tests.benchmarks.gpu --look
-	@$(BIN)/python -m pip install --quiet gsplat==1.5.3 ninja || echo "gsplat does not install here"
 	@held=0; env -u TRITON_INTERPRET TESTS_ON=cuda $(BIN)/python -m pytest -rs tests/gpu tests/properties \
 	tests/unit/solve/test_closed_form.py || held=$$?; \
 	env -u TRITON_INTERPRET $(BIN)/python -m tests.benchmarks.gpu --shared $(SHARED) && exit $$held

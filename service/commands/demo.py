@@ -257,7 +257,8 @@ def unpack_tabletop(folder: Path) -> Path:
 
     It is 12 published splat objects on a table. No photo went through CLIP: a region's vector is the text vector of
     its word with noise, moved so far from all words as vectors of photos are. Of the masks 30 % are merged with a
-    neighbour, 15 % split, 10 % of another word. What made the files is ``tests/benchmarks/demo_scene.py``.
+    neighbour, 15 % split, 10 % of another word. What made the files is
+    ``tests/benchmarks/demo_scene.py`` at 3229a850.
     """
     import zstandard
 

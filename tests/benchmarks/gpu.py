@@ -1,12 +1,8 @@
-"""Measurements of a GPU: speed, agreement with the processor, accuracy, and gsplat beside it. ``make gpu`` runs it.
+"""Measurements of a GPU: speed, agreement with the processor, and accuracy. ``make gpu`` runs it.
 
     python -m tests.benchmarks.gpu [--look] [--shared DIR]
 
 ``--look`` says only whether there is a card: a line, and status 2 where there is none. Status 1: two lifts differed.
-
-gsplat (``pip install gsplat==1.5.3``, whose CUDA code is compiled at its first call) lifts as people do who have a
-differentiable rasterizer: ``d/dX sum(render(X) B) = A^T B`` for a linear render, and ``A^T n`` of one channel more.
-Its alphas are capped at 0.999 where ours are at 0.99, so the two agree but for splats that are nearly opaque.
 """
 
 import statistics
@@ -15,13 +11,12 @@ import tempfile
 import time
 from argparse import ArgumentParser, RawTextHelpFormatter
 from collections.abc import Iterator, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import cosine_similarity, embedding_bag
+from torch.nn.functional import cosine_similarity
 
 import liftcore as lc
 from liftcore.evaluate.hardware import hardware, machine_line
@@ -29,9 +24,7 @@ from liftcore.lifting.files import lift_files
 from liftcore.runtime.device import CPU, Device, choose_device
 from liftcore.values.lift_file import TENSORS, save_lift
 from liftcore.values.settings import Preset
-from liftcore.values.views import cells_under
 from tests.benchmarks.base import read_pack, read_scene, scene_files, table_of
-from tests.benchmarks.room import room_cameras, room_regions, room_splats
 from tests.benchmarks.scenes import RoomSpec, write_voronoi_room
 from tests.benchmarks.tabletop import CASES, tabletop
 
@@ -111,81 +104,6 @@ def tabletop_rows(folder: Path, device: Device) -> Iterator[dict[str, Any]]:
         yield {"features, weights": case.name, "accuracy": figures.accuracy, "mIoU": figures.miou, **base}
 
 
-Views = Sequence[tuple[lc.Camera, lc.Regions]]
-
-
-def beside_gsplat(size: RoomSpec, device: Device) -> dict[str, Any]:
-    """Both lifts of the room in turns, from tensors to X: medians of three rounds after one that does not count.
-
-    The cosine of a splat's two features is a mean by total weight.
-    """
-    rasterization, splats = import_module("gsplat").rasterization, room_splats(size.splats)
-    cameras = room_cameras(size.views, *size.size)
-    views = [
-        (camera, at_pixels(room_regions(camera, k, 4, size.channels), camera)) for k, camera in enumerate(cameras)
-    ]
-    seconds: dict[str, list[float]] = {"splatlift": [], "gsplat": []}
-    features, expected, total_weight = torch.empty(0), torch.empty(0), torch.empty(0)
-    for _ in range(4):
-        start = time.perf_counter()
-        features, total_weight = splatlift_features(splats, views, device)
-        middle = time.perf_counter()
-        expected = gsplat_features(rasterization, device.place, splats, views)
-        seconds["splatlift"].append(middle - start)
-        seconds["gsplat"].append(time.perf_counter() - middle)
-    own_s, gsplat_s = (statistics.median(rounds[1:]) for rounds in seconds.values())
-    cosines = cosine_similarity(features, expected, dim=1).double()
-    cosine = float((cosines * total_weight).sum() / total_weight.sum())
-    return {"splatlift s": own_s, "gsplat s": gsplat_s, "times": gsplat_s / own_s, "cosine": cosine}
-
-
-def at_pixels(regions: lc.Regions, camera: lc.Camera) -> lc.Regions:
-    """The regions with a label a pixel."""
-    rows, columns = regions.labels.shape[1:]
-    y = cells_under(torch.arange(camera.height), camera.height, rows)
-    x = cells_under(torch.arange(camera.width), camera.width, columns)
-    return lc.Regions(regions.labels[:, y][:, :, x].contiguous(), regions.codebook)
-
-
-def splatlift_features(splats: lc.Splats, views: Views, device: Device) -> tuple[Tensor, Tensor]:
-    """X [P, F] f32 and total weights [P] f64, by ``row-sum``."""
-    cameras = {camera.name: camera for camera, _ in views}
-    observed = {camera.name: regions for camera, regions in views}
-    settings = {"dtype": "float32", "diagnostic_rays": 0, "device": device.kind}
-    lifted = lc.lift(splats, cameras, observed, "row-sum", **settings).to(CPU.place)
-    return lifted.features, lifted.total_weight.double()
-
-
-def gsplat_features(rasterization: Any, place: torch.device, splats: lc.Splats, views: Views) -> Tensor:
-    """X [P, F] f32 by a gradient through ``gsplat.rasterization``, zero where no ray met the splat."""
-    means, quats = splats.means.to(place), splats.quats.to(place)
-    scales, opacities = splats.log_scales.exp().to(place), torch.sigmoid(splats.opacity_logits).to(place)
-    X = torch.zeros(splats.count, views[0][1].codebook.shape[1] + 1, device=place, requires_grad=True)
-    for camera, regions in views:
-        intrinsics = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-        pose = torch.tensor(camera.viewmat, dtype=torch.float32)
-        rendered, _, _ = rasterization(
-            means, quats, scales, opacities, X, pose[None].to(place), intrinsics.float()[None].to(place),
-            camera.width, camera.height, packed=False,
-        )  # fmt: skip
-        (rendered[0] * dense_target(regions, place)).sum().backward()  # adds to what the views before left
-    assert X.grad is not None
-    sums = X.grad.cpu()
-    totals = sums[:, -1:]
-    return torch.where(totals > 0, sums[:, :-1] / totals, 0.0)
-
-
-def dense_target(regions: lc.Regions, place: torch.device) -> Tensor:
-    """B and n of every pixel, [H, W, F + 1] f32, n last: levels are added up, a quarter of gsplat's work."""
-    count, channels = regions.codebook.shape
-    book = torch.zeros(count + 1, channels + 1, device=place)  # its last row is what an unlabelled level reads
-    book[:count, :channels] = regions.codebook.to(place)
-    book[:count, channels] = 1.0
-    labels = regions.labels.to(place).flatten(1).T
-    target = embedding_bag(torch.where(labels >= 0, labels, count), book, mode="sum")
-    return target.reshape(*regions.labels.shape[1:], channels + 1)
-
-
 def main() -> int:
     """Print every table; the exit status."""
     names = {"prog": "python -m tests.benchmarks.gpu", "description": __doc__}
@@ -217,11 +135,6 @@ def main() -> int:
     _section("Beside the processor", near)
     if (options.shared / "tabletop").is_dir():
         _section("Accuracy on tabletop", tabletop_rows(options.shared / "tabletop", device))
-    try:
-        _section(f"gsplat by autograd ({SMALL})", [beside_gsplat(SMALL, device)])
-    except (RuntimeError, OSError, ImportError, AttributeError, TypeError) as error:
-        # What its compiler, its version or the card's memory says; a figure is not put in its place.
-        print(f"gsplat did not run: {type(error).__name__}: {' '.join(str(error).split())[:300]}")
     return 1 if broken else 0
 
 

@@ -150,10 +150,6 @@ def without(name: str) -> bytes:
     return ply(ROWS[:, keep], [PROPERTIES[k] for k in keep])
 
 
-def with_property_renamed(before: str, after: str) -> bytes:
-    return ply(ROWS, [after if name == before else name for name in PROPERTIES])
-
-
 def with_columns(*names: str) -> bytes:
     return ply(np.hstack([ROWS, np.zeros((5, len(names)), np.float32)]), [*PROPERTIES, *names])
 

@@ -71,6 +71,10 @@ def test_one_rank_of_a_training_is_no_scene(tmp_path: Path) -> None:
     for rank in (0, 1):
         with pytest.raises(lc.InvalidSplats, match="one of several GPUs"):
             lc.read_splats(tmp_path / f"ckpt_29999_rank{rank}.pt")
+    (tmp_path / "ckpt_29999_rank1.pt").rename(tmp_path / "alone_rank1.pt")
+    assert lc.read_splats(tmp_path / "ckpt_29999_rank0.pt").count == 3  # nothing says that it is a part
+    with pytest.raises(lc.InvalidSplats, match="one of several GPUs"):
+        lc.read_splats(tmp_path / "alone_rank1.pt")
 
 
 @pytest.mark.parametrize("column", ["x", "scale_1", "rot_2", "opacity"])
