@@ -410,6 +410,9 @@ PAIRS = [  # names of views and of cameras, and which pair
     (["train/000", "test/000"], ["000"], {}),
     (["train/000", "test/000"], ["train/000"], {"train/000": "train/000"}),
     (["train/000"], ["test/000"], {}),
+    (["0", "camA/0"], ["0"], {"0": "0"}),  # the same name comes first
+    (["A/0"], ["camA/0"], {}),  # whole folders only
+    (["K\u00fcche_0", "K\u00fcche_1"], ["Ku\u0308che_1"], {"K\u00fcche_1": "Ku\u0308che_1"}),  # of a Mac
 ]
 
 

@@ -10,7 +10,6 @@ import pytest
 import torch
 from hypothesis import strategies as st
 
-import liftcore as lc
 from liftcore.errors import InvalidInput, InvalidSettings
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import ReferenceRaster, dense_view, reading_matrix, selected_weights
@@ -85,17 +84,6 @@ def test_renders_equal_the_oracle(footprint, backend):
     def check(data) -> None:
         splats, camera, _, params = draw_case(data, footprint, backend)
         check_render(backend.open(splats), splats, camera, params)
-
-
-@pytest.mark.parametrize("kernel", Kernel)
-def test_weights_at_pixels_equal_the_oracle(kernel):
-    splats, camera, params = random_splats(7, 60, kernel=kernel), random_camera(7), CompositingParams()
-    view, pixels = dense_view(splats, camera, params), pixels_of(camera)
-    A = np.zeros(view.A.shape)
-    for row, (rows, weights) in zip(A, lc.weights_at(splats, camera, pixels, device="cpu"), strict=True):
-        row[rows.numpy()] = weights.numpy()
-    assert np.count_nonzero(A) > 500 and not view.cut.any()
-    assert np.abs(A - view.A).max() < INSIDE
 
 
 @every_footprint

@@ -10,12 +10,7 @@ import pytest
 import torch
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
-from liftcore.lifting import geometry
-from liftcore.lifting.files import lift_files
 from liftcore.runtime.one_thread import one_thread
-from liftcore.solve import closed_form, reweight
-from liftcore.values.settings import LiftSettings
-from tests.scenes import write_scene
 
 
 @pytest.fixture(autouse=True)
@@ -49,28 +44,6 @@ def test_it_is_one_thread_within_and_as_many_as_before_after_it():
     with pytest.raises(ValueError, match="no"), one_thread():
         raise ValueError("no")
     assert torch.get_num_threads() == 3 and all_are(3)
-
-
-def test_a_lift_has_no_threads_of_torch(tmp_path, monkeypatch):
-    thread_counts = {}
-
-    def watch(module, name: str) -> None:
-        work = getattr(module, name)
-
-        def count_threads(*arguments):
-            thread_counts[name] = torch.get_num_threads()
-            return work(*arguments)
-
-        monkeypatch.setattr(module, name, count_threads)
-
-    watch(geometry, "as_regions")
-    watch(geometry, "stacked")
-    watch(reweight, "row_blocks")
-    watch(closed_form, "sum_rows")
-    splats, cameras, features = write_scene(tmp_path, 3)[:3]
-    lift_files(splats, cameras, [features], LiftSettings.of(robust=True))
-    assert thread_counts == dict.fromkeys(("as_regions", "stacked", "row_blocks", "sum_rows"), 1)
-    assert torch.get_num_threads() == 3
 
 
 @pytest.mark.parametrize("first_fails", [False, True])

@@ -3,7 +3,6 @@
 import ast
 import logging
 from contextlib import contextmanager
-from dataclasses import replace
 from importlib import import_module
 from itertools import chain
 from pathlib import Path
@@ -14,7 +13,7 @@ import torch
 
 import liftcore as lc
 from liftcore.lifting.files import lift_files
-from tests.scenes import observed, random_splats, write_scene
+from tests.scenes import observed, write_scene
 
 ROOT = Path(__file__).parents[2]
 MOST_NAMES = 60  # of `import liftcore`
@@ -182,17 +181,6 @@ def test_the_current_card_may_be_named_by_its_number(scene):
             lc.InvalidSettings, match=r"cuda:0, the current GPU, got 'cuda:3'.*CUDA_VISIBLE_DEVICES=3"
         ):
             call(splats, cameras, views, device="cuda:3")
-
-
-def test_plan_warns_of_splats_with_activated_opacities_and_scales(scene):
-    _, _, cameras, views = scene
-    splats = random_splats(3, 200, spread=1.5)
-    opacities, scales = torch.sigmoid(splats.opacity_logits), splats.log_scales.exp()
-    plan = lc.plan(replace(splats, opacity_logits=opacities, log_scales=scales), cameras, views)
-    warnings = plan.warnings
-    assert any("no logits" in text for text in warnings) and any("no logarithms" in text for text in warnings)
-    assert plan.available_views == len(views)
-    assert not any("as if they were no" in text for text in lc.plan(splats, cameras, views).warnings)
 
 
 @contextmanager

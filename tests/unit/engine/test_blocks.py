@@ -264,8 +264,3 @@ def test_what_needs_all_rays_or_features_is_refused_before(
 ) -> None:
     with pytest.raises(lc.InvalidSettings, match=f"engine: expected settings that work on blocks.*got {got}; set"):
         lc.lift(*scene.values(), engine=LocalEngine(), **overrides)
-
-
-@pytest.fixture(scope="module")
-def lift(scene: dict[str, Any]) -> lc.LiftResult:
-    return lc.lift(*scene.values(), preset="row-sum", diagnostic_rays=0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import shutil
 from pathlib import Path
 
@@ -55,17 +54,6 @@ def test_distorted_photos_and_all_of_a_fisheye_have_a_lens(
         assert cameras.distorted == (("frame 1",) if lens else ())
 
 
-def test_panoramas_are_refused_with_what_to_make_of_them(tmp_path: Path) -> None:
-    panoramas = {1: (17, "EQUIRECTANGULAR", (640.0, 480.0))}
-    paths = [
-        write_files(tmp_path / files.__name__, files(panoramas, FIRST_IMAGE)) for files in (binary_files, text_files)
-    ]
-    paths.append(with_json(tmp_path, {**TRANSFORMS, "camera_model": "EQUIRECTANGULAR"}))
-    for path in paths:
-        with pytest.raises(InvalidCameras, match=r"got '?EQUIRECTANGULAR.*make pinhole photos of it"):
-            read_cameras(path)
-
-
 RECORD = {
     "img_name": "r_0",
     "width": 9,
@@ -106,34 +94,6 @@ def test_folder_and_zip_read_the_same_model(place: str, tmp_path: Path) -> None:
     write_files(scene / "sparse/9", {"cameras.bin": b"of no whole model"})
     for path in (scene, zipped(scene, "."), zipped(tmp_path, "scene")):
         assert len(read_cameras(path)) == len(ALL) and read_cameras(path).warnings == ()
-
-
-@pytest.mark.parametrize("others", [("sparse/1",), ("dense/sparse", "sparse/10"), ("colmap/sparse/0",)])
-@pytest.mark.parametrize("packed", [False, True])
-def test_several_models_are_refused_with_their_sizes(others: tuple[str, ...], packed: bool, tmp_path: Path) -> None:
-    scene = tmp_path / "scene"
-    write_files(scene / "sparse/0", named_model(*ALL[:2]))
-    for place in others:
-        write_files(scene / place, named_model(*ALL))
-    with pytest.raises(InvalidCameras, match=r"expected one (COLMAP model|scene)") as error:
-        read_cameras(zipped(scene, ".") if packed else scene)
-    if not packed:
-        assert "sparse/0 (2 images)" in error.value.got and f"{others[0]} (6 images)" in error.value.got
-        assert "name the folder" in error.value.hint
-    assert len(read_cameras(scene / "sparse/0")) == 2 and len(read_cameras(scene / others[0])) == 6
-
-
-def test_warnings_count_distorted_photos(tmp_path: Path) -> None:
-    report = inspect_file(write_files(tmp_path / "model", binary_files(DISTORTED)))
-    assert report["distorted"] == 2
-    assert report["sizes"] == ["640x480"]  # of the photos
-    assert any(
-        re.search(
-            "2 of 3 views are of distorted photos, of each of which 9[0-9]% or more is lifted: features must be", text
-        )
-        for text in report["warnings"]
-    )
-    assert inspect_file(write_files(tmp_path / "plain", binary_files()))["distorted"] == 0
 
 
 def test_what_is_whole_is_preferred_and_what_is_named_is_read(tmp_path: Path) -> None:

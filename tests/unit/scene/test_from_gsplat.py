@@ -73,15 +73,6 @@ def test_tensors_that_cannot_be_are_refused_by_their_name(overrides: dict[str, A
         lc.Splats.from_gsplat(**{**parameters(), "activated": False, **overrides})
 
 
-def test_numbers_that_look_activated_give_warnings_where_splats_are_made() -> None:
-    tensors = parameters()
-    active = {**tensors, "scales": tensors["scales"].exp(), "opacities": tensors["opacities"].sigmoid()}
-    warnings = lc.Splats.from_gsplat(**active, activated=False).warnings
-    assert any("no logits" in text for text in warnings) and any("no logarithms" in text for text in warnings)
-    assert not lc.Splats.from_gsplat(**tensors, activated=False).warnings
-    assert not lc.Splats.from_gsplat(**active, activated=True).warnings
-
-
 @pytest.mark.parametrize("rows", [3, 4])
 def test_camera_to_world_poses_of_either_convention_give_the_camera(rows: int) -> None:
     for seed in range(3):

@@ -113,19 +113,12 @@ def floats(path: Path, splats: Splats, offset: np.ndarray) -> None:
     write_splats(path, replace(splats, means=(splats.means.double() + torch.from_numpy(offset)).float()))
 
 
-def checkpoint(path: Path, splats: Splats, offset: np.ndarray) -> None:
-    means = splats.means.double() + torch.from_numpy(offset)
-    tensors = {"means": means, "quats": splats.quats, "scales": splats.log_scales, "opacities": splats.opacity_logits}
-    torch.save({"splats": tensors | {"sh0": splats.sh, "shN": torch.zeros(splats.count, 0, 3)}}, path)
-
-
 def splat(path: Path, splats: Splats, offset: np.ndarray) -> None:
     shifted = (splats.means.double() + torch.from_numpy(offset)).float()
     path.write_bytes(b"".join(splat_blocks(replace(splats, means=shifted))))
 
 
-FILES = {"doubles.ply": (doubles, 1e-5), "scene.pt": (checkpoint, 1e-5), "floats.ply": (floats, 0.5),
-         "scene.splat": (splat, 0.5)}  # fmt: skip
+FILES = {"doubles.ply": (doubles, 1e-5), "floats.ply": (floats, 0.5)}
 
 
 @pytest.mark.parametrize("name", FILES)

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import struct
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,8 +10,6 @@ import pytest
 import torch
 
 import liftcore as lc
-from liftcore.evaluate.inspect import inspect_file
-from liftcore.io.splats import read_places, read_splats, some_rows, write_splats
 from liftcore.query.splat_colours import view_colours
 from liftcore.raster.reference import dense_view
 from liftcore.scene.compositing import CompositingParams
@@ -23,7 +17,6 @@ from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
 from tests.scenes import look_at, observed, random_camera, random_splats
 
-FILES = Path(__file__).parents[2] / "data" / "splats"
 COUNT, BROKEN = 40, {"means": 5, "log_scales": 9, "quats": 17, "opacity_logits": 20}
 VALID_ROWS = torch.tensor([row not in BROKEN.values() for row in range(COUNT)])
 ODD = {"means": np.nan, "log_scales": np.inf, "quats": -np.inf, "opacity_logits": np.nan}
@@ -85,55 +78,6 @@ def test_a_colour_that_is_no_number_is_grey_from_everywhere(kernel: Kernel) -> N
     assert torch.equal(with_colours.opacity_logits, splats.opacity_logits)
 
 
-def files(folder: Path) -> Iterator[tuple[Path, int, int]]:
-    """Yield a file of each format that can hold such numbers, its number of invisible splats and of grey ones."""
-    splats = random_splats(3, COUNT)
-    with_colours = replace(splats, sh=torch.rand(COUNT, 4, 3))
-    write_splats(folder / "s.ply", with_colours)
-    content = (folder / "s.ply").read_bytes()
-    start, stride = (
-        content.index(b"end_header\n") + 11,
-        4 * len(with_colours.layout or read_splats(folder / "s.ply").layout),
-    )
-    names = read_splats(folder / "s.ply").layout
-    rows = np.frombuffer(content[start:], np.dtype([(name, "<f4") for name in names])).copy()
-    assert rows.itemsize == stride
-    rows["x"][5], rows["rot_1"][17], rows["f_rest_3"][7] = np.nan, np.inf, np.nan
-    (folder / "s.ply").write_bytes(content[:start] + rows.tobytes())
-    yield folder / "s.ply", 2, 1
-    torch.save({"splats": {
-        "means": torch.from_numpy(broken(splats)["means"].numpy()).double(), "quats": splats.quats,
-        "scales": splats.log_scales, "opacities": splats.opacity_logits,
-        "sh0": torch.full((COUNT, 1, 3), np.nan), "shN": torch.zeros(COUNT, 0, 3),
-    }}, folder / "s.pt")  # fmt: skip
-    yield folder / "s.pt", 1, COUNT
-    content = bytearray(b"".join(some_rows(folder / "s.ply", np.ones(COUNT, bool), ".splat")))
-    content[32 * 3 : 32 * 3 + 4] = struct.pack("<f", np.nan)
-    content[32 * 4 + 12 : 32 * 4 + 16] = struct.pack("<f", -1.0)  # a scale, of which there is no logarithm
-    (folder / "s.splat").write_bytes(bytes(content))
-    yield folder / "s.splat", 2, 0
-    head, end, body = (FILES / "degree1.compressed.ply").read_bytes().partition(b"end_header\n")
-    (folder / "s.compressed.ply").write_bytes(head + end + struct.pack("<f", np.nan) + body[4:])
-    yield folder / "s.compressed.ply", 256, 0  # a whole chunk of 300 splats
-
-
-def test_files_of_every_format_keep_their_rows_and_count_what_is_none(tmp_path: Path) -> None:
-    for path, unseen, grey in files(tmp_path):
-        splats = read_splats(path)
-        text = " | ".join(splats.warnings)
-        assert (f"{unseen} of {splats.count} splats have a place" in text) == (unseen > 0), path
-        assert (f"{grey} of {splats.count} splats have a colour" in text) == (grey > 0), path
-        assert int(torch.isneginf(splats.opacity_logits).sum()) == unseen
-        report = json.loads(json.dumps(inspect_file(path), allow_nan=False))
-        assert set(splats.warnings) <= set(report["warnings"])
-        assert np.isfinite(read_places(path)).all()
-        np.testing.assert_array_equal(read_places(path), splats.means.numpy())
-        for suffix in (".ply", ".splat", ".spz"):
-            copy = tmp_path / f"copy{suffix}"
-            copy.write_bytes(b"".join(some_rows(path, np.ones(splats.count, bool), suffix)))
-            assert read_splats(copy).count == splats.count
-
-
 def test_whole_and_empty_opacities_and_flat_splats_are_numbers() -> None:
     values = geometry_of(random_splats(3, COUNT))
     values["opacity_logits"][:2] = torch.tensor([np.inf, -np.inf])
@@ -143,19 +87,3 @@ def test_whole_and_empty_opacities_and_flat_splats_are_numbers() -> None:
         torch.equal(getattr(splats, name), values[name]) for name in ("opacity_logits", "log_scales", "quats")
     )
     assert bool(torch.isfinite(lc.render(splats, random_camera(0), torch.ones(COUNT))).all())
-
-
-def test_questions_take_what_the_lift_took(tmp_path: Path) -> None:
-    splats = Splats(**broken(random_splats(3, COUNT)))
-    cameras = {f"v{number}": random_camera(number, name=f"v{number}") for number in range(3)}
-    views = {name: observed(number, 0) for number, name in enumerate(cameras)}
-    scene = lc.Scene(lc.lift(splats, cameras, views, "row-sum"), splats, cameras)
-    first = int(np.flatnonzero(scene.has_feature)[0])
-    answer = scene.ask(lc.Query(like=[f"splat:{first}"], threshold=-1.0))
-    assert (
-        not answer.selected[~VALID_ROWS.numpy()].any()
-        and answer.box is not None
-        and np.isfinite(np.array(answer.box)).all()
-    )
-    assert all(np.isfinite(np.array(item.box)).all() for item in scene.objects(answer).objects)
-    assert scene.attention(answer, "v0").max() > 0 and np.isfinite(scene.render("v0")).all()

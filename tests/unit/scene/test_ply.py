@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import tracemalloc
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from liftcore.io.ply import BLOCK_ROWS
 from liftcore.io.splats import read_splats, recoloured, some_rows, write_splats
 from liftcore.query.splat_colours import view_colours
 from liftcore.scene.splats import Kernel
-from tests.scenes import look_at, random_splats
+from tests.scenes import look_at
 
 ROTATION = [f"rot_{i}" for i in range(4)]
 SCALES = [f"scale_{i}" for i in range(3)]
@@ -97,19 +96,6 @@ def test_forced_kernel_overrules_the_properties(tmp_path: Path) -> None:
     assert flat.log_scales.shape == (5, 2)
     with pytest.raises(InvalidSplats, match=r"'scale_2' of a 3dgs splat.*nearest dialect is 2DGS"):
         read_splats(with_ply(tmp_path, ply_bytes(DIALECTS["2dgs"])), Kernel.GAUSSIAN_3D)
-
-
-@pytest.mark.parametrize("kernel", list(Kernel))
-def test_a_lift_reads_no_colours_and_no_extras(tmp_path, kernel):
-    splats = random_splats(4, 9, kernel=kernel)
-    extras = {"mask": torch.ones(9)}
-    write_splats(tmp_path / "s.ply", replace(splats, sh=torch.ones(9, 16, 3), extras=extras))
-    full, bare = read_splats(tmp_path / "s.ply"), read_splats(tmp_path / "s.ply", colour=False)
-    assert full.sh is not None
-    assert "mask" in full.extras
-    assert (bare.sh, bare.sb_params, dict(bare.extras), bare.kernel) == (None, None, {}, kernel)
-    for name in ("means", "quats", "log_scales", "opacity_logits"):
-        assert torch.equal(getattr(bare, name), getattr(full, name))
 
 
 def test_elements_behind_the_vertices_are_passed_over(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from liftcore.io.transforms import transforms_of
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
-from liftcore.scene.views import cameras_of_views, require_pairs, view_names
+from liftcore.scene.views import require_pairs, view_names
 from tests.inria_file import write_inria_cameras
 
 K = np.array([[50.0, 0.0, 32.0], [0.0, 51.0, 24.0], [0.0, 0.0, 1.0]])
@@ -159,24 +159,6 @@ def test_more_views_than_a_scene_may_have_are_refused_before_they_are_read(
         path = with_json(tmp_path, [{"img_name": "a"}] * 3)
     with pytest.raises(InvalidCameras, match=r"at most 2 views, got 3 or more; lift fewer photos"):
         read_cameras(path)
-
-
-@pytest.mark.parametrize(
-    ("views", "cameras", "pairs"),
-    [
-        (["0", "camA/0"], ["0"], {"0": "0"}),  # the same name comes first
-        (["A/0"], ["camA/0"], {}),  # whole folders only
-        # More folders may precede those that distinguish cameras of a rig.
-        (["/d/camA/0", "/d/camB/0"], ["camA/0", "camB/0"], {"/d/camA/0": "camA/0", "/d/camB/0": "camB/0"}),
-        (["K\u00fcche_0", "K\u00fcche_1"], ["Ku\u0308che_1"], {"K\u00fcche_1": "Ku\u0308che_1"}),  # of a Mac
-    ],
-)
-def test_names_pair_as_they_are_or_by_their_last_part_where_it_is_one_of_a_kind(
-    views: list[str], cameras: list[str], pairs: dict[str, str]
-) -> None:
-    assert cameras_of_views(views, cameras) == pairs
-    back = {camera: view for view, camera in pairs.items()}
-    assert cameras_of_views(cameras, views) == back
 
 
 @pytest.mark.parametrize(

@@ -162,12 +162,6 @@ def test_a_step_over_very_many_terms_keeps_its_digits(rows, channels):
     assert np.abs(got - exact).max() < 1e-6 * exact.max()
 
 
-def shares(weights: list[np.ndarray], splat: int) -> np.ndarray:
-    """Of every view in the weight of a splat."""
-    level_weights = np.array([view[splat].sum() for view in weights])
-    return level_weights / level_weights.sum()
-
-
 def test_slices_of_channels_are_compared_as_one_vector(monkeypatch):
     scene = random_scene(3, count=500)
     matrix = scene.after()
