@@ -13,9 +13,9 @@ from tests.promises.scenes import CHANNELS, HEIGHT, KERNELS, WIDTH, RandomScene,
 GAIN = 1.2  # on opacity logits, of Tikhonov guidance
 
 
-def weights_of(scene: RandomScene, name: str, gain: float = 1.0) -> np.ndarray:
+def weights_of(scene: RandomScene, name: str, gain: float = 1.0, antialiased: bool = False) -> np.ndarray:
     """Return A [H W, P] of a view: renders of one splat each."""
-    params = lc.CompositingParams(gain)
+    params = lc.CompositingParams(gain, antialiased=antialiased)
     image = lc.render(scene.splats, scene.cameras[name], np.eye(scene.splats.count, dtype=np.float32), params)
     assert not isinstance(image, dict)
     return image.double().numpy().reshape(-1, scene.splats.count)
@@ -34,16 +34,26 @@ def read_grid(grid: np.ndarray) -> np.ndarray:
     return (upper * (1 - dy) + lower * dy).reshape(-1, grid.shape[2])
 
 
-def dense_lift(scene: RandomScene, preset: str) -> tuple[np.ndarray, np.ndarray]:
+SETTINGS: dict[str, dict[str, Any]] = {
+    "row-sum": {"preset": "row-sum"},
+    "tikhonov": {"preset": "tikhonov"},
+    "antialiased": {"preset": "tikhonov", "antialiased": True},
+    "argmax": {"preset": "argmax"},
+    "top-k": {"preset": "top-k", "top_k": 3},
+}
+
+
+def dense_lift(scene: RandomScene, name_of_settings: str) -> tuple[np.ndarray, np.ndarray]:
     """Return X [P, F] and the weights D [P] that it is divided by, in float64."""
-    count = scene.splats.count
+    count, settings = scene.splats.count, SETTINGS[name_of_settings]
     sums, D = np.zeros((count, CHANNELS)), np.zeros(count)
     for name, view in scene.views.items():
-        A = weights_of(scene, name, GAIN if preset == "tikhonov" else 1.0)
-        if preset == "tikhonov":
+        is_squared = settings["preset"] == "tikhonov"
+        A = weights_of(scene, name, GAIN if is_squared else 1.0, settings.get("antialiased", False))
+        if is_squared:
             A = A**2
-        if preset == "argmax":
-            A = np.where(np.arange(count) == A.argmax(axis=1)[:, None], A, 0)
+        if largest := {"argmax": 1, "top-k": 3}.get(settings["preset"]):
+            A = np.where(np.sort(A, axis=1)[:, -largest, None] <= A, A, 0)
         if isinstance(view, lc.FeatureGrid):
             sums += A.T @ read_grid(view.grid.double().numpy())
             D += A.sum(axis=0)
@@ -55,20 +65,31 @@ def dense_lift(scene: RandomScene, preset: str) -> tuple[np.ndarray, np.ndarray]
     return np.divide(sums, D[:, None], out=np.zeros_like(sums), where=D[:, None] > 0), D
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("grids", [False, True])
-@pytest.mark.parametrize("preset", ["row-sum", "tikhonov", "argmax"])
-def test_lift_equals_its_dense_definition(preset: str, grids: bool, kernel: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "kernel"),
+    [(name, kernel) for name in SETTINGS for kernel in KERNELS[: 1 if name == "antialiased" else 3]],
+)
+def test_lift_equals_its_dense_definition(name: str, kernel: str, grids: bool) -> None:
     scene = random_scene(11, count=60, grids=grids, kernel=kernel, wrong=0.3)
-    X, D = dense_lift(scene, preset)
-    result = lc.lift(*scene.arguments(), preset=preset, progress=False)
+    X, D = dense_lift(scene, name)
+    result = lc.lift(*scene.arguments(), **SETTINGS[name], progress=False)
     clear = D > 1e-4
-    assert clear.sum() > (10 if preset == "argmax" else 30)
+    assert clear.sum() > (10 if name == "argmax" else 30)
     error = np.linalg.norm(result.features.double().numpy() - X, axis=1)[clear]
     assert (error / np.linalg.norm(X, axis=1)[clear]).max() < 1e-3
     assert result.has_feature.numpy()[clear].all()
-    total = sum(weights_of(scene, name).sum(axis=0) for name in scene.views)
+    antialiased = name == "antialiased"
+    total = sum(weights_of(scene, view, antialiased=antialiased).sum(axis=0) for view in scene.views)
     np.testing.assert_allclose(result.total_weight.numpy(), total, rtol=1e-4, atol=1e-4)
+
+
+def test_a_lift_of_every_third_pixel_speaks_for_all_of_them() -> None:
+    scene = random_scene(11, count=60)
+    full, strided = (lc.lift(*scene.arguments(), preset="row-sum", stride=n, progress=False) for n in (1, 3))
+    assert strided.diagnostics["rays"] < full.diagnostics["rays"] / 7
+    assert float(strided.total_weight.sum() / full.total_weight.sum()) == pytest.approx(1, abs=0.05)
+    assert agreement(strided, full) > 0.9
 
 
 @pytest.mark.parametrize("settings", [{"preset": "row-sum"}, {"preset": "tikhonov"}, {}], ids=str)

@@ -29,9 +29,8 @@ from tests.properties.oracle import (
     dense,
     one_region_a_ray,
     pixels_of,
-    same_bits,
 )
-from tests.scenes import look_at, random_camera, random_grid, random_regions, random_splats, scenes
+from tests.scenes import look_at, random_camera, random_grid, random_splats, scenes
 
 if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera
@@ -241,32 +240,6 @@ def test_views_walked_in_a_row_are_those_walked_alone_to_the_bit(footprint, back
     check_iterated_views(backend.open(splats), backend.open(splats), params)
 
 
-@every_footprint
-def test_the_number_of_threads_changes_no_bit(footprint):
-    (splats, params), camera = seeded(footprint, 7, 3_000), random_camera(7, 200, 150)
-    gain, strided = replace(params, opacity_logit_scale=1.2), replace(params, stride=3, offset=(1, 2))
-    serial, parallel = CpuRaster(splats, threads=1), CpuRaster(splats, threads=5)
-    for case_params, weighting in (
-        (params, Weighting()),
-        (gain, Weighting(2)),
-        (gain, Weighting(2, top_k=3)),
-        (strided, Weighting(1, top_k=2)),
-    ):
-        for observation in (random_regions(7, 4, 30, (75, 100)), random_grid(7, (10, 13))):
-            first, second = (
-                raster.region_weights(camera, observation, case_params, weighting) for raster in (serial, parallel)
-            )
-            assert same_bits(first, second)
-    labels = torch.arange(3_000, dtype=torch.int32) % 60 - 1
-    for case_params in (params, gain):
-        for product in (
-            lambda raster, case_params=case_params: raster.row_sums(camera, case_params),
-            lambda raster, case_params=case_params: raster.strongest_labels(camera, labels, case_params),
-        ):
-            first, second = product(serial), product(parallel)
-            assert first.any() and torch.equal(first, second)
-
-
 def test_images_and_traced_rays_are_whole_whatever_the_stride():
     splats, camera = random_splats(5, 300), random_camera(5, 61, 47)
     raster, params = CpuRaster(splats), CompositingParams(stride=4, offset=(3, 1))
@@ -276,22 +249,6 @@ def test_images_and_traced_rays_are_whole_whatever_the_stride():
         got, full = (raster.ray_rows(camera, rays, case_params) for case_params in (params, CompositingParams()))
         assert torch.equal(got.splats, full.splats)
         assert torch.allclose(got.weights, full.weights, atol=1e-6)
-
-
-def test_the_oracle_is_a_backend_that_gives_the_same_products():
-    splats, camera = random_splats(1, 30), random_camera(1)
-    assert not dense_view(splats, camera, GAIN).cut.any()
-    fast, reference = CpuRaster(splats), ReferenceRaster(splats)
-    observation, params = random_regions(1), replace(GAIN, stride=2, offset=(1, 0))
-    actual, expected = (
-        raster.region_weights(camera, observation, params, Weighting(2)) for raster in (fast, reference)
-    )
-    assert np.abs(dense(actual, 30, 5) - dense(expected, 30, 5)).max() < INSIDE
-    assert torch.equal(actual.total_weight_splats, expected.total_weight_splats)
-    assert torch.allclose(actual.total_weight, expected.total_weight, atol=INSIDE)
-    assert torch.allclose(fast.row_sums(camera, GAIN), reference.row_sums(camera, GAIN), atol=INSIDE)
-    sample = pixels_of(camera)[::50]
-    assert torch.equal(fast.ray_rows(camera, sample, GAIN).indptr, reference.ray_rows(camera, sample, GAIN).indptr)
 
 
 @every_backend

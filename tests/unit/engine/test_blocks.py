@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -41,18 +40,6 @@ class Shuffled(LocalEngine):
             work(job, piece, self.threads)
         work(job, order[0], self.threads)
         yield from order
-
-
-class Twice(LocalEngine):
-    """An engine that runs each piece on two workers at once, as a cluster may that takes one for dead."""
-
-    def run(self, work: Any, job: Any, pieces: int) -> Iterator[int]:
-        with ThreadPoolExecutor(2) as pool:
-            for piece in range(pieces):
-                futures = [pool.submit(work, job, piece, self.threads) for _ in range(2)]
-                for completed in futures:
-                    completed.result()
-                yield piece
 
 
 def halves_and_quarters(camera: lc.Camera, rng: np.random.Generator) -> np.ndarray:
@@ -103,44 +90,6 @@ def assert_same(left: lc.LiftResult, right: lc.LiftResult) -> None:
         if first is not None:
             assert (first.dtype, first.shape) == (second.dtype, second.shape), name
             assert first.numpy().tobytes() == second.numpy().tobytes(), name
-
-
-def assert_same_metadata(left: lc.LiftResult, right: lc.LiftResult) -> None:
-    """Compare the metadata of lifts, including the plan but without timings."""
-    first, second = (lift.metadata.model_dump(exclude={"timings"}) for lift in (left, right))
-    assert first == second
-
-
-@pytest.mark.parametrize(
-    "overrides",
-    [
-        {"preset": "row-sum", "objects": True},
-        {"preset": "default", "dtype": "float32"},
-    ],
-)
-def test_blocks_give_the_bits_of_a_lift_in_memory(scene: dict[str, Any], overrides: dict[str, Any]) -> None:
-    settings = LiftSettings.of(diagnostic_rays=200, **overrides)
-    expected = lc.lift(scene["splats"], scene["cameras"], scene["views"], settings)
-    # The quarters, of two halves.
-    assert expected.node_parents is not None and int((expected.node_parents >= 0).sum()) == 4
-    for engine in (Twice(1), Shuffled(2)):
-        result = in_blocks(engine, scene, settings)
-        assert_same(result, expected)
-        assert_same_metadata(result, expected)
-
-
-def test_worker_holds_the_splats_that_its_views_see(scene: dict[str, Any], tmp_path: Path) -> None:
-    counts: list[tuple[int, int]] = []
-
-    class Watching(LocalEngine):
-        def run(self, work: Any, job: Any, pieces: int) -> Iterator[int]:
-            cameras = [job.cameras[name] for name in job.names[:2]]
-            splats, ids = blocks.visible_splats(job, cameras, 1)
-            counts.append((splats.count, len(ids)))
-            yield from super().run(work, job, pieces)
-
-    in_blocks(Watching(1), scene, LiftSettings.of(preset="tikhonov"), folder=tmp_path)
-    assert 0 < counts[0][0] == counts[0][1] < 0.9 * COUNT
 
 
 def test_lift_goes_on_from_the_pieces_in_its_folder(scene: dict[str, Any], tmp_path: Path) -> None:

@@ -145,17 +145,6 @@ def test_a_photo_is_read_in_the_orientation_of_its_camera(tag: int, suffix: str,
         assert np.abs(np.asarray(ImageOps.exif_transpose(image)).astype(int) - upright).max() < 20
 
 
-def test_sizes_of_cameras_turn_the_photos_that_are_encoded(photos: Path, encode: Encode) -> None:
-    upright = blob(60, 40, (50, 0, 60, 10))
-    exif = Image.Exif()
-    exif[ORIENTATION] = 6
-    upright.transpose(Image.Transpose.ROTATE_90).save(photos / "a.png", exif=exif)
-    sizes = {"a": (600, 400)}
-    result, grids = encode(photos, sizes=sizes)
-    assert result.readings == {"a": Reading.ORIENTED}
-    assert grids["a"].shape == (2, 3, 3) and int(grids["a"].sum(dim=-1).argmax()) == 2
-
-
 def test_every_kind_of_picture_has_its_colours(photos: Path, encode: Encode) -> None:
     greys = {"L": 128, "LA": (128, 255), "RGBA": (128, 128, 128, 255), "CMYK": (127, 127, 127, 0)}
     for mode, value in greys.items():

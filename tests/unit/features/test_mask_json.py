@@ -129,19 +129,6 @@ def assert_within_a_pixel(actual: np.ndarray, expected: np.ndarray) -> None:
     assert not (actual & ~around.any(axis=0)).any() and not (around.all(axis=0) & ~actual).any()
 
 
-@pytest.mark.parametrize(
-    ("polygon", "pixel_count"),
-    [
-        ([[-50, -50, 50, -50, 50, 50, -50, 50]], 48),  # beyond the image on every side
-         ([[2, 2]], 0), ([[1, 1, 5, 1, 3, 1]], 0),  # no area
-        ([[0, 0, 8, 0, 8, 6, 0, 6], [0, 0, 8, 0, 8, 6, 0, 6]], 48),  # parts are united, not cut out of each other
-        ([[0, 0], [8, 0], [8, 6], [0, 6]], 48),  # points, as the labels of LeRF-OVS have them
-    ],
-)  # fmt: skip
-def test_polygons_cover_the_pixels_whose_centres_they_hold(polygon: Any, pixel_count: int) -> None:
-    assert fill_polygons((HEIGHT, WIDTH), read_polygons(polygon)).sum() == pytest.approx(pixel_count, abs=4)
-
-
 def test_polygons_beyond_their_image_are_reported(tmp_path: Path) -> None:
     corner = [[6, 4, 8.1, 4, 8.1, 6.1]]  # as drawn over the edge by hand
     tall = write(tmp_path / "tall", a=coco((0, 1, BOWL_POLYGON), image_0={"width": HEIGHT, "height": WIDTH}))

@@ -213,20 +213,6 @@ def test_every_mask_is_whole_on_one_level(masks: np.ndarray) -> None:
     assert all((level >= 0).any() for level in labels[1:])
 
 
-def test_largest_masks_come_first_and_of_equals_the_first() -> None:
-    masks = np.zeros((4, 1, 6), bool)
-    for number, (start, end) in enumerate([(0, 2), (0, 4), (2, 4), (3, 5)]):
-        masks[number, 0, start:end] = True
-    assert label_levels(list(masks), "a.json").tolist() == [
-        [[1, 1, 1, 1, -1, -1]],
-        [[0, 0, 2, 2, -1, -1]],
-        [[-1, -1, -1, 3, 3, -1]],
-    ]
-    masks = np.concatenate([np.eye(5, dtype=bool)[:, None], np.zeros((2, 1, 5), bool)])
-    assert label_levels(list(masks), "a.json").tolist() == [[[0, 1, 2, 3, 4]]]
-    assert label_levels([np.zeros((2, 2), bool)], "a.json").tolist() == [[[-1, -1], [-1, -1]]]
-
-
 def test_too_many_masks_over_a_pixel_are_refused_with_their_number() -> None:
     masks = [np.ones((2, 2), bool)] * MAX_LEVELS
     assert len(label_levels(masks, "a.json")) == MAX_LEVELS

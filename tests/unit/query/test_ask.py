@@ -6,21 +6,16 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound, SplatliftError
 from liftcore.io.splats import some_rows
-from liftcore.query import ask as ask_module
-from liftcore.query import segment as segment_module
-from liftcore.query.ask import answers, ask, locate, resolve_query
+from liftcore.query.ask import answers, ask, resolve_query
 from liftcore.query.directions import directions, read_vector
 from liftcore.query.question import Query
 from liftcore.query.result import load_lift
@@ -64,20 +59,6 @@ def exact(scene: Scene) -> Scene:
     return of(scene, rows, has_feature=torch.arange(COUNT) < COUNT - 1)
 
 
-def test_splats_that_mean_the_text_are_selected_the_best_with_places_and_a_box(exact: Scene) -> None:
-    answer = ask(exact, "x", Axes())
-    assert np.flatnonzero(answer.selected).tolist() == list(range(0, COUNT - 1, 3))
-    assert answer.count == len(range(0, COUNT - 1, 3))
-    assert answer.statistics["min"] <= answer.statistics["q50"] <= answer.statistics["max"]
-    places, means = locate(exact, answer, 4), exact.splats.means.numpy()
-    assert [best.splat for best in places.top] == [0, 3, 6, 9]  # of equal scores the first in the file
-    assert places.top[0].position == pytest.approx(means[0].tolist())
-    selected = means[answer.selected]
-    assert places.box == tuple(tuple(end.tolist()) for end in (selected.min(axis=0), selected.max(axis=0)))
-    assert len(locate(exact, answer, 1000).top) == COUNT - 1  # no splat without a feature
-    assert locate(exact, ask(exact, Query.of(("x",), ("y",), threshold=1.0), Axes()), 1).box is None
-
-
 def test_splats_without_weight_do_not_decide_the_threshold(exact: Scene) -> None:
     reference = ask(exact, "x", Axes())
     outliers = np.zeros((COUNT, CHANNELS))
@@ -104,26 +85,6 @@ def test_questions_together_have_the_bits_of_each_alone(scene: Scene) -> None:
     for batched, resolved_query in zip(answers(scene, resolved_queries), resolved_queries, strict=True):
         (single,) = answers(scene, [resolved_query])
         assert np.array_equal(batched.scores, single.scores) and batched.threshold == single.threshold
-
-
-@pytest.mark.parametrize("module", [ask_module, segment_module])
-def test_questions_use_one_thread_of_linear_algebra(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch, module: ModuleType
-) -> None:
-    libraries = ThreadpoolController().select(user_api="blas").lib_controllers
-    find_threshold, numbers = module.find_threshold, set[int]()
-
-    def record_threads(*args: Any) -> Any:
-        numbers.update(library.num_threads for library in libraries)
-        return find_threshold(*args)
-
-    monkeypatch.setattr(module, "find_threshold", record_threads)
-    with threadpool_limits(3, user_api="blas"):
-        if module is ask_module:
-            scene.ask("x", encoder=Axes())
-        else:
-            scene.segment(["x", "y"], encoder=Axes())
-        assert numbers == {1} and {library.num_threads for library in libraries} == {3}
 
 
 def test_what_cannot_be_asked_is_refused(scene: Scene) -> None:

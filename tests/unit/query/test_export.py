@@ -8,7 +8,6 @@ import pytest
 
 from liftcore.errors import InvalidLift
 from liftcore.io.splats import read_splats
-from liftcore.lifting.files import lift_files
 from liftcore.query.ask import ask
 from liftcore.query.colours import NOT_SEEN_COLOUR, colour_map
 from liftcore.query.export import coloured_ply, object_splats
@@ -16,8 +15,7 @@ from liftcore.query.question import Answer, Query
 from liftcore.query.scene import Scene
 from liftcore.query.terms import Region
 from liftcore.scene.harmonics import SH_C0
-from liftcore.values.settings import LiftSettings
-from tests.tiny_scene import SPLATS_A_CLUSTER, ply, splat_rows
+from tests.tiny_scene import ply, splat_rows
 
 
 @pytest.fixture
@@ -30,20 +28,6 @@ def scene(lift_tiny: Callable[..., Path], tmp_path: Path) -> Scene:
 
 def of_lamp(scene: Scene, threshold: float = 0.5) -> Answer:
     return ask(scene, Query.of((Region("left", 0, 2),), threshold=threshold))
-
-
-def test_the_object_is_what_was_selected_and_can_be_lifted_again(scene: Scene, tmp_path: Path) -> None:
-    answer = of_lamp(scene)
-    (tmp_path / "lamp.ply").write_bytes(b"".join(object_splats(scene, answer)))
-    rows = splat_rows()[answer.selected[:-1]]
-    assert SPLATS_A_CLUSTER * 0.8 <= len(rows) <= SPLATS_A_CLUSTER * 1.2
-    assert (tmp_path / "lamp.ply").read_bytes() == ply(rows)
-    files = tmp_path / "lamp.ply", tmp_path / "c.json", [tmp_path / "f.st"]
-    second_lift = lift_files(*files, LiftSettings.of(preset="row-sum"))
-    assert second_lift.features.shape[0] == len(rows)
-    all_splats = of_lamp(scene, -1.0)
-    assert np.array_equal(all_splats.selected, all_splats.has_feature)
-    assert b"".join(object_splats(scene, all_splats)) == ply(splat_rows())
 
 
 def test_scores_have_the_colours_of_the_map_and_what_was_not_seen_is_grey(scene: Scene, tmp_path: Path) -> None:

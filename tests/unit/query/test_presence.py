@@ -10,15 +10,10 @@ import torch
 
 from liftcore.errors import InvalidQuery
 from liftcore.query.ask import ask
-from liftcore.query.export import object_splats
-from liftcore.query.objects import objects
 from liftcore.query.presence import References, references_of
-from liftcore.query.question import Answer, Query
-from liftcore.query.render import view_mask
 from liftcore.query.result import LiftResult
 from liftcore.query.scene import Scene
 from liftcore.query.segment import segment
-from liftcore.query.terms import SplatTerm
 from liftcore.text import LVIS_TABLE, CachingEncoder
 from liftcore.text.table import TableEncoder
 from tests.tiny_scene import SPLATS_A_CLUSTER
@@ -50,36 +45,6 @@ def clip(scene: Scene, table: TableEncoder) -> Scene:
     values = {"total_weight": ones, "has_feature": ones > 0}
     lifted = replace(scene.lift, features=torch.from_numpy(rows.astype(np.float32)), **values)
     return Scene(lifted, scene.splats, scene.cameras)
-
-
-def test_absent_object_is_not_rendered_unless_kept(clip: Scene, table: TableEncoder) -> None:
-    absent = ask(clip, "sofa", table)
-    assert absent.threshold.value == np.inf and absent.threshold.explanation == absent.reason
-    assert objects(clip, absent).objects == ()
-    in_view = view_mask(clip, absent, "middle")
-    assert not in_view.mask.any() and not in_view.attention.any()
-    with pytest.raises(InvalidQuery, match="absent=keep"):
-        object_splats(clip, absent)
-    assert ask(clip, Query.of(("sofa",), threshold=0.0), table).count == 0
-    answer = ask(clip, Query.of(("sofa",), absent="keep"), table)
-    assert answer.count > 0 and answer.presence == absent.presence
-    with pytest.raises(InvalidQuery, match="drop, keep"):
-        Query.of(("sofa",), absent="hide")
-
-
-def test_of_several_words_the_absent_ones_are_left_out(clip: Scene, table: TableEncoder) -> None:
-    def are_equal(a: Answer, b: Answer) -> bool:
-        return np.array_equal(a.scores, b.scores) and np.array_equal(a.selected, b.selected)
-
-    cat = ask(clip, "cat", table)
-    combined = ask(clip, Query.of(("sofa", "cat")), table)
-    assert are_equal(combined, cat) and combined.present and "'sofa' is not there" in combined.reason
-    assert not are_equal(ask(clip, Query.of(("sofa", "cat"), absent="keep"), table), cat)
-    assert ask(clip, Query.of(("cat",), ("sofa",)), table).presence == cat.presence  # presence ignores negatives
-    example = Query.of((SplatTerm(0), "sofa"))
-    assert are_equal(ask(clip, example, table), ask(clip, Query.of((SplatTerm(0),))))
-    assert ask(clip, example, table).count > 0
-    assert ask(clip, Query.of((SplatTerm(0),))).present is None
 
 
 def test_references_that_mean_the_same_hide_nothing(clip: Scene, table: TableEncoder) -> None:

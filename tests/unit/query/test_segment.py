@@ -35,20 +35,6 @@ def clear(scene: Scene) -> Scene:
     return lifted
 
 
-def test_every_splat_gets_the_word_that_it_is_most_like(clear: Scene) -> None:
-    segmentation = segment(clear, ["lamp", "apple", "book"], EYE[[2, 0, 1]])
-    assert np.array_equal(segmentation.labels, np.array([1, 2, 0])[CLUSTER])
-    assert (segmentation.margin > 0.5).all()
-    means = clear.splats.means.numpy()
-    for label in segmentation.named_words:
-        members = means[segmentation.labels == label.row]
-        assert label.splats == SPLATS_A_CLUSTER and label.share == pytest.approx(1 / 3, abs=1e-6)
-        assert np.array(label.box) == pytest.approx(np.stack([members.min(axis=0), members.max(axis=0)]), abs=0.3)
-        assert label.score > 0.9 and 0 < label.threshold < 1
-    names = [segmentation.named_words[value - 1].word for value in segmentation.values[::SPLATS_A_CLUSTER]]
-    assert names == ["apple", "book", "lamp"]
-
-
 def test_words_that_are_not_there_name_nothing(clear: Scene) -> None:
     between = (EYE[0] + EYE[5]) / np.sqrt(2)  # the second best word of the first cluster
     words, vectors = ["apple", "pear", "book", "lamp", "void"], np.stack([EYE[0], between, *EYE[[1, 2, 7]]])

@@ -26,23 +26,6 @@ def lifted(scene: Scene) -> tuple[LiftResult, Splats]:
     return LiftResult.of(scene.lift), splats
 
 
-def test_rows_that_are_kept_come_back_as_they_were(lifted: tuple[LiftResult, Splats]) -> None:
-    result, splats = lifted
-    order = np.random.default_rng(1).permutation(splats.count)[:45]
-    moved_lift = result.transferred(splats, splats[order])
-    for name in ("features", "total_weight", "has_feature"):
-        assert torch.equal(getattr(moved_lift, name), getattr(result, name)[order]), name
-    expected = result[order]
-    assert (
-        expected.object is not None
-        and moved_lift.object is not None
-        and torch.equal(moved_lift.object, expected.object)
-    )
-    facts = moved_lift.diagnostics["transfer"]
-    assert (facts["rows"], facts["without_partner"]) == (45, 0)
-    moved_lift.require_splats(splats[order])
-
-
 def test_splats_of_elsewhere_find_no_partner_and_have_no_feature(lifted: tuple[LiftResult, Splats]) -> None:
     result, splats = lifted
     means = splats.means.clone()

@@ -14,10 +14,9 @@ import torch
 from plyfile import PlyData
 
 import liftcore as lc
-from liftcore.evaluate.inspect import describe_cameras, describe_splats
-from liftcore.io.labels import Labels
+from liftcore.evaluate.inspect import describe_cameras
 from liftcore.io.splat import splat_blocks
-from liftcore.io.splats import labelled, read_places, read_splats, some_rows, write_splats
+from liftcore.io.splats import read_places, read_splats
 from liftcore.io.spz import spz_blocks
 from liftcore.lifting.planning.views import visibility
 from liftcore.query.ask import ask, locate
@@ -38,7 +37,6 @@ from liftcore.values.settings import LiftSettings
 from tests.scenes import random_camera, random_regions, random_splats, splats_at
 
 UTM = np.array([500_000.25, 5_400_000.5, 300.125])
-ROUNDING = 2e-5  # of float32 about an origin near the splats, in scene units; half a metre about the file's
 
 
 def moved_splats(splats: Splats, offset: np.ndarray = UTM) -> Splats:
@@ -105,48 +103,9 @@ def test_scenes_about_their_own_origin_keep_it_and_their_bits() -> None:
         assert np.array_equal(copy.positions(), splats.means.numpy())
 
 
-def doubles(path: Path, splats: Splats, offset: np.ndarray) -> None:
-    write_splats(path, moved_splats(splats, offset))
-
-
-def floats(path: Path, splats: Splats, offset: np.ndarray) -> None:
-    write_splats(path, replace(splats, means=(splats.means.double() + torch.from_numpy(offset)).float()))
-
-
 def splat(path: Path, splats: Splats, offset: np.ndarray) -> None:
     shifted = (splats.means.double() + torch.from_numpy(offset)).float()
     path.write_bytes(b"".join(splat_blocks(replace(splats, means=shifted))))
-
-
-FILES = {"doubles.ply": (doubles, 1e-5), "floats.ply": (floats, 0.5)}
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_every_file_gives_the_positions_that_it_holds(name: str, tmp_path: Path) -> None:
-    write, step = FILES[name]
-    splats, path = random_splats(4, 200), tmp_path / name
-    write(path, splats, UTM)
-    actual = read_splats(path)
-    expected = splats.means.double().numpy() + UTM
-    assert actual.origin != FILE_ORIGIN and np.abs(actual.means.numpy()).max() < 16
-    assert np.abs(actual.positions() - expected).max() <= step
-    assert np.array_equal(read_places(path), actual.positions())
-    assert any("float32" in warning for warning in actual.warnings) == (step > 0.1)
-    description = describe_splats(actual)
-    assert np.abs(np.array(description["box"]) - [expected.min(axis=0), expected.max(axis=0)]).max() <= step
-    assert description["origin"] == list(actual.origin)
-    # What is written is in the same frame: doubles, or the file's own bytes.
-    mask = np.arange(200) % 3 == 0
-    (tmp_path / "some.ply").write_bytes(b"".join(some_rows(path, mask)))
-    assert np.abs(read_splats(tmp_path / "some.ply").positions() - actual.positions()[mask]).max() <= ROUNDING
-    numbers = {"object": np.arange(200, dtype=np.int32)}
-    (tmp_path / "more.ply").write_bytes(b"".join(labelled(path, Labels(numbers, {}))))
-    assert np.abs(read_splats(tmp_path / "more.ply").positions() - actual.positions()).max() <= ROUNDING
-    # The formats of viewers are about the origin: they have no room for it.
-    for suffix, blocks in ((".splat", splat_blocks), (".spz", spz_blocks)):
-        (tmp_path / f"again{suffix}").write_bytes(b"".join(blocks(actual)))
-        copy = read_splats(tmp_path / f"again{suffix}")
-        assert copy.origin == FILE_ORIGIN and torch.allclose(copy.means, actual.means, atol=1e-5)
 
 
 QUANTISED = Path(__file__).parents[2] / "data" / "splats"  # as splat-transform wrote them
