@@ -64,13 +64,6 @@ def zipped(members: dict[str, bytes]) -> bytes:
     return content.getvalue()
 
 
-def array_file(array: np.ndarray) -> bytes:
-    """Return the bytes of a .npy file."""
-    content = io.BytesIO()
-    np.save(content, array)
-    return content.getvalue()
-
-
 def zip_of_zeros(first: tuple[str, bytes], name: str, megabytes: int) -> bytes:
     """Return a zip of a member and so many zeros, made a megabyte at a time."""
     content = io.BytesIO(zipped(dict([first])))
@@ -214,21 +207,15 @@ def compressed(old: bytes, new: bytes) -> Callable[[], bytes]:
 SH_HALF = "meshes/0/primitives/0/attributes/KHR_gaussian_splatting:SH_DEGREE_2_COEF_1"
 SPLAT_FILES = [
     ("empty", b"", "empty file"),
-    ("noise", bytes(range(256)) * 9, "begins with"),
     ("zeros", bytes(4000), "expected splats"),
     ("truncated", ply(ROWS)[:-1], "truncated"),
     ("rows longer than their properties", ply(ROWS) + b"\1" * 20, "longer"),
     ("empty scene", ply(ROWS[:0]), "empty scene"),
-    ("ascii", b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", "ascii"),
     ("big-endian", b"ply\nformat binary_big_endian 1.0\nend_header\n", "binary_little_endian"),
     ("list property", head("element vertex 1", "property list uchar int a") + bytes(8), "scalar"),
-    ("unknown type", head("element vertex 1", "property half a"), "'half'"),
-    ("negative count", head("element vertex -5", "property float x"), "vertex -5"),
     ("huge count", head("element vertex 999999999999999", "property float x"), "truncated"),
-    ("count of 64 bits", head("element vertex 18446744073709551617", "property float x"), "vertex"),
     ("count of 5,000 digits", head("element vertex " + "9" * 5000), "zero or more"),
     ("no element", head(), "without one"),
-    ("no format", b"ply\nelement vertex 1\nproperty float x\nend_header\n", "format"),
     ("property twice", head("element vertex 1", "property float x", "property float x"), "same name"),
     ("other element first", head("element camera 1", "property float x"), "'vertex'"),
     ("foreign characters", HEADER + b"element vertex 1\nproperty float \xff\nend_header\n", "ASCII"),
@@ -243,21 +230,16 @@ SPLAT_FILES = [
     ("Git LFS", POINTER, "git lfs pull"),
     ("web page", b"<!DOCTYPE html>\n<html>", "web page"),
     ("gzip", b"\x1f\x8b\x08" + bytes(60), "expected splats"),
-    ("NumPy", npy(np.zeros(3)), "NumPy"),
     ("pickle", PICKLE, "pickle"),
     ("a pickle of code", checkpoint({"splats": {"means": Intruder()}}), "more than tensors"),
     ("another checkpoint", checkpoint({"model": {"weight": torch.zeros(2)}}), "'model'"),
     ("checkpoint without turns", checkpoint({"splats": {"means": torch.zeros(2, 3)}}), "quats"),
     ("checkpoint of integers", checkpoint({"splats": {"means": torch.zeros(2, 3, dtype=torch.int32)}}), "floats"),
-    (".splat of half a row", sample("degree3.splat")[:-9], "begins with"),
-    (".ksplat", b"\0\1\0\0" + struct.pack("<4I", 1, 1, 9, 9) + bytes(5000), "expected splats"),
     ("spz of version 9", b"NGSP\x09\0\0\0" + bytes(40), "version 9"),
     ("spz cut", sample("degree3.v4.spz")[:-40], "truncated"),
-    ("compressed PLY cut", sample("degree3.compressed.ply")[:-9], "bytes"),
     ("compressed PLY without bounds", compressed(b"float min_x", b"float mon_x"), "'min_x'"),
     ("compressed PLY without colour", compressed(b"packed_color", b"packed_colur"), "packed_color"),
     ("compressed PLY of more chunks", compressed(b"element chunk 1", b"element chunk 2"), "bytes"),
-    ("SOG that does not parse", sog("", "", None), "meta.json"),
     ("SOG of version 1", sog("", "version", 1), "version 2"),
     ("SOG of more splats than pixels", sog("", "count", 400), "400"),
     ("SOG without places", sog("", "means", None), "'means'"),
@@ -278,11 +260,6 @@ SPLAT_FILES = [
 ]
 SPLAT_BOMBS = [
     ("header of 64 MB", lambda: b"ply\n" + b"x" * (64 << 20), "end_header"),
-    (
-        "100,000 properties",
-        lambda: head("element vertex 1", *(f"property float p{k}" for k in range(100_000))),
-        "first",
-    ),
     ("200,000 comments", HEADER + b"comment\n" * 200_000 + b"end_header\n", "first"),
     ("spz 3 of 2^30 splats", lambda: zlib.compress(spz(3, 1 << 30), wbits=31), "1073741824"),
     ("spz 4 of 2^30 splats", spz(4, 1 << 30, 5), "1073741824"),
@@ -324,28 +301,20 @@ BINARY = {
 MANY_ROWS = struct.pack("<Q", 2**63)
 CAMERA_FILES = [
     ("empty", b"", "empty file"),
-    ("text", b"hello", "'hello'"),
-    ("broken JSON", b"{broken", "parse"),
     ("not UTF-8", b'{"a": "\xff\xfe"}', "parse"),
     ("Git LFS", POINTER, "git lfs pull"),
-    ("COLMAP's half", BINARY["cameras.bin"], "together"),
     ("no frames", with_camera(frames=None), "'frames'"),
     ("empty list", b"[]", "at least one view"),
     ("list of nothing", b"[{}]", "'img_name'"),
-    ("list of numbers", b"[3]", "list of int"),
-    ("no views", with_camera(frames=[]), "at least one view"),
     ("frames of numbers", with_camera(frames=[1]), "objects"),
     ("frame without a name", with_camera(frames=[{}]), "'file_path'"),
-    ("frame without a pose", with_camera(frames=[{"file_path": "a"}]), "matrix"),
     ("views twice", with_camera(frames=TWICE), "one view a name"),
     ("no size", with_camera(w=None), "size"),
     ("size of half a pixel", with_camera(w=9.5), "whole number"),
-    ("negative size", with_camera(w=-5), "w"),
     ("10^18 pixels", with_camera(w=10**18), "size"),
     ("focal length of zero", with_camera(fl_x=0), "focal"),
     ("NaN", with_camera(fl_x=float("nan")), "finite"),
     ("Infinity", with_camera(fl_x=float("inf")), "finite"),
-    ("beyond every float", cameras_json().replace(b"30.0", b"1e999"), "finite"),
     ("4,000 digits", cameras_json().replace(b"30.0", b"9" * 4000), "finite"),
     ("scaled pose", with_pose(np.diag([2.0, 2, 2, 1]).tolist()), "scaled by 2"),
     ("mirroring pose", with_pose(np.diag([1.0, -1, 1, 1]).tolist()), "mirrors (determinant -1)"),
@@ -358,9 +327,7 @@ CAMERA_FILES = [
     ("lens beyond the model", with_camera(camera_model="FISHEYE624"), "FISHEYE624"),
     ("lens that folds", with_camera(k1=-9), "distortion"),
     ("lens of two models", with_camera(camera_model="OPENCV_FISHEYE", p1=0.1), "fisheye"),
-    ("zero byte in a name", cameras_json().replace(b"images/left", b"images/\\u0000left"), "name"),
     ("half of a pair in a name", cameras_json().replace(b"images/left", b"images/\\ud800left"), "name"),
-    ("zip cut", zipped(IN_ZIP)[:-30], "zip"),
     ("zip in a zip", zipped({"sparse/0/model.zip": zipped(IN_ZIP)}), "zip"),
     ("zip of another size", patched(zipped(IN_ZIP), 24, 10), "zip"),
     ("zip of overlapping members", patched(zipped(IN_ZIP), 42, 0), "zip"),
@@ -386,19 +353,12 @@ ONES, BOOK, LABELS = np.ones((2, 2, 3), np.float32), np.ones((4, 3), np.float32)
 REGIONS = {"v/labels": LABELS, "v/codebook": BOOK}
 FEATURE_FILES = [
     ("empty", b"", "empty file"),
-    ("text", b"short", "begins with"),
     ("truncated", save({"v/grid": ONES})[:-1], "open"),
-    ("broken header", safetensors(b"{broken}"), "open"),
-    ("header beyond the end", safetensors(b"{}", 1000), "open"),
     ("overlapping offsets", tensors(12, v__grid=GRID, w__grid=tensor([1, 1, 2], 4, 12)), "open"),
-    ("offsets backwards", tensors(8, v__grid=tensor([1, 1, 2], 8, 0)), "open"),
-    ("negative shape", tensors(8, v__grid=tensor([-1, -1, 2], 0, 8)), "open"),
     ("a tensor twice", safetensors(f"{{{GRID_TEXT},{GRID_TEXT}}}".encode()) + bytes(8), "twice"),
     ("no channels", tensors(0, v__grid=tensor([1, 1, 0], 0, 0)), "empty"),
     ("no views", save({}), "at least one view"),
     ("unknown part", save({"v/depth": ONES}), "'v/depth'"),
-    ("no view's name", save({"grid": ONES}), "'grid'"),
-    ("labels alone", save({"v/labels": LABELS}), "labels"),
     ("codebook alone", save({"v/codebook": BOOK}), "codebook"),
     ("labels beside a grid", save(REGIONS | {"v/grid": ONES}), "with grid"),
     ("grid of two sides", save({"v/grid": BOOK}), "[h, w, F]"),
@@ -413,18 +373,9 @@ FEATURE_FILES = [
     ("text table", tiny_scene.text_table(), "text embeddings"),
     ("zip of a pickle", zipped({"archive/data.pkl": b"\x80\x02."}), "code"),
     ("pickle", PICKLE, "pickle"),
-    (
-        "half of a pair in a name",
-        safetensors(f"{{{GRID_TEXT}}}".replace("v/", "\\ud800/").encode()) + bytes(8),
-        "open",
-    ),
 ]
 FEATURE_BOMBS = [
     ("header of 2^63 bytes", safetensors(b"{}", 2**63), "header"),
-    ("header beyond its limit", safetensors(b"{" + b" " * 50, 33 << 20), "header"),
-    ("offsets beyond the end", tensors(8, v__grid=tensor([1000, 1000, 1000], 0, 4 * 10**9)), "open"),
-    ("shape beyond 64 bits", tensors(8, v__grid=tensor([2**40, 2**40, 2], 0, 8)), "open"),
-    ("shape that wraps to nothing", tensors(0, v__grid=tensor([2**63, 2, 2], 0, 0)), "open"),
     ("deep header", safetensors(b'{"a":' * 100_000), "open"),
     ("npy of 4 TB, as it says", b"\x93NUMPY\x01\x00v\x00" + SHAPE.ljust(117) + b"\n", "NumPy"),
 ]
@@ -441,14 +392,11 @@ def table_of(words: Any, rows: Any = ((1.0,),)) -> bytes:
 TABLE_FILES = [
     ("empty", b"", "empty file"),
     ("features", save(REGIONS), "features"),
-    ("vectors alone", array_file(np.eye(3)), "safetensors.numpy.save_file({'embeddings': array}"),
-    ("tensor alone", zipped({"archive/data.pkl": b"\x80\x02."}), "safetensors.numpy.save_file({'embeddings': array}"),
+    ("vectors alone", npy(np.eye(3)), "safetensors.numpy.save_file({'embeddings': array}"),
     ("no words", tensors(4, **WORD), "words"),
     ("zeros", table_of(["a"], [[0.0]]), "zero"),
     ("NaN", table_of(["a"], [[np.nan]]), "finite"),
     ("more words than rows", table_of(["a", "b"]), "words"),
-    ("words in an object", table_of({"a": 0}), "words"),
-    ("a word that is none", table_of([None]), "words"),
     ("half of a pair as a word", table_of('["\\ud800"]'), "words"),
     (
         "more tensors",
@@ -459,7 +407,6 @@ TABLE_FILES = [
 ]
 TABLE_BOMBS = [
     ("deep words", table_of("[" * 100_000), "words"),
-    ("a word of 5,000 digits", table_of("[" + "9" * 5000 + "]"), "words"),
     (
         "100,000 sides",
         tensors(4, embeddings=tensor([1] * 100_000, 0, 4), __metadata__={"words": '["a"]'}),
@@ -470,7 +417,6 @@ MASK_FILES = [
     ("fractions", tensors(24, v__mask=tensor([2, 3], 0, 24)), "mask"),
     ("class below none", save({"v/mask": np.full((2, 3), -2, np.int16)}), "-2"),
     ("no name", save({"v": np.zeros((2, 3), np.int16)}), "mask"),
-    ("no sides", save({"v/mask": np.zeros((), np.int32)}), "mask"),
     ("empty side", tensors(0, v__mask=tensor([10**9, 0], 0, 0, "I32")), "mask"),
     ("empty", b"", "empty file"),
 ]
@@ -484,10 +430,7 @@ def photo(side: int) -> bytes:
 
 PHOTO_FILES = [
     ("no zip", b"photos", "zip"),
-    ("nothing", zipped({}), "photo"),
-    ("no photo", zipped({"notes.txt": b"x"}), "photo"),
     ("another format", zipped({"a.jpg": photo(2)}), "JPEG"),
-    ("cut", zipped({"a.png": photo(2)})[:-9], "zip"),
     ("name of two lines", zipped({"a\n.png": photo(2)}), "name"),
 ]
 PHOTO_BOMBS = [
@@ -499,7 +442,6 @@ PHOTO_BOMBS = [
 LIFT_FILES = [
     ("empty", b"", "empty file"),
     ("features", save(REGIONS), "features"),
-    ("splats", ply(ROWS), "got splats"),
     ("tensors of no lift", save({"a": ONES}), "lift"),
     ("metadata of no lift", save({"features": ONES[0]}, metadata={"splatlift": "{"}), "lift"),
     ("pickle", PICKLE, "pickle"),
@@ -529,7 +471,6 @@ def binary_camera(model: int, *values: float) -> bytes:
 PINHOLE = b"1 PINHOLE 64 48 50 50 32 24\n"
 LINE = b"1 1 0 0 0 0 0 1 1 a.png\n"
 MODELS = [
-    ("images cut", BINARY | {"images.bin": BINARY["images.bin"][:-9]}, "bytes"),
     ("no images", BINARY | {"images.bin": b""}, "ends after 0"),
     ("2^62 images", BINARY | {"images.bin": struct.pack("<Q", 2**62)}, "4611686018427387904"),
     ("unknown model", BINARY | {"cameras.bin": binary_camera(99, 1, 1, 1, 1)}, "model id 99"),
@@ -540,11 +481,9 @@ MODELS = [
     ("place of NaN", BINARY | {"images.bin": binary_image(x=np.nan)}, "finite"),
     ("focal length of NaN", BINARY | {"cameras.bin": binary_camera(1, np.nan, 1, 1, 1)}, "focal"),
     ("half a model", {"cameras.bin": BINARY["cameras.bin"]}, "images.bin"),
-    ("the other half", {"images.bin": BINARY["images.bin"]}, "cameras.bin"),
     ("pointer", BINARY | {"images.bin": POINTER}, "git lfs pull"),
     ("width of letters", MODEL | {"cameras.txt": b"1 PINHOLE wide 48 1 1 1 1\n"}, "CAMERA_ID"),
     ("parameters missing", MODEL | {"cameras.txt": b"1 PINHOLE 64 48 1 1 1\n"}, "4 parameters"),
-    ("model of no name", MODEL | {"cameras.txt": b"1 CROOKED 64 48 1 1 1\n"}, "CROOKED"),
     ("pose of letters", MODEL | {"images.txt": b"0 1 0 0 0 0 0 zwei 1 a.jpg\n\n"}, "IMAGE_ID"),
     ("no empty lines", MODEL | {"images.txt": LINE + LINE}, "empty line"),
     ("name twice", MODEL | {"images.txt": LINE + b"\n" + LINE + b"\n"}, "one view a name"),
@@ -580,12 +519,9 @@ MASK_FOLDERS = [
     ("ids of halves", with_vectors(a_masks_npy=npy(np.full((3, 4), 0.5))), "whole numbers"),
     ("masks of objects", with_vectors(a_masks_npy=npy(OBJECTS)), "code"),
     ("masks of text", with_vectors(a_masks_npy=npy(np.array(["a"]))), "numbers"),
-    ("JSON of nothing", with_vectors(a_json=b""), "JSON"),
-    ("JSON cut", with_vectors(a_json=b'[{"segmentation": {"size": [3'), "JSON"),
     ("JSON too deep", with_vectors(a_json=b"[" * 100_000), "JSON"),
     ("JSON of no masks", with_vectors(a_json=b"[]"), "3 masks"),
     ("JSON of a number", with_vectors(a_json=b"3"), "list of masks"),
-    ("picture of more values", with_vectors(a_png=png(GREY + 1)), "values"),
     ("picture of nothing", with_vectors(a_png=png(GREY * 0)), "values"),
     ("picture in colours", with_vectors(a_png=png(Image.new("RGB", (4, 3)))), "colours"),
     ("picture cut", with_vectors(a_png=png(GREY)[:40]), "PNG"),
@@ -597,7 +533,6 @@ ARRAY_FOLDERS = [
     ("integers", {"a.npy": npy(np.zeros((2, 3, 4), np.int32))}, "[h, w, F]"),
     ("four axes", {"a.npy": npy(np.zeros((5, 2, 3, 4), np.float32))}, "[h, w, F]"),
     ("NaN", {"a.npy": npy(np.full((2, 3, 4), np.nan, np.float32))}, "finite"),
-    ("cut", {"a.npy": npy(np.zeros((2, 3, 4), np.float32))[:-4]}, "a.npy"),
     ("4 TB, as it says", {"a.npy": b"\x93NUMPY\x01\x00v\x00" + SHAPE.ljust(117) + b"\n"}, "a.npy"),
 ]
 BAD_FOLDERS = [

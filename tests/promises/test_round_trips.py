@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import struct
@@ -19,12 +18,13 @@ import numpy as np
 import pytest
 import torch
 from liftcore import evaluate, files
-from PIL import Image
 from safetensors.numpy import load_file
 from scipy.spatial.transform import Rotation
 
 from tests import tiny_scene
+from tests.promises.bad_files import npy, png
 from tests.promises.scenes import CHANNELS, KERNELS, random_grid, random_scene, random_splats, regions_of, write_pack
+from tests.run_lengths import sam_records
 
 SPLATS = Path(__file__).parents[1] / "data" / "splats"
 FOREIGN = sorted(path for path in SPLATS.iterdir() if not path.name.endswith(".decoded.ply"))
@@ -204,30 +204,6 @@ MASKS[0, :2, :4] = MASKS[1, 1:5, 3:7] = MASKS[2, 5:, 6:] = True  # the first two
 VECTORS = np.random.default_rng(0).normal(size=(3, CHANNELS)).astype(np.float32)
 
 
-def run_lengths(mask: np.ndarray) -> list[int]:
-    """Return COCO's counts down the columns of a mask, zeros first."""
-    flat = mask.T.ravel()
-    changes = np.flatnonzero(np.diff(flat, prepend=False))
-    return np.diff(changes, prepend=0, append=flat.size).tolist()
-
-
-def sam_records(masks: np.ndarray) -> str:
-    segmentations = [{"size": [*mask.shape], "counts": run_lengths(mask)} for mask in masks]
-    return json.dumps([{"segmentation": segmentation} for segmentation in segmentations])
-
-
-def png(values: np.ndarray) -> bytes:
-    content = io.BytesIO()
-    Image.fromarray(values).save(content, format="PNG")
-    return content.getvalue()
-
-
-def npy(values: np.ndarray) -> bytes:
-    content = io.BytesIO()
-    np.save(content, values)
-    return content.getvalue()
-
-
 @pytest.mark.parametrize("kind", ["a_masks.npy", "a.json", "a.png"])
 def test_masks_of_every_kind_become_regions_that_cover_them(kind: str, tmp_path: Path) -> None:
     masks = MASKS.copy()
@@ -236,7 +212,7 @@ def test_masks_of_every_kind_become_regions_that_cover_them(kind: str, tmp_path:
     picture = np.zeros(masks.shape[1:], np.uint8)
     for number, mask in enumerate(masks, start=1):
         picture[mask] = number
-    contents = {"a_masks.npy": npy(masks), "a.json": sam_records(masks).encode(), "a.png": png(picture)}
+    contents = {"a_masks.npy": npy(masks), "a.json": json.dumps(sam_records(masks)).encode(), "a.png": png(picture)}
     folder = tmp_path / "masks"
     folder.mkdir()
     (folder / "a.npy").write_bytes(npy(VECTORS))

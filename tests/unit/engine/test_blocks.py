@@ -24,7 +24,8 @@ from liftcore.runtime.progress import Timings
 from liftcore.values.lift_file import SCHEMA
 from liftcore.values.pack import write_pack
 from liftcore.values.settings import LiftSettings
-from tests.scenes import look_at, random_splats
+from tests.promises.scenes import look_at, random_grid, regions_of
+from tests.scenes import random_splats
 
 ROWS = 1 << 15  # of a block
 COUNT = 2 * ROWS + 500
@@ -42,38 +43,17 @@ class Shuffled(LocalEngine):
         yield from order
 
 
-def halves_and_quarters(camera: lc.Camera, rng: np.random.Generator) -> np.ndarray:
-    """Return labels [2, 12, 16] i32: halves of the plane z = 0 as a camera sees it and, on another level, quarters.
-
-    Some pixels are astray or without. Views agree on what is one thing, and on what its parts are.
-    """
-    v, u = np.mgrid[1:24:2, 1:32:2]
-    rays = np.stack([u, v, np.ones(u.shape)], axis=-1) @ np.linalg.inv(camera.K).T
-    pose = camera.viewmat
-    along, centre = rays @ pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
-    x, y, _ = np.moveaxis(centre - along * (centre[2] / along[..., 2:]), -1, 0)
-    labels = np.stack([x > 0, 2 + (x > 0) + 2 * (y > 0)])
-    # Of the same level.
-    right_labels = np.stack([rng.integers(-1, 2, u.shape), rng.choice([-1, 2, 3, 4, 5], u.shape)])
-    return np.where(rng.random(labels.shape) < 0.05, right_labels, labels).astype(np.int32)
-
-
 @pytest.fixture(scope="module")
 def scene() -> dict[str, Any]:
     """Return splats that a view sees in part, in three blocks, and views of regions and of grids."""
     rng = np.random.default_rng(1)
     splats = random_splats(3, COUNT, spread=6.0)
     splats = replace(splats, means=splats.means * torch.tensor([1.0, 1.0, 0.05]))  # a sheet: views see the same
-    cameras = {
-        name: look_at(name, rng.normal((0, 0, -4), 1), 32, 24, 30.0) for name in map("v{}".format, range(VIEWS))
+    cameras = {f"v{number}": look_at(rng.normal((0, 0, -4), 1), f"v{number}") for number in range(VIEWS)}
+    views = {
+        name: regions_of(camera, rng) if number % 2 else random_grid(rng)
+        for number, (name, camera) in enumerate(cameras.items())
     }
-    views = {}
-    for number, name in enumerate(cameras):
-        book = torch.from_numpy(rng.normal(0, 1, (6, 4)).astype(np.float32))
-        if number % 2:
-            views[name] = lc.Regions(halves_and_quarters(cameras[name], rng), book)
-        else:
-            views[name] = lc.FeatureGrid(rng.normal(0, 1, (6, 8, 4)).astype(np.float32))
     return {"splats": splats, "cameras": lc.Cameras(cameras), "views": views}
 
 
@@ -135,7 +115,7 @@ def test_folder_that_is_full_or_that_workers_do_not_see_is_named(scene: dict[str
 
 
 def test_folder_without_room_for_the_blocks_is_refused_before_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    cameras = {name: look_at(name, np.array([0, 0, -4.0]), 32, 24, 30.0) for name in ("v0", "v1", "v2")}
+    cameras = {name: look_at(np.array([0, 0, -4.0]), name) for name in ("v0", "v1", "v2")}
     plans = list[Plan]()
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1))
     result = lc.lift(
@@ -164,9 +144,7 @@ def few_views(seed: int, folder: str = "") -> dict[str, lc.FeatureGrid]:
 
 def test_features_in_the_place_of_others_are_lifted(tmp_path: Path) -> None:
     names = "cam/v0", "cam/v1", "cam/v2"
-    cameras = lc.Cameras(
-        {name: look_at(name, np.array([0.3 * k, 0, -4]), 32, 24, 30.0) for k, name in enumerate(names)}
-    )
+    cameras = lc.Cameras({name: look_at(np.array([0.3 * k, 0, -4]), name) for k, name in enumerate(names)})
     splats, pack = random_splats(3, 300), tmp_path / "pack.safetensors"
     for seed in (1, 2):
         write_pack(pack, few_views(seed, "cam/"), {})

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from safetensors.torch import load_file, save_file
 import liftcore as lc
 from liftcore.evaluate import evaluate_lift
 from tests.labelled_scene import FRAMES, LIFTED, OBJECTS, truth, write_lift
-from tests.unit.command_line import run
+from tests.promises.command_line import run
 
 LIFT = "kitchen.lift.safetensors"
 
@@ -43,14 +42,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def evaluate(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
-    status, out, err = run(capsys, "evaluate", *arguments, "--json")
-    assert (status, err) == (0, "")
-    return json.loads(out)
-
-
-def test_a_right_lift_scores_near_one(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    document = evaluate(capsys, folder / LIFT, folder / "labels.safetensors")
+def test_a_right_lift_scores_near_one(folder: Path) -> None:
+    document = run("evaluate", folder / LIFT, folder / "labels.safetensors", "--json").document
     means = document["means"]["all labelled"]
     assert (means["frames"], means["objects"], means["localised"]) == (2, 4, 1)
     assert min(means["object_micro"], means["frame_macro"], means["class_pooled"]) > 0.9
@@ -60,13 +53,13 @@ def test_a_right_lift_scores_near_one(folder: Path, capsys: pytest.CaptureFixtur
     for phrase, pooled in document["classes"].items():
         rows = [row for row in document["objects"] if row["phrase"] == phrase]
         assert pooled == sum(row["intersection"] for row in rows) / sum(row["union"] for row in rows)
-    status, out, _ = run(capsys, "evaluate", folder / LIFT, folder / "labels.safetensors")
-    assert status == 0 and out.startswith("all labelled: 4 objects in 2 frames, mIoU 9") and "red apple: IoU 9" in out
+    out = run("evaluate", folder / LIFT, folder / "labels.safetensors").out
+    assert out.startswith("all labelled: 4 objects in 2 frames, mIoU 9") and "red apple: IoU 9" in out
 
 
-def test_a_call_evaluates_as_the_command_does(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_call_evaluates_as_the_command_does(folder: Path) -> None:
     options = ["--threshold", "0.5", "--negative", "wall", "stuff"]
-    document = evaluate(capsys, folder / LIFT, folder / "labels.safetensors", *options)
+    document = run("evaluate", folder / LIFT, folder / "labels.safetensors", *options, "--json").document
     labels = lc.read_features(folder / "labels.safetensors")
     for lift in (str(folder / LIFT), lc.Scene(folder / LIFT)):
         evaluation = evaluate_lift(lift, labels, threshold=0.5, negatives=["wall", "stuff"])
@@ -85,11 +78,9 @@ def test_unlabelled_pixels_count_nowhere(folder: Path, tmp_path: Path) -> None:
     assert row.intersection == pytest.approx(80 * 25, rel=0.05)
 
 
-def test_words_that_the_encoder_lacks_and_views_without_cameras_are_named(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_words_that_the_encoder_lacks_and_views_without_cameras_are_named(folder: Path, tmp_path: Path) -> None:
     labels = write_labels(tmp_path, {**FRAMES, "frame_00009": 0}, ("red apple", "griffin"))
-    document = evaluate(capsys, folder / LIFT, labels)
+    document = run("evaluate", folder / LIFT, labels, "--json").document
     assert document["classes"].keys() == {"red apple"}
     assert any("lacks 'griffin': left out" in warning for warning in document["warnings"])
     assert any("'frame_00009' have labels but no camera" in warning for warning in document["warnings"])
