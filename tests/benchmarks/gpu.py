@@ -25,7 +25,7 @@ from liftcore.runtime.device import CPU, Device, choose_device
 from liftcore.values.lift_file import TENSORS, save_lift
 from liftcore.values.settings import Preset
 from tests.benchmarks.base import read_pack, read_scene, scene_files, table_of
-from tests.benchmarks.scenes import RoomSpec, write_voronoi_room
+from tests.benchmarks.scenes import RoomSpec, write_room
 from tests.benchmarks.tabletop import CASES, tabletop
 
 LARGE = RoomSpec(1_000_000, 300, (986, 728), 512)  # docs/results.md has it on an H100
@@ -35,7 +35,8 @@ SMALL = RoomSpec(200_000, 8, (640, 480), 512)  # to compare both devices on: the
 def whole_lift(size: RoomSpec, device: Device, preset: str) -> tuple[list[dict[str, Any]], list[str]]:
     """Seconds of a lift from files to a file by stage, the second of two; the tensors that differ between the two."""
     with tempfile.TemporaryDirectory(prefix="splatlift-room-") as folder:
-        files = write_voronoi_room(Path(folder), size)
+        write_room(Path(folder), size)
+        files = scene_files(Path(folder))
         settings, lifts = lc.LiftSettings.of(preset=preset, device=device.kind), []
         start = 0.0
         for _ in range(2):  # the first compiles kernels, and leaves the files in the memory of the machine
@@ -128,7 +129,8 @@ def main() -> int:
     if (options.shared / "plush").is_dir():
         _section("A view of plush", views_of(device, options.shared / "plush"))
     with tempfile.TemporaryDirectory(prefix="splatlift-room-") as folder:
-        near = [{"scene": "room", **beside_processor(write_voronoi_room(Path(folder), SMALL), device)}]
+        write_room(Path(folder), SMALL)
+        near = [{"scene": "room", **beside_processor(scene_files(Path(folder)), device)}]
     for name, pack in (("plush", "regions"), ("tabletop", "features")):
         if (options.shared / name).is_dir():
             near.append({"scene": name, **beside_processor(scene_files(options.shared / name, pack), device)})

@@ -5,7 +5,6 @@ import torch
 
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
-from liftcore.values.views import Regions
 
 _HALF = 3.0  # scene units from the middle of the room to its walls
 _BALLS = 12
@@ -61,27 +60,6 @@ def room_cameras(count: int, width: int, height: int) -> list[Camera]:
         focal = 0.8 * width
         cameras.append(Camera.pinhole(f"room_{k:03d}", width, height, focal, focal, width / 2, height / 2, pose))
     return cameras
-
-
-def room_regions(camera: Camera, seed: int, levels: int, channels: int) -> Regions:
-    """Make label maps like SAM's four levels: Voronoi regions, finer level by level, over random unit vectors."""
-    from scipy.spatial import KDTree
-
-    rng = np.random.default_rng(seed)
-    height, width = camera.height // 2, camera.width // 2
-    y, x = np.mgrid[:height, :width]
-    pixels = np.stack([y.ravel(), x.ravel()], axis=1)
-    maps, first = [], 0
-    for level in range(levels):
-        regions = 20 * 2**level
-        sites = rng.uniform(0, 1, (regions, 2)) * [height, width]
-        maps.append(first + KDTree(sites).query(pixels)[1].reshape(height, width))
-        first += regions
-    generator = torch.Generator().manual_seed(seed)
-    codebook = torch.nn.functional.normalize(
-        torch.randn(first, channels, generator=generator, dtype=torch.float32), dim=1
-    ).half()
-    return Regions(torch.from_numpy(np.stack(maps).astype(np.int32)), codebook)
 
 
 def _surfaces(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:

@@ -21,7 +21,7 @@ from liftcore.io.splats import write_splats
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.values.pack import as_views, write_pack
 from liftcore.values.views import NO_LABEL, ViewFeatures
-from tests.benchmarks.room import PART_LEVELS, room_cameras, room_parts, room_regions, room_splats
+from tests.benchmarks.room import PART_LEVELS, room_cameras, room_parts, room_splats
 from tests.inria_file import write_inria_cameras
 
 NOISE = 0.45
@@ -100,26 +100,6 @@ def _shrunk(camera: lc.Camera) -> lc.Camera:
     sizes = {"width": camera.width // SHRUNK, "height": camera.height // SHRUNK}
     lengths = {name: getattr(camera, name) / SHRUNK for name in ("fx", "fy", "cx", "cy")}
     return camera.replace(**sizes, **lengths)
-
-
-def write_voronoi_room(folder: Path, size: RoomSpec, different: int = 12) -> tuple[Path, Path, Path]:
-    """The room as files: Voronoi regions over random vectors, and no part is seen twice.
-
-    Args:
-        different: label maps that views take in turn, as making one takes longer than lifting it.
-    """
-    paths = folder / "point_cloud.ply", folder / "cameras.json", folder / "features.safetensors"
-    cameras = room_cameras(size.views, *size.size)
-    write_splats(paths[0], room_splats(size.splats))
-    write_inria_cameras(lc.Cameras(tuple(cameras)), paths[1])
-    maps = [room_regions(camera, k, 4, 1).labels for k, camera in enumerate(cameras[:different])]
-    views: dict[str, ViewFeatures] = {}
-    for k, camera in enumerate(cameras):
-        labels, generator = maps[k % len(maps)], torch.Generator().manual_seed(k)
-        rows = torch.randn(int(labels.max()) + 1, size.channels, generator=generator)
-        views[camera.name] = lc.Regions(labels, torch.nn.functional.normalize(rows, dim=1).half())
-    write_pack(paths[2], views, {"encoder": "random", "normalised": "true"})
-    return paths
 
 
 def main() -> None:
