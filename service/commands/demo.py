@@ -20,16 +20,14 @@ import httpx
 import numpy as np
 from PIL import Image
 
-from liftcore import read_cameras, read_features
 from liftcore.cli import Parser
-from liftcore.errors import InvalidInput, SplatliftError, Unavailable
+from liftcore.errors import InvalidInput, Unavailable
 from liftcore.files import camera_files, identify, visible_files
-from liftcore.text import BUILT_IN, NO_WORDS, OWN_WORDS
+from liftcore.text import NO_WORDS
 
 SHIPPED = Path(__file__).with_name("tabletop")
 CAMERA_FILES = ("cameras.json", "transforms.json", "cameras.zip")
 TABLE = "text_table.safetensors"
-ENCODERS = {space: encoder for encoder, space in BUILT_IN.items()}
 STOP_SECONDS = 20
 LAST_CHARACTERS = 3_000  # of the service's log, after a failure
 TIMEOUT = httpx.Timeout(600.0, connect=10.0)  # the first query loads an encoder
@@ -56,14 +54,15 @@ def run(options: argparse.Namespace) -> int:
     out.mkdir(parents=True, exist_ok=True)
     if options.scene is None:
         say("12 published splat objects on a table (sources: scene/LICENCES.md), with CLIP's vectors of words.")
-    scene = find_scene(options.scene or unpack_tabletop(out / "scene"), options.ask, out / "scene")
-    with serving(data, scene.encoder, out / "service.log") as url:
+    folder = options.scene or unpack_tabletop(out / "scene")
+    files, truth = find_files(folder, out / "scene"), read_truth(folder)
+    with serving(data, out / "service.log") as url:
         say(f"The service listens on {url}.")
         try:
-            report = show(scene, url, out, say)
+            report = show(files, truth, options.ask, url, out, say)
         except httpx.HTTPError as error:
             raise Unavailable("service", expected="an answer to each request", got=repr(error)) from None
-    report |= {"seconds": round(time.perf_counter() - begin, 1), "out": str(out.resolve())}
+    report |= {"scene": folder.name, "out": str(out.resolve()), "seconds": round(time.perf_counter() - begin, 1)}
     report["lift_file"] = str((data / "lifts" / f"{report['lift']}.safetensors").resolve())
     say(f"Pictures are in {report['out']}. All of it took {report['seconds']:.0f} s.")
     say(f"The lift is {report['lift_file']}")
@@ -73,10 +72,9 @@ def run(options: argparse.Namespace) -> int:
 
 
 @contextmanager
-def serving(data: Path, encoder: str, log: Path) -> Iterator[str]:
+def serving(data: Path, log: Path) -> Iterator[str]:
     """Run ``splatlift serve`` on a free port during the block; yield its address."""
-    options = ["--port", "0", "--data", str(data), "--encoder", encoder, "--json"]
-    command = [sys.executable, "-m", "liftcore.cli", "serve", *options]
+    command = [sys.executable, "-m", "liftcore.cli", "serve", "--port", "0", "--data", str(data), "--json"]
     with (
         log.open("wb") as stderr,
         subprocess.Popen(command, stdout=subprocess.PIPE, stderr=stderr, text=True) as server,
@@ -103,99 +101,94 @@ def client_of(url: str) -> httpx.Client:
     def require_success(response: httpx.Response) -> None:
         if response.is_error:
             response.read()
-            raise error_of(response.json())
+            require_no(response.json())
 
     hooks = {"response": [require_success]}  # a proxy of the environment is ignored
     return httpx.Client(base_url=url, timeout=TIMEOUT, trust_env=False, event_hooks=hooks)
 
 
-def error_of(problem: dict[str, Any]) -> SplatliftError:
-    """Return a problem of the service as an error."""
-    kind = Unavailable if problem["status"] >= 500 else InvalidInput
-    got, expected = problem.get("got", problem["detail"]), problem.get("expected", "success")
-    return kind(problem.get("argument", "service"), expected=expected, got=got, hint=problem.get("hint", ""))
+def require_no(problem: dict[str, Any] | None) -> None:
+    """Raise a problem of the service as an error."""
+    if problem is not None:
+        raise InvalidInput("service", expected="success", got=problem["detail"])
 
 
-def wait_for_lift(client: httpx.Client, order: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Order a lift and wait; return the job and its lift."""
-    job = client.post("/lift", json=order).json()
+def lift_files(client: httpx.Client, files: Mapping[str, Path]) -> tuple[dict[str, Any], float]:
+    """Upload files by their kinds, lift, and wait; return the lift, and its seconds."""
+    order: dict[str, Any] = {
+        kind: client.put(f"/assets/{kind}", content=path.read_bytes()).json()["id"] for kind, path in files.items()
+    }
+    job = client.post("/lift", json=order | {"features": [order["features"]]}).json()
     while job["state"] in ("queued", "running"):
         time.sleep(0.25)
         job = client.get(f"/jobs/{job['id']}").json()
-    if job["state"] == "failed":
-        raise error_of(job["problem"])
-    return job, client.get(f"/lifts/{job['id']}").json()
+    require_no(job["problem"])
+    return client.get(f"/lifts/{job['id']}").json(), job["ended"] - job["started"]
 
 
-def show(scene: DemoScene, url: str, out: Path, say: Callable[[str], None]) -> dict[str, Any]:
-    """Upload, lift and query; write pictures to ``out`` and sentences to ``say``; return the results."""
+def show(
+    files: Mapping[str, Path], truth: Truth | None, phrases: Sequence[str], url: str, out: Path,
+    say: Callable[[str], None],
+) -> dict[str, Any]:  # fmt: skip
+    """Upload, lift and query; write pictures to ``out`` and sentences to ``say``; return the results.
+
+    Without phrases those of the truth are asked; without words, for more of what is in the middle of a view.
+    """
     with client_of(url) as client:
-        files = {"splats": scene.splats, "cameras": scene.cameras, "features": scene.features}
-        ids = {
-            kind: client.put(f"/assets/{kind}", content=path.read_bytes()).json()["id"]
-            for kind, path in files.items()
-        }
-        job, lift = wait_for_lift(client, ids | {"features": [ids["features"]]})
-        took, view = job["ended"] - job["started"], scene.views[0]
+        lift, took = lift_files(client, files)
+        first = client.get(f"/lifts/{lift['id']}/views", params={"limit": 1}).json()["views"][0]
+        views = tuple(truth.masks) if truth else (first["name"],)
         say(f"Lifted {lift['channels']} channels onto {lift['count']:,} splats in {took:.1f} s.")
-        pictures = {"rgb": f"render-{view}.png", "pca": f"features-{view}.png"}
+        pictures = {"rgb": f"render-{views[0]}.png", "pca": f"features-{views[0]}.png"}
         for channel, name in pictures.items():
-            parameters = {"lift": lift["id"], "view": view, "channel": channel}
+            parameters = {"lift": lift["id"], "view": views[0], "channel": channel}
             (out / name).write_bytes(client.get("/render", params=parameters).content)
-        kind, phrases = "text", scene.phrases
+        has_words = "table" in files or lift["text_space"] not in ("", NO_WORDS)
+        phrases = phrases or (truth.questions if truth and has_words else ())
+        kind = "text" if phrases else "like"
         if not phrases:
-            with Image.open(out / pictures["rgb"]) as picture:
-                kind, phrases = "like", (f"{view}:{picture.width // 2},{picture.height // 2}",)
-            say(
-                f"  Nothing says what its words are, so it is asked for more of the middle of the view, {phrases[0]}."
-            )
+            phrases = (f"{views[0]}:{first['width'] // 2},{first['height'] // 2}",)
+            say(f"  No words are known for it, so it is asked for more of the middle of the view, {phrases[0]}.")
         # The first query opens the lift and is not timed.
         client.get("/query", params={"lift": lift["id"], kind: phrases[0], "threshold": "0"})
-        findings = [ask(client, lift["id"], kind, phrase, scene, out, say) for phrase in phrases]
-    names = ("count", "channels", "diagnostics")
-    splats, channels, diagnostics = (lift[name] for name in names)
+        findings = [ask(client, {"lift": lift["id"], kind: text}, text, views, truth, out, say) for text in phrases]
     return {
-        "scene": scene.name, "lift": lift["id"], "splats": splats, "channels": channels, "views": lift["view_count"],
-        "lift_seconds": took, "diagnostics": diagnostics, "view": view, "text_space": scene.text_space,
+        "lift": lift["id"], "splats": lift["count"], "channels": lift["channels"], "views": lift["view_count"],
+        "lift_seconds": took, "diagnostics": lift["diagnostics"], "view": views[0], "text_space": lift["text_space"],
         "pictures": pictures, "phrases": findings,
     }  # fmt: skip
 
 
 def ask(
-    client: httpx.Client, lift: str, kind: str, phrase: str, scene: DemoScene, out: Path, say: Callable[[str], None]
-) -> dict[str, Any]:
+    client: httpx.Client, parameters: dict[str, str], phrase: str, views: Sequence[str], truth: Truth | None,
+    out: Path, say: Callable[[str], None],
+) -> dict[str, Any]:  # fmt: skip
     """Ask one phrase: write its pictures, say what it selects, and return that."""
-    parameters, view, truth = {"lift": lift, kind: phrase}, scene.views[0], scene.truth
-    begin = time.perf_counter()
+    view, begin = views[0], time.perf_counter()
     answer = client.get("/query", params=parameters).json()
-    middle = time.perf_counter()
+    query_ms = 1e3 * (time.perf_counter() - begin)
     masks = {
-        name: pixels(client.get("/query/mask", params=parameters | {"view": name}).content) > 0
-        for name in scene.views
+        name: pixels(client.get("/query/mask", params=parameters | {"view": name}).content) > 0 for name in views
     }
-    mask_ms = 1e3 * (time.perf_counter() - middle) / len(masks)
     slug = "-".join(re.findall(r"\w+", phrase.casefold()))
     names = {picture: f"{slug}-{picture}-{view}.png" for picture in ("mask", "heat", "found")}
     Image.fromarray(masks[view].astype(np.uint8) * 255).save(out / names["mask"])
     (out / names["heat"]).write_bytes(client.get("/query/attention", params=parameters | {"view": view}).content)
     shade = np.where(masks[view][..., None], 1.0, 0.35)
-    Image.fromarray((pixels((out / f"render-{view}.png").read_bytes()) * shade).astype(np.uint8)).save(
-        out / names["found"]
-    )
-    iou = truth.mean_iou(phrase, masks) if truth else None
-    label, value = truth.name_of(masks) if truth else None, answer["threshold"]["value"]
+    picture = pixels((out / f"render-{view}.png").read_bytes()) * shade
+    Image.fromarray(picture.astype(np.uint8)).save(out / names["found"])
+    label, iou = (truth.name_of(masks), truth.mean_iou(phrase, masks)) if truth else (None, None)
     if answer["present"] is False:
         say(f'  "{phrase}" finds nothing\n      {answer["reason"]}')
     else:
         against = "" if iou is None else f", IoU {iou:.2f} against the truth of views that were not lifted"
         say(f'  "{phrase}": {f"the {label}" if label else "something"}')
-        say(f"      {answer['count']:,} splats, {1e3 * (middle - begin):.0f} ms (mask {mask_ms:.0f} ms){against}")
+        say(f"      {answer['count']:,} splats, {query_ms:.0f} ms{against}")
         say(f"      {names['found']}")
     return {
         "phrase": phrase, "present": answer["present"], "reason": answer["reason"], "object": label,
-        "splats": answer["count"], "score": answer["top"][0]["score"] if answer["top"] else None, "threshold": value,
-        "explanation": answer["threshold"]["explanation"], "query_ms": 1e3 * (middle - begin), "mask_ms": mask_ms,
-        "iou": iou, "pictures": names,
+        "splats": answer["count"], "score": answer["top"][0]["score"] if answer["top"] else None,
+        "threshold": answer["threshold"]["value"], "query_ms": query_ms, "iou": iou, "pictures": names,
     }  # fmt: skip
 
 
@@ -215,6 +208,7 @@ class Truth:
     names: tuple[str, ...]  # object names
     masks: Mapping[str, np.ndarray]  # view -> [H, W] integers, rows of names; -1 = none
     objects_of_phrases: Mapping[str, Sequence[str]]  # phrase without article -> names of its objects
+    questions: tuple[str, ...]  # phrases that show what it can do
 
     def name_of(self, masks: Mapping[str, np.ndarray]) -> str | None:
         """Return the name of the object with most pixels in these masks [H, W] bool; None if there is none."""
@@ -237,21 +231,6 @@ def bare(phrase: str) -> str:
     return re.sub(r"^(an?|the)\s+", "", phrase.strip().casefold())
 
 
-@dataclass(frozen=True)
-class DemoScene:
-    """A scene ready for upload."""
-
-    name: str
-    splats: Path
-    cameras: Path
-    features: Path
-    encoder: str  # specification of the text encoder
-    text_space: str  # of the features; "none" if no text encoder shares it, "" if unknown
-    phrases: tuple[str, ...]  # empty: no text queries, or no words known
-    views: tuple[str, ...]  # the view of the picture first; views with labels if there are any
-    truth: Truth | None
-
-
 def unpack_tabletop(folder: Path) -> Path:
     """Write the example as plain files: splats, cameras, a pack of 18 views, labels; return the folder.
 
@@ -270,51 +249,28 @@ def unpack_tabletop(folder: Path) -> Path:
     return folder
 
 
-def find_scene(folder: Path, phrases: Sequence[str], scratch: Path) -> DemoScene:
-    """Return a scene folder: files are found by their content, a COLMAP model is zipped into ``scratch``.
-
-    Without phrases those in ``truth.json`` are asked.
-    """
+def find_files(folder: Path, scratch: Path) -> dict[str, Path]:
+    """Return the files of a scene folder by kind, found by their content; a COLMAP model as a zip in scratch."""
     if not folder.is_dir():
         raise InvalidInput("--scene", expected="a folder", got=f"nothing at {folder}")
-    splats = identify(folder).accepted_over_http
     packs = [path for path in visible_files(folder, "*.safetensors") if identify(path).kind == "features"]
-    for kind, paths in (("features", packs), ("splats", splats)):
+    packs.sort(key=lambda path: path.name != "features.safetensors")
+    named_files = [folder / name for name in CAMERA_FILES if (folder / name).is_file()]
+    cameras = [file for file in camera_files(next(iter(named_files), folder)) if file.is_file()]
+    if len(cameras) > 1:
+        scratch.mkdir(parents=True, exist_ok=True)
+        with zipfile.ZipFile(scratch / "cameras.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+            for file in cameras:
+                archive.write(file, file.name)
+        cameras = [scratch / "cameras.zip"]
+    splats = [folder / name for name in identify(folder).accepted_over_http]
+    files = {"splats": splats, "cameras": cameras, "features": packs}
+    for kind, paths in files.items():
         if not paths:
             expected = f"{kind} that the service takes"
-            raise InvalidInput(f"{kind} of {folder.name}", expected=expected, got="none")
-    features = min(packs, key=lambda path: (path.name != "features.safetensors", path.name))
-    cameras, table, truth = find_cameras(folder, scratch), folder / TABLE, read_truth(folder)
-    text_space = read_features(features).text_space
-    is_askable = table.is_file() or text_space in (*ENCODERS, OWN_WORDS)
-    if phrases and not is_askable:
-        got = f"none, and features whose text space is {text_space or 'not named'}"
-        expected = f"words in the space of the features, as {TABLE} in {folder.name}"
-        raise InvalidInput("--ask", expected=expected, got=got, hint="leave --ask out, and it is asked by example")
-    if truth is not None and not phrases and is_askable and text_space != NO_WORDS:
-        phrases = json.loads((folder / "truth.json").read_text()).get("ask", [f"the {truth.names[0]}"])
-    views = list(truth.masks) if truth else [camera.name for camera in read_cameras(cameras).values()]
-    encoder = f"table:{table}" if table.is_file() else ENCODERS.get(text_space, next(iter(BUILT_IN)))
-    return DemoScene(
-        folder.name, folder / splats[0], cameras, features, encoder, text_space, tuple(phrases), tuple(views), truth
-    )
-
-
-def find_cameras(folder: Path, scratch: Path) -> Path:
-    """Return the file of the cameras; a COLMAP model of several files as a zip in ``scratch``."""
-    candidates = [folder / name for name in CAMERA_FILES if (folder / name).is_file()]
-    files = [file for file in camera_files(candidates[0] if candidates else folder) if file.is_file()]
-    if not files:
-        names = ", ".join([*CAMERA_FILES, "sparse/0"])
-        raise InvalidInput(f"cameras of {folder.name}", expected=f"one of {names}", got="none")
-    if len(files) == 1:
-        return files[0]
-    scratch.mkdir(parents=True, exist_ok=True)
-    packed = scratch / "cameras.zip"
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-        for file in files:
-            archive.write(file, file.name)
-    return packed
+            raise InvalidInput(f"{kind} of {folder.name}", expected=expected, got="none", hint="--help lists them")
+    table = {"table": folder / TABLE} if (folder / TABLE).is_file() else {}
+    return {kind: paths[0] for kind, paths in files.items()} | table
 
 
 def read_truth(folder: Path) -> Truth | None:
@@ -329,4 +285,5 @@ def read_truth(folder: Path) -> Truth | None:
     masks = {name.removesuffix("/mask"): mask for name, mask in load_file(arrays_file).items()}
     phrases = {bare(name): (name,) for name in names}
     phrases |= {bare(phrase): tuple(objects) for phrase, objects in document.get("phrases", {}).items()}
-    return Truth(names, {view: masks[view] for view in document.get("held_out_views", masks)}, phrases)
+    views, questions = document.get("held_out_views", masks), document.get("ask", [f"the {names[0]}"])
+    return Truth(names, {view: masks[view] for view in views}, phrases, tuple(questions))

@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 import liftcore as lc
 from liftcore.cli import main
 from liftcore.io.cameras import read_cameras
-from service.commands.demo import find_scene
+from service.commands.demo import read_truth
 from tests.tiny_scene import HEIGHT, WIDTH, WORDS, cameras_document, codebook, colmap_zip, labels, make_scene
 
 from .readme import GUIDE, PYTHON, ROOT, blocks, text
@@ -211,9 +211,9 @@ def test_cells_run_in_order_and_print_what_is_saved(
         pictures = [output for output in cell["outputs"] if "image/png" in output.get("data", {})]
         assert len(pictures) == len(pyplot.get_fignums())
         pyplot.close("all")
-    scene = find_scene(names["folder"], (), names["folder"])
-    assert scene.truth is not None
-    overlap = scene.truth.mean_iou(names["phrase"], {"view_030": names["mask"]})
+    truth = read_truth(names["folder"])
+    assert truth is not None
+    overlap = truth.mean_iou(names["phrase"], {"view_030": names["mask"]})
     assert overlap is not None and overlap > 0.8
 
 
