@@ -2,6 +2,7 @@
 
 from liftcore.features.encoders.encode import read_image as read_image
 from liftcore.io.cameras import camera_files as camera_files
+from liftcore.io.files import is_zip as is_zip
 from liftcore.io.files import visible_files as visible_files
 from liftcore.io.files import whole_file as whole_file
 from liftcore.io.json_file import finite as finite

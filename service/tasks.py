@@ -10,7 +10,6 @@ import json
 import logging
 import os
 import tempfile
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -33,7 +32,7 @@ from liftcore import (
 )
 from liftcore.errors import InvalidFeatures, InvalidInput, InvalidLift, SplatliftError
 from liftcore.evaluate import inspect_file
-from liftcore.files import finite, identify, wrong_kind
+from liftcore.files import finite, identify, is_zip, wrong_kind
 from liftcore.text.table import TableEncoder
 from service.errors import replace_names
 from service.models import FILE_CHARACTERS, VIEW_CHARACTERS, WORD_CHARACTERS
@@ -86,7 +85,7 @@ def _suffix(kind: str, path: Path) -> str:
     if kind == "splats":
         return identify(path).suffix
     if kind == "cameras":
-        return ".zip" if zipfile.is_zipfile(path) else ".json"
+        return ".zip" if is_zip(path) else ".json"
     return ".zip" if kind == "photos" else ".safetensors"
 
 
@@ -165,7 +164,7 @@ def lift_content(path: Path, shape: Sequence[int], metadata: dict[str, Any]) -> 
 def _of_another_kind(kind: str, path: Path) -> InvalidInput | None:
     """Return the error for a file of another kind; None if it looks right, or unknown."""
     identity, expected, error = identify(path), f"a file of {kind}", error_class(kind)
-    if identity.suffix in (".sog", ".zip") and not zipfile.is_zipfile(path):
+    if identity.suffix in (".sog", ".zip") and not is_zip(path):
         got, hint = "the document of a SOG without its pictures", "zip it with them, and send that"
         return error(kind, expected=expected, got=got, hint=hint)
     if identity.kind is None:
@@ -209,7 +208,7 @@ def lift(order: Order, report: Reporter) -> dict[str, Any]:
         threads=order["threads"],
         progress=report,
         on_plan=report_plan,
-        checkpoint=Checkpoint(Path(order["work"]), order["checkpoint_seconds"]),
+        checkpoint=Checkpoint(Path(order["work"])),
         engine=open_engine(order["engine"], address, order["threads"]),
     )
     lift, output = _as_clients_know(lift, order["file_names"]), Path(order["output"])

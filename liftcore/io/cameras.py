@@ -18,7 +18,7 @@ from pathlib import Path, PurePosixPath
 
 from liftcore.errors import InvalidCameras, Unavailable
 from liftcore.io.colmap import MODEL_FILES, has_model, is_whole, model_files, read_colmap, read_image_names
-from liftcore.io.files import BROKEN_ZIP, first_bytes, is_system_file, open_regular, open_zip
+from liftcore.io.files import BROKEN_ZIP, first_bytes, is_system_file, is_zip, open_regular, open_zip
 from liftcore.io.inria import parse_inria
 from liftcore.io.json_file import read_json
 from liftcore.io.kinds import wrong_kind
@@ -121,7 +121,7 @@ def _read(path: Path) -> Cameras:
     try:
         with open_regular(source.file) as handle:
             start = handle.read(64).lstrip(b"\xef\xbb\xbf \t\r\n")
-        if zipfile.is_zipfile(source.file):
+        if is_zip(source.file):
             return _from_zip(source.file, source.frame)
     except OSError as error:
         got = f"a file that does not open ({error.strerror})"

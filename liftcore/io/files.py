@@ -77,6 +77,14 @@ def _open_without_waiting(path: str, flags: int) -> int:
     return os.open(path, flags | (0 if sys.platform == "win32" else os.O_NONBLOCK))
 
 
+def is_zip(path: Path) -> bool:
+    """Return True for a zip. zipfile raises for one of several disks, as damaged bytes may say."""
+    try:
+        return zipfile.is_zipfile(path)
+    except zipfile.BadZipFile:
+        return False
+
+
 def open_zip(path: Path) -> zipfile.ZipFile:
     """Open a zip, whose list of files is checked against a limit before zipfile reads it."""
     with open_regular(path) as handle:

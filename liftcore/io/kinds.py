@@ -22,7 +22,16 @@ from typing import Any, TypeVar
 
 from liftcore.errors import InvalidInput
 from liftcore.io.colmap import MODEL_FILES
-from liftcore.io.files import BROKEN_ZIP, LFS_HINT, LFS_POINTER, first_bytes, is_system_file, open_regular, open_zip
+from liftcore.io.files import (
+    BROKEN_ZIP,
+    LFS_HINT,
+    LFS_POINTER,
+    first_bytes,
+    is_system_file,
+    is_zip,
+    open_regular,
+    open_zip,
+)
 from liftcore.io.ply import MAX_HEADER_BYTES, cloud_without_splats
 from liftcore.io.sog import META, is_sog_document, sog_folder
 from liftcore.io.splat import looks_like_splat
@@ -263,7 +272,7 @@ def _file_rules(path: Path, head: bytes, size: int) -> Iterator[FileKind | None]
     yield _colmap_part(path) if path.name in (*MODEL_FILES, *_COLMAP_POINTS) else None
     yield _ply(head) if head[:4] in (b"ply\n", b"ply\r") else None
     yield _splats_as(SplatFormat.SPZ) if begins_like_spz(head) else None
-    yield _zip(path) if head[:2] == b"PK" and zipfile.is_zipfile(path) else None
+    yield _zip(path) if head[:2] == b"PK" and is_zip(path) else None
     damaged = FileKind(None, "a zip that is cut short or damaged", "copy or download it again")
     yield damaged if head[:4] == b"PK\3\4" else None
     yield _safetensors(path) if suffix == ".safetensors" or _is_safetensors(head, size) else None

@@ -293,6 +293,7 @@ MODEL = {
     "cameras.txt": b"1 PINHOLE 64 48 50 50 32 24\n",
     "images.txt": b"1 1 0 0 0 0 0 1 1 a.png\n\n2 1 0 0 0 0 0 1 1 b.png\n1 2 -1\n",
 }
+TWO_DISKS = struct.pack("<4sLQL", b"PK\6\7", 0, 0, 2)  # before the end record of a zip
 IN_ZIP = {f"sparse/0/{name}": content for name, content in MODEL.items()}
 BINARY = {
     "cameras.bin": struct.pack("<QIiQQ4d", 1, 1, 1, 64, 48, 50.0, 50.0, 32.0, 24.0),
@@ -328,6 +329,7 @@ CAMERA_FILES = [
     ("lens that folds", with_camera(k1=-9), "distortion"),
     ("lens of two models", with_camera(camera_model="OPENCV_FISHEYE", p1=0.1), "fisheye"),
     ("half of a pair in a name", cameras_json().replace(b"images/left", b"images/\\ud800left"), "name"),
+    ("zip of two disks", zipped(IN_ZIP)[:-22] + TWO_DISKS + zipped(IN_ZIP)[-22:], "zip"),
     ("zip in a zip", zipped({"sparse/0/model.zip": zipped(IN_ZIP)}), "zip"),
     ("zip of another size", patched(zipped(IN_ZIP), 24, 10), "zip"),
     ("zip of overlapping members", patched(zipped(IN_ZIP), 42, 0), "zip"),
