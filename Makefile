@@ -1,20 +1,17 @@
-# Every target makes the environment first: .venv, from requirements.lock, once.
+# Every target makes the environment first: .venv, from requirements.lock, once. TORCH_PIP and CUDA_TORCH_PIP are options
+# of pip for torch, such as an index.
 
 PYTHON ?= python3
 BIN := .venv/bin
 TORCH = $$(sed -nE 's/^(torch(vision)?==[^ ]*).*/\1/p' requirements.lock)
 READY := .venv/.ready
 SHARED := ../shared/data
-SCENE ?=
-ASK ?=
 OUT ?= demo-output
-TORCH_PIP ?=
-CUDA_TORCH_PIP ?=
 
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 export PIP_ROOT_USER_ACTION = ignore
 
-.PHONY: demo test check kernels gpu wheel lint format serve docs setup clean
+.PHONY: demo test check kernels gpu wheel lint serve docs setup
 
 demo: $(READY)  ## the whole job through the real service; SCENE=DIR takes a scene of your own, ASK=TEXT a question
 	$(BIN)/splatlift demo --out "$(OUT)" $(if $(SCENE),--scene "$(SCENE)") $(if $(ASK),--ask "$(ASK)")
@@ -37,7 +34,7 @@ kernels: $(READY)
 	$(BIN)/python -m tests.kernels
 
 # Another torch than the lock's build brings the triton that it was made with: that one stays.
-gpu:  ## all that a card is for: CUDA's torch, conformance, speed, accuracy; prints figures
+gpu:  ## all that a card is for: conformance, speed, accuracy; prints figures
 	@nvidia-smi -L 2>/dev/null | grep -q GPU || { echo "make gpu: nvidia-smi lists no card here, so nothing was run" >&2; exit 2; }
 	@$(MAKE) --no-print-directory setup
 	@$(BIN)/python -c 'import sys, torch; sys.exit(torch.version.cuda is None)' || { echo "installing torch's CUDA build" \
@@ -68,10 +65,6 @@ lint: $(READY)
 	$(BIN)/lint-imports --config service/imports.toml
 	$(BIN)/python -m tests.wording
 
-format: $(READY)
-	$(BIN)/ruff check --fix .
-	$(BIN)/ruff format .
-
 serve: $(READY)
 	$(BIN)/splatlift serve
 
@@ -84,10 +77,8 @@ docs: $(READY)  ## the docs site in build/site; a broken link or reference fails
 
 setup: $(READY)
 
-# torch and torchvision first, from one index: each build of the one loads beside its own build of the other alone,
-# and the lock has digests of PyPI's. What they need has digests in the lock, but for the libraries of a CUDA build,
-# which come last. Modules are compiled as they are imported: most of them never are, and to compile all takes half a
-# minute.
+# torch and torchvision first, from one index, as each loads beside its own build of the other alone, and the lock has
+# digests of PyPI's. The libraries of a CUDA build come last. Modules are compiled as they are imported.
 $(READY): requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "splatlift needs Python 3.11 or later")'
 	@echo "making .venv: a few minutes, once"
@@ -102,6 +93,3 @@ $(READY): requirements.lock pyproject.toml
 	@echo "compiling the kernels of 3DGS: a minute, once"
 	$(BIN)/python -m tests.kernels 3dgs
 	touch $@
-
-clean:
-	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache demo-output
