@@ -1,6 +1,7 @@
 """Public: ``splatlift``, the command line.
 
-Each command is a module with ``add_arguments`` and ``run``, here or in the service's package.
+Each command is ``add_arguments`` and ``run`` of a module, here or in the service's package. In `SHARED` modules the
+command's name is behind them.
 
 Exit status: 0 for success; 2 for invalid input, with one line on stderr; 1 for an internal error. With ``--json``
 stdout has exactly one JSON object.
@@ -10,7 +11,7 @@ import argparse
 import os
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from importlib import import_module
 from typing import Any
@@ -36,6 +37,10 @@ COMMANDS = {
     "evaluate": "evaluate a lift by labels of its views",
     "tradeoff": "compare speed and accuracy on a scene",
 }
+SHARED = {  # modules of commands beside another one
+    "plan": "lift", "render": "export", "encode": "pack",
+    **dict.fromkeys(("inspect", "check", "tradeoff"), "evaluate"),
+}  # fmt: skip
 SERVICE_COMMANDS = {  # modules of the package service
     "demo": "run a complete example through the HTTP service",
     "serve": "run the HTTP service",
@@ -55,7 +60,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         words = sys.argv[1:] if argv is None else argv
         options = build_parser().parse_args(words)
         options.command_line = shlex.join(["splatlift", *words])
-        status = _module(options.command).run(options)
+        status = _function(options.command, "run")(options)
         sys.stdout.flush()
         return status
     except SystemExit as end:
@@ -92,17 +97,14 @@ def build_parser() -> argparse.ArgumentParser:
 
 def _add_options(name: str, parser: Parser, shared: list[Parser]) -> None:
     try:
-        _module(name).add_arguments(parser, *shared)
+        _function(name, "add_arguments")(parser, *shared)
     except SplatliftError as error:  # its package is not installed
         parser.exit(BAD_INPUT, f"splatlift: {error}\n")
 
 
-def _module(name: str) -> Any:
-    """Import the module of a command.
-
-    Raises:
-        Unavailable: its package is not installed.
-    """
-    if name in COMMANDS:
-        return import_module(f"liftcore.cli.{name}")
-    return load_command(name)
+def _function(command: str, name: str) -> Callable[..., Any]:
+    """Import a function of a command."""
+    if command in SERVICE_COMMANDS:
+        return getattr(load_command(command), name)
+    module = import_module(f"liftcore.cli.{SHARED.get(command, command)}")
+    return getattr(module, f"{name}_{command}" if command in SHARED else name)

@@ -1,4 +1,4 @@
-"""``splatlift export``: export a lifted scene with its labels; the suffix of the file is the format."""
+"""``splatlift export`` and ``render``: write a lifted scene, or a picture of it."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from liftcore.cli import options as common
 from liftcore.cli.objects import named_tree
-from liftcore.cli.options import Parser, add_encoder, add_lift, add_world, open_lift, text_encoder, whole_number
 from liftcore.cli.reply import check_outputs, reply, write_files
 from liftcore.cli.segment import encoder_and_words
-from liftcore.errors import InvalidInput
+from liftcore.errors import InvalidInput, InvalidQuery
 
 if TYPE_CHECKING:
     from liftcore import Answer, Catalogue, Scene, Segmentation
@@ -20,24 +20,31 @@ if TYPE_CHECKING:
 CONTENT_BY_SUFFIX = {".json": "masks"}  # other suffixes: splats with labels
 
 
-def add_arguments(parser: Parser) -> None:
+def add_arguments(parser: common.Parser) -> None:
     """Add the options of the command."""
-    add_lift(parser)
-    formats = ".glb, .usdz or .ply: splats with labels; .spz or .splat: splats; .json: COCO masks in the views"
+    common.add_lift(parser)
+    formats = ".glb, .usdz, .ply, .spz, .splat; .json: COCO masks"
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=formats)
     source = parser.add_mutually_exclusive_group()
-    source.add_argument(
-        "--text", action="append", default=[], metavar="TEXT", help="label the splats selected by these words"
-    )
-    source.add_argument("--words", type=Path, metavar="FILE", help="label every splat with the best of these words")
-    source.add_argument("--all-words", action="store_true", help="label every splat with the encoder's best word")
-    source.add_argument("--object", type=whole_number, metavar="ID", help="only one object of the lift")
-    only_help = "with --text: only the selected splats"
-    parser.add_argument("--only", action="store_true", help=only_help)
-    vocabulary_help = "without the options above: label the lift's objects with these words, a file with one a line"
-    parser.add_argument("--vocabulary", type=Path, metavar="FILE", help=vocabulary_help)
-    add_encoder(parser)
-    add_world(parser)
+    texts = "label the splats selected by this text"
+    source.add_argument("--text", action="append", default=[], metavar="TEXT", help=texts)
+    source.add_argument("--words", type=Path, metavar="FILE", help="label every splat with the best word")
+    source.add_argument("--all-words", action="store_true", help="likewise, of all words of the encoder")
+    source.add_argument("--object", type=common.whole_number, metavar="ID", help="only one object of the lift")
+    parser.add_argument("--only", action="store_true", help="with --text: only the selected splats")
+    parser.add_argument("--vocabulary", type=Path, metavar="FILE", help="names of the lift's objects")
+    common.add_encoder(parser)
+    common.add_world(parser)
+
+
+def add_arguments_render(parser: common.Parser) -> None:
+    """Add the options of the command ``render``."""
+    from liftcore import Picture
+
+    common.add_lift(parser)
+    common.add_view(parser)
+    common.add_fields(parser, Picture, ["channel"], {"channel": {"metavar": "NAME"}})
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="PNG", help="the picture to write")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -46,10 +53,8 @@ def run(options: argparse.Namespace) -> int:
     content = CONTENT_BY_SUFFIX.get(suffix, "labelled")
     kind = "json" if content == "masks" else "splats"
     if options.only and not options.text:
-        raise InvalidInput(
-            "--only", expected="--text as well", got="no --text", hint="use --object ID for one object"
-        )
-    files, scene = {"output": options.output}, open_lift(options)
+        raise InvalidInput("--only", expected="--text as well", got="no --text", hint="use --object ID")
+    files, scene = {"output": options.output}, common.open_lift(options)
     check_outputs(files, options, scene, kind=kind)
     source = _source(options, scene)
     if isinstance(source, int) or options.only:
@@ -78,18 +83,28 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
+def run_render(options: argparse.Namespace) -> int:
+    """Render the picture, and print its path."""
+    view, files = common.view_of(options), {"output": options.output}
+    if view is None:
+        raise InvalidQuery("--view", expected="a view to render", got="no --view and no --camera")
+    scene = common.open_lift(options)
+    check_outputs(files, options, scene)
+    paths = write_files(files, {"output": partial(scene.export, what=options.channel, view=view)})
+    document = {"channel": options.channel, "out": paths["output"]}
+    reply(document, as_json=options.json, lines=[paths["output"]])
+    return 0
+
+
 def _source(options: argparse.Namespace, scene: Scene) -> Answer | Segmentation | Catalogue | SceneTree | int | None:
+    from liftcore import Query
+
     if options.object is not None:
         return int(options.object)
     if options.text:
-        return scene.ask(_query(options.text), encoder=text_encoder(options, scene, stand_in=True), places=False)
+        query, encoder = Query(text=options.text), common.text_encoder(options, scene, stand_in=True)
+        return scene.ask(query, encoder=encoder, places=False)
     if options.words is not None or options.all_words:
         encoder, words = encoder_and_words(options, scene, options.words)
         return scene.segment(words, encoder=encoder, progress=True)
     return None if scene.object is None else named_tree(options, scene)
-
-
-def _query(texts: list[str]) -> Any:
-    from liftcore import Query
-
-    return Query(text=texts)

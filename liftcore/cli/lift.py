@@ -1,17 +1,16 @@
-"""``splatlift lift``: lift features onto splats."""
+"""``splatlift lift`` and ``plan``: lift features onto splats, or plan that."""
 
 from __future__ import annotations
 
 import argparse
 import json
-import tempfile
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import Parser, add_settings, add_sources, add_verbose, add_world, count, world_of
+from liftcore.cli.options import Parser, add_settings, add_sources, add_verbose, add_world, option_errors, world_of
 from liftcore.cli.reply import check_outputs, reply, short_text, smoothing_line, write_files
-from liftcore.errors import InvalidInput, InvalidSettings
+from liftcore.errors import InvalidSettings
 
 FEW_VIEWS = 26  # of masks, where smoothing improves features; with 52 it hardly does (docs/results.md)
 CLOSED_SCENE_ROW_SUM = 0.9  # least mean row sum of a scene that was trained with its background
@@ -30,24 +29,30 @@ def add_arguments(parser: Parser) -> None:
     add_world(parser)
     parser.add_argument("--explain", action="store_true", help="print the plan before the lift")
     add_verbose(parser)
-    checkpoint_help = "an interrupted lift resumes, and a lift of the same regions with other features reuses them"
-    parser.add_argument("--checkpoint", type=Path, metavar="DIR", help=f"store rasterized views: {checkpoint_help}")
-    parser.add_argument("--threads", type=count, metavar="N", help="default: the number of cores")
-    engine_help = "lift in blocks of bounded memory: local, in this process; ray, by the workers of a Ray cluster"
-    parser.add_argument("--engine", metavar="NAME", help=engine_help)
-    parser.add_argument("--address", metavar="HOST:PORT", help="of the Ray cluster, or auto; default: this machine")
+    parser.add_argument("--checkpoint", type=Path, metavar="DIR", help="keep rasterized views, to resume")
+    parser.add_argument("--engine", metavar="NAME", help="lift in blocks of bounded memory: local or ray")
+    parser.add_argument("--address", metavar="HOST:PORT", help="of the Ray cluster, or auto")
+
+
+def add_arguments_plan(parser: Parser) -> None:
+    """Add the options of the command ``plan``."""
+    add_sources(parser)
+    add_settings(parser)
+    add_verbose(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     """Lift, write the lift completely or not at all, and print a summary."""
     settings, world = settings_of(options), world_of(options)
     from liftcore import lift_files, open_engine
+    from liftcore.files import check_output
 
     files = {"output": options.output}
     check_outputs(files, options, kind="lift")
     engine = open_engine(options.engine, options.address, options.threads)
     if options.checkpoint:
-        require_folder(options.checkpoint)
+        with option_errors({"output": "checkpoint"}):
+            check_output(options.checkpoint / "checkpoint.json", (), "json")
 
     plans: list[Plan] = []
 
@@ -77,27 +82,25 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def require_folder(folder: Path) -> None:
-    """Check that checkpoints can be written to a folder, created if missing; the lift itself would only warn.
+def run_plan(options: argparse.Namespace) -> int:
+    """Print the plan of a lift."""
+    from liftcore import plan_files
 
-    Raises:
-        InvalidInput: it is not a folder, or not writable.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        got = f"{folder} ({error.strerror or error})"
-        raise InvalidInput("checkpoint", expected="a folder that can be written", got=got) from None
+    settings = settings_of(options)
+    plan = plan_files(options.splats, options.cameras, options.features, settings, threads=options.threads)
+    document = {
+        **plan.facts(),
+        "seconds": plan.seconds,
+        "device": {"kind": plan.device.kind, "name": plan.device.name},
+        "views": {"lifted": list(plan.views), "left_out": list(plan.left_out)},
+        "warnings": list(plan.warnings),
+    }
+    reply(document, as_json=options.json, lines=plan.lines() if options.verbose else plan_lines(plan))
+    return 0
 
 
 def settings_of(options: argparse.Namespace) -> LiftSettings:
-    """Return the settings of ``--preset``, ``--quality``, ``--device`` and ``--set key=value``.
-
-    Raises:
-        InvalidSettings: a pair without ``=``, an unknown name, one with two values or a value out of range.
-    """
+    """Return the settings of ``--preset``, ``--quality``, ``--device`` and ``--set key=value``."""
     from liftcore import LiftSettings
 
     options_by_name = {"preset": options.preset, "quality": options.quality, "device": options.device}
@@ -109,11 +112,7 @@ def settings_of(options: argparse.Namespace) -> LiftSettings:
 
 
 def pairs_of(pairs: Sequence[str]) -> dict[str, Any]:
-    """Parse names and values of ``key=value``; a value is JSON, or else a text.
-
-    Raises:
-        InvalidSettings: a pair without ``=``, an unknown name or one with two values.
-    """
+    """Parse names and values of ``key=value``; a value is JSON, or else a text."""
     from liftcore import LiftSettings
 
     values: dict[str, Any] = {}

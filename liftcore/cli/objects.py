@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.cli.options import Parser, add_encoder, add_splats, add_world, world_of
-from liftcore.cli.reply import check_outputs, lines_of, reply, write_files
+from liftcore.cli.reply import check_outputs, lines_of, outputs_of, reply, write_files
 from liftcore.cli.segment import encoder_and_words
 from liftcore.errors import InvalidQuery
 
@@ -20,14 +20,13 @@ if TYPE_CHECKING:
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
     parser.add_argument("lift", type=Path, help="a lift (.safetensors)")
-    vocabulary_help = "name each object by the nearest word of a file, one a line, or of a text table (.safetensors)"
-    parser.add_argument("--vocabulary", type=Path, metavar="FILE", help=vocabulary_help)
+    parser.add_argument("--vocabulary", type=Path, metavar="FILE", help="names: words, or a text table")
     add_encoder(parser)
     parser.add_argument("--tree", action="store_true", help="list parts and groups too")
     add_world(parser)
-    parser.add_argument("--features", action="store_true", help="with --json: the mean feature of each object too")
+    parser.add_argument("--features", action="store_true", help="with --json: mean features of objects")
     parser.add_argument("--csv", type=Path, metavar="CSV", help="write the list as a table")
-    parser.add_argument("--into", type=Path, metavar="FOLDER", help="write one PLY for each object, object-ID.ply")
+    parser.add_argument("--into", type=Path, metavar="FOLDER", help="write a PLY of each object")
     add_splats(parser)
 
 
@@ -36,7 +35,7 @@ def run(options: argparse.Namespace) -> int:
     if options.tree and (options.csv or options.features):
         option = "--csv" if options.csv else "--features"
         raise InvalidQuery(option, expected="the list of objects", got="--tree", hint="--json has the tree")
-    files = {"csv": options.csv} if options.csv else {}
+    files = outputs_of(options)
     from liftcore import Scene
 
     scene = Scene(options.lift, splats=options.splats, world=world_of(options))

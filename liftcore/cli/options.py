@@ -54,7 +54,11 @@ class Parser(argparse.ArgumentParser):
         return self
 
     def format_help(self) -> str:
+        """Return the help: the first line has what is required alone, and each option has a line."""
         self.add_options()
+        required = [action for action in self._actions if action.required or not action.option_strings]
+        words = [*self.prog.split(), "[options]", *map(_usage_of, required)]
+        self.usage, self.formatter_class = " ".join(filter(None, words)), _OptionLines
         return super().format_help()
 
     def parse_known_args(  # pyright: ignore[reportIncompatibleMethodOverride]: it has overloads
@@ -74,6 +78,20 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         self.exit(BAD_INPUT, f"{self.prog}: {' '.join(message.split())}; see '{self.prog} --help'\n")
+
+
+class _OptionLines(argparse.HelpFormatter):
+    """The format of a help: wide enough for the longest options of most commands."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=30)
+
+
+def _usage_of(action: argparse.Action) -> str:
+    """Return the words of a required argument."""
+    name = str(action.metavar or action.dest)
+    values = {"?": f"[{name}]", "*": f"[{name} ...]", "+": f"{name} [...]"}.get(str(action.nargs), name)
+    return " ".join((*action.option_strings[:1], values))
 
 
 def wrong_kind_error(options: argparse.Namespace) -> InvalidInput | None:
@@ -110,21 +128,29 @@ def shared_options() -> Parser:
 
 def add_sources(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of splats, cameras and feature packs."""
-    parser.add_argument("splats", type=Path, help="trained splats (.ply, .splat, .spz, .sog, or a checkpoint)")
-    parser.add_argument("cameras", type=Path, help="COLMAP folder or .zip, transforms.json or cameras.json")
+    parser.add_argument("splats", type=Path, help="trained splats, of any format")
+    parser.add_argument("cameras", type=Path, help="COLMAP, transforms.json or cameras.json")
     parser.add_argument("features", type=Path, nargs="+", help="feature packs (.safetensors)")
 
 
 def add_settings(parser: Parser) -> None:
     """Add the options of the settings of a lift."""
-    parser.add_argument("--preset", metavar="NAME", help=f"a set of weights: {PRESETS}")
-    quality_help = "level of quality: exact, balanced, fast or draft"
-    parser.add_argument("--quality", metavar="NAME", help=quality_help)
-    add_device(parser)
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="one of the settings that --settings lists"
-    )
+    parser.add_argument("--preset", metavar="NAME", help=PRESETS)
+    parser.add_argument("--quality", metavar="NAME", help="exact, balanced, fast or draft")
+    parser.add_argument("--device", metavar="NAME", help="auto, cpu or cuda")
+    add_set(parser)
     parser.add_argument("--settings", action=ListSettings, nargs=0, help="list all settings, and exit")
+    add_threads(parser)
+
+
+def add_set(parser: argparse.ArgumentParser) -> None:
+    """Add the option of single settings."""
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one setting of a lift")
+
+
+def add_threads(parser: argparse.ArgumentParser) -> None:
+    """Add the option of the number of threads."""
+    parser.add_argument("--threads", type=count, metavar="N", help="default: the number of cores")
 
 
 class ListSettings(argparse.Action):
@@ -143,11 +169,6 @@ class ListSettings(argparse.Action):
                     textwrap.fill(f"{name}={default}: {meaning}", 98, initial_indent="  ", subsequent_indent="    ")
                 )
         parser.exit()
-
-
-def add_device(parser: argparse.ArgumentParser) -> None:
-    """Add the option of the device."""
-    parser.add_argument("--device", metavar="NAME", help="device for rasterization and solve: auto, cpu or cuda")
 
 
 def add_fields(
@@ -185,38 +206,29 @@ def add_encoder(parser: argparse.ArgumentParser) -> None:
     """Add the options of the text encoder."""
     words = parser.add_mutually_exclusive_group()
     words.add_argument("--table", type=Path, metavar="FILE", help="precomputed text embeddings")
-    specs = "lvis, open_clip:MODEL/TAG, open_clip:MODEL@FILE or table:FILE"
-    words.add_argument("--encoder", metavar="NAME", help=f"{specs}; default: the lift's text space")
+    words.add_argument("--encoder", metavar="NAME", help="of texts; default: that of the lift's text space")
 
 
 def add_lift(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of a lift and the paths of its splats and cameras."""
     parser.add_argument("lift", type=Path, help="a lift (.safetensors)")
     add_splats(parser)
-    parser.add_argument("--cameras", type=Path, metavar="PATH", help="its cameras; default: their recorded path")
+    parser.add_argument("--cameras", type=Path, metavar="PATH", help="its cameras; default: as recorded")
 
 
 def add_splats(parser: argparse.ArgumentParser) -> None:
     """Add the option of the path of a lift's splats."""
-    splats_help = "its splats; default: their recorded path, or the lift's folder"
-    parser.add_argument("--splats", type=Path, metavar="FILE", help=splats_help)
+    parser.add_argument("--splats", type=Path, metavar="FILE", help="its splats; default: as recorded")
 
 
 def add_world(parser: argparse.ArgumentParser) -> None:
     """Add the options of the up direction and the length of a unit."""
-    up_help = "the direction against gravity, in the frame of the splats; default: from their files"
-    parser.add_argument("--up", type=float, nargs=3, metavar=("X", "Y", "Z"), help=up_help)
-    parser.add_argument(
-        "--metres-per-unit", type=float, metavar="M", help="length of a scene unit; default: likewise"
-    )
+    parser.add_argument("--up", type=float, nargs=3, metavar=("X", "Y", "Z"), help="default: from the files")
+    parser.add_argument("--metres-per-unit", type=float, metavar="M", help="default: from the files")
 
 
 def world_of(options: argparse.Namespace) -> WorldFrame:
-    """Return the frame of the splats from the options.
-
-    Raises:
-        InvalidInput: a zero direction, or a length not above zero.
-    """
+    """Return the frame of the splats from the options."""
     from liftcore import WorldFrame
 
     with option_errors({"up": "--up", "metres_per_unit": "--metres-per-unit"}):
@@ -224,11 +236,7 @@ def world_of(options: argparse.Namespace) -> WorldFrame:
 
 
 def open_lift(options: argparse.Namespace) -> Scene:
-    """Open the lift of the options.
-
-    Raises:
-        InvalidLift: the file is not a lift.
-    """
+    """Open the lift of the options."""
     from liftcore import Scene
 
     scene = Scene(options.lift, splats=options.splats, cameras=options.cameras)
@@ -239,14 +247,13 @@ def open_lift(options: argparse.Namespace) -> Scene:
 
 def add_verbose(parser: argparse.ArgumentParser) -> None:
     """Add the option of all figures."""
-    parser.add_argument("--verbose", action="store_true", help="print all figures, not only the verdict")
+    parser.add_argument("--verbose", action="store_true", help="print all figures")
 
 
 def add_view(parser: argparse.ArgumentParser) -> None:
     """Add the options of the camera of pictures."""
     parser.add_argument("--view", metavar="NAME", help="the camera of pictures")
-    camera_help = "another camera in the splats' frame, a file of any format; if it has several cameras, --view's"
-    parser.add_argument("--camera", type=Path, metavar="FILE", help=camera_help)
+    parser.add_argument("--camera", type=Path, metavar="FILE", help="of others in the splats' frame")
 
 
 def view_of(options: argparse.Namespace, *pictures: str) -> Any:
@@ -254,10 +261,6 @@ def view_of(options: argparse.Namespace, *pictures: str) -> Any:
 
     Args:
         pictures: options that need a camera.
-
-    Raises:
-        InvalidQuery: a picture without a view, or a file of several cameras without ``--view``.
-        InvalidCameras, NotFound: the file has no camera, or no camera of that name.
     """
     if options.camera is None:
         picture_options = [f"--{name}" for name in pictures if getattr(options, name)]
@@ -300,9 +303,6 @@ def text_encoder(options: argparse.Namespace, scene: Scene, hint: str = "", *, s
 
     Args:
         hint: other advice of the command. stand_in: as for `Scene.encoder`.
-
-    Raises:
-        InvalidQuery, Unavailable: as for `Scene.encoder`.
     """
     return scene.encoder(
         encoder_spec(options), hint=f"--table FILE or --encoder NAME; {hint}".rstrip("; "), stand_in=stand_in

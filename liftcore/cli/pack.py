@@ -1,4 +1,4 @@
-"""``splatlift pack``: convert features and masks of common formats to feature packs."""
+"""``splatlift pack`` and ``encode``: make feature packs of features and masks, or of images."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import Parser, option_errors
+from liftcore.cli.options import Parser, count, option_errors
 from liftcore.cli.reply import list_folders, reply, short_text
 
 if TYPE_CHECKING:
@@ -28,68 +28,48 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
     formats = parser.add_subparsers(dest="format", required=True, metavar="FORMAT", parser_class=Parser)
     langsplat = formats.add_parser("langsplat", parents=[shared], help="IMG_s.npy and IMG_f.npy")
     arrays = formats.add_parser("npy", parents=[shared], help="IMG.npy (.npz, .pt), one dense map a view")
-    axes_help = "the order of the axes, [h, w, F] or [F, h, w]; leading axes of length 1 are removed"
-    arrays.add_argument("--layout", choices=("hwc", "chw"), default="hwc", help=axes_help)
-    fit_help = (
-        "what the encoder's preprocessing did to photos of another shape than its maps: stretched them, padded them "
-        "with bars on both sides, or cropped their centre"
-    )
-    arrays.add_argument("--map-fit", choices=("stretch", "pad", "crop"), help=fit_help)
-    masks = formats.add_parser(
-        "masks", parents=[shared], help="IMG.npy, one vector a mask, with IMG.json (SAM), IMG_masks.npy or IMG.png"
-    )
-    masks.add_argument(
-        "--unlabelled",
-        type=_grey,
-        default=0,
-        metavar="VALUE",
-        help="value of pixels without a mask in label pictures: with 0, value 1 is the first vector; with another "
-        "(255), value 0 is the first",
-    )
-    encoder_help = (
-        "compute the vectors from each mask's crop of its photo: open_clip:MODEL/TAG or open_clip:MODEL@FILE"
-    )
-    masks.add_argument("--encoder", metavar="SPEC", help=encoder_help)
-    masks.add_argument(
-        "--photos", type=Path, nargs="+", metavar="PATH", help="photos for --encoder, or their folders"
-    )
-    masks.add_argument("--device", default="cpu", metavar="NAME", help="device of the model, as torch names it")
-    prompts = formats.add_parser(
-        "prompts",
-        parents=[shared],
-        help="masks by phrase: PHRASE/VIEW.png, JSON (COCO, Grounded SAM 2), or label pictures with names",
-    )
-    prompts.add_argument(
-        "--names",
-        type=Path,
-        metavar="FILE",
-        help='names of label pictures, JSON from values to names: {"1": "red mug"}',
-    )
-    folders_help = "names of folders of binary PNGs: phrases (PHRASE/VIEW.png) or views (VIEW/PHRASE.png)"
-    prompts.add_argument("--folders", choices=("phrases", "views"), default="phrases", help=folders_help)
-    unlabelled_help = "value of unlabelled pixels in pictures (255), which get no label"
-    prompts.add_argument("--unlabelled", type=_grey, metavar="VALUE", help=unlabelled_help)
-    unannotated_help = (
-        "COCO's images without an annotation are omitted (skip), or show none of the phrases (negative)"
-    )
-    prompts.add_argument("--unannotated", choices=("skip", "negative"), default="skip", help=unannotated_help)
+    arrays.add_argument("--layout", choices=("hwc", "chw"), default="hwc", help="of the axes; default hwc")
+    fit = "what the encoder did to photos of another shape"
+    arrays.add_argument("--map-fit", choices=("stretch", "pad", "crop"), help=fit)
+    masks = formats.add_parser("masks", parents=[shared], help="IMG.npy, a vector a mask, with JSON or pictures")
+    unlabelled = "of pixels without a mask"
+    masks.add_argument("--unlabelled", type=_grey, default=0, metavar="VALUE", help=f"{unlabelled}; default 0")
+    masks.add_argument("--encoder", metavar="SPEC", help="of the vectors of crops: open_clip:MODEL/TAG")
+    photos = "photos of --encoder, or their folders"
+    masks.add_argument("--photos", type=Path, nargs="+", metavar="PATH", help=photos)
+    masks.add_argument("--device", default="cpu", metavar="NAME", help="of the model, as torch names it")
+    prompts = formats.add_parser("prompts", parents=[shared], help="masks by phrase: PHRASE/VIEW.png or JSON")
+    prompts.add_argument("--names", type=Path, metavar="FILE", help='of values, JSON: {"1": "red mug"}')
+    prompts.add_argument("--folders", choices=("phrases", "views"), default="phrases", help="of PNGs")
+    prompts.add_argument("--unlabelled", type=_grey, metavar="VALUE", help=unlabelled)
+    unannotated = "images: left out, or without phrases"
+    prompts.add_argument("--unannotated", choices=("skip", "negative"), default="skip", help=unannotated)
     retag = formats.add_parser("retag", parents=[shared], help="a pack with other names of its encoder or text space")
-    space = (
-        "the text encoder that shares the space of the features, as for query's --encoder "
-        "(open_clip:ViT-B-32/openai), which is the default encoder of queries here and in a service; 'none': no text "
-        "encoder shares it, so a lift is queried by example. All packs of a lift must have the same"
-    )
-    unit = "record that the vectors are unit vectors, or are not; this does not change them"
     for command in (langsplat, arrays, masks, prompts):
         command.add_argument("folder", type=Path, help="the folder of the files")
     retag.add_argument("pack", type=Path, help="the pack to copy")
     for command in (langsplat, arrays, masks, prompts, retag):
         command.add_argument("-o", "--output", type=Path, required=True, metavar="PACK", help="the pack to write")
-        command.add_argument("--encoder-name", metavar="NAME", help="name of the encoder of the features or masks")
+        command.add_argument("--encoder-name", metavar="NAME", help="of the features or masks")
     for command in (langsplat, arrays, masks, retag):
-        command.add_argument("--text-space", metavar="NAME", help=space)
+        command.add_argument("--text-space", metavar="NAME", help="the text encoder of the space, or none")
     for command in (langsplat, arrays, masks):
+        unit = "the vectors have unit length, or not"
         command.add_argument("--normalised", action=argparse.BooleanOptionalAction, help=unit)
+
+
+def add_arguments_encode(parser: Parser) -> None:
+    """Add the options of the command ``encode``."""
+    parser.add_argument("images", type=Path, nargs="+", help="images, or folders of them")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="PACK", help="the pack to write")
+    spec = "maskclip:MODEL/TAG, maskclip:MODEL@FILE or timm:NAME"
+    parser.add_argument("--encoder", required=True, metavar="SPEC", help=spec)
+    parser.add_argument("--cameras", type=Path, metavar="PATH", help="whose sizes say how photos are turned")
+    parser.add_argument("--size", type=count, metavar="PX", help="the shorter side; default: of the model")
+    parser.add_argument("--batch", type=count, default=1, metavar="N", help="images encoded at once")
+    parser.add_argument("--device", default="cpu", metavar="NAME", help="of the model, as torch names it")
+    unit = "make unit vectors; the default"
+    parser.add_argument("--normalised", action=argparse.BooleanOptionalAction, default=True, help=unit)
 
 
 def _grey(text: str) -> int:
@@ -125,6 +105,20 @@ def run(options: argparse.Namespace) -> int:
         "warnings": [*facts["warnings"], *description["warnings"]],
     }
     reply(document, as_json=options.json, lines=_lines(document))
+    return 0
+
+
+def run_encode(options: argparse.Namespace) -> int:
+    """Write the pack, completely or not at all, and describe it."""
+    from liftcore import encode_images
+
+    names = ("device", "cameras", "size", "batch", "normalised")
+    values = {name: getattr(options, name) for name in names}
+    with option_errors({name: f"--{name}" for name in ("encoder", "device", "size")}):
+        document = encode_images(options.images, options.output, options.encoder, **values, progress=True)
+    line = f"{document['out']}: {document['views']} views, {document['channels']} channels, {document['bytes']} bytes"
+    lines = [line, *list_folders(document["folders"]), *(f"warning: {text}" for text in document["warnings"])]
+    reply(document, as_json=options.json, lines=lines)
     return 0
 
 

@@ -7,24 +7,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import (
-    Parser,
-    add_encoder,
-    add_fields,
-    add_lift,
-    add_view,
-    add_world,
-    open_lift,
-    text_encoder,
-    view_of,
-)
-from liftcore.cli.reply import check_outputs, lines_of, place_of, reply, write_files
+from liftcore.cli import options as common
+from liftcore.cli.reply import check_outputs, lines_of, outputs_of, place_of, reply, write_files
 from liftcore.errors import InvalidQuery
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-
-    from PIL.Image import Image
 
     from liftcore import Answer, Objects, Query, TextEncoder, ViewMask
 
@@ -33,57 +21,62 @@ LOCAL_SUFFIXES = (".splat", ".spz")  # of files whose positions are about the sp
 FIELD_OVERRIDES: dict[str, dict[str, Any]] = {  # keywords of options besides those of the fields
     "text": {
         "flag": "text", "nargs": "?", "action": "store", "default": None, "metavar": "text",
-        "help": "the text to search for, in quotes; optional with --like",
+        "help": "the text to search for, in quotes",
     },
-    "like": {"metavar": "EXAMPLE|FILE.npy"},
-    "unlike": {"metavar": "EXAMPLE|FILE.npy"},
+    "like": {"metavar": "EXAMPLE", "help": "VIEW:x,y, splat:J, object:N or a vector.npy"},
+    "unlike": {"metavar": "EXAMPLE", "help": "a negative example, likewise"},
+    "sets": {"metavar": "SET", "help": "object:N or selection:NAME, as they are"},
     "negatives": {
         "flag": "--negative", "nargs": "+", "action": "extend", "metavar": "WORD",
-        "help": "negative texts: all words up to the next option, so TEXT must come before; may be repeated",
+        "help": "negative texts, up to the next option",
     },
-    "top": {"default": 0},
+    "threshold": {"help": "auto, paper or a number from -1 to 1"},
+    "instances": {"help": "keep the best N objects"},
+    "min_size": {"help": "leave out objects of fewer splats"},
+    "keep": {"help": "of objects; default all"},
+    "absent": {"help": "words of what is not there; default drop"},
+    "top": {"default": 0, "help": "list the N best splats"},
 }  # fmt: skip
-OUTPUTS = ("object", "coloured", "scores", "mask", "attention", "overlay")  # options that name a file to write
 
 
-def add_arguments(parser: Parser) -> None:
+def add_arguments(parser: common.Parser) -> None:
     """Add the options of the command."""
     from liftcore import Query
 
     parser.last = "text"
-    add_lift(parser)
-    add_encoder(parser)
-    add_fields(parser, Query, (*Query.deciding(), "top"), FIELD_OVERRIDES)
-    parser.add_argument(
-        "--objects", action="store_true", help="list the selected objects, with their positions and boxes"
-    )
-    add_world(parser)
-    add_view(parser)
+    common.add_lift(parser)
+    common.add_encoder(parser)
+    common.add_fields(parser, Query, (*Query.deciding(), "top"), FIELD_OVERRIDES)
+    parser.add_argument("--objects", action="store_true", help="list the selected objects")
+    common.add_world(parser)
+    common.add_view(parser)
     parser.add_argument("--mask", type=Path, metavar="PNG", help="write the mask of the view")
     parser.add_argument("--attention", type=Path, metavar="PNG", help="write the attention map of the view")
-    overlay_help = "write the view with outlines of the selection, and a caption"
-    parser.add_argument("--overlay", type=Path, metavar="PNG", help=overlay_help)
-    parser.add_argument("--photo", type=Path, metavar="FILE", help="of the view, for --overlay; default: a render")
+    parser.add_argument("--overlay", type=Path, metavar="PNG", help="write the view with outlines, on --photo")
+    parser.add_argument("--photo", type=Path, metavar="FILE", help="of the view; default: a render")
     parser.add_argument("--scores", type=Path, metavar="NPY", help="write the scores [P], float32")
-    object_help = "write only the selected splats: .ply with all their properties, .splat or .spz"
-    parser.add_argument("--object", type=Path, metavar="FILE", help=object_help)
-    parser.add_argument("--coloured", type=Path, metavar="PLY", help="write all splats, coloured by their scores")
+    parser.add_argument("--object", type=Path, metavar="FILE", help="write the selected splats")
+    parser.add_argument("--coloured", type=Path, metavar="PLY", help="write all splats in colours of scores")
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the query, render the mask of a view, write the requested files, and print the answer."""
-    view = view_of(options, "mask", "attention", "overlay")
-    files = {kind: path for kind in OUTPUTS if (path := getattr(options, kind)) is not None}
+    from liftcore.files import read_image
+
+    view = common.view_of(options, "mask", "attention", "overlay")
+    files = outputs_of(options)
     query = _query(options)
-    scene = open_lift(options)
+    scene = common.open_lift(options)
     check_outputs(files, options, scene)
     hint = "or query by example, with --like"
-    encoder = text_encoder(options, scene, hint, stand_in=True) if query.texts else None
+    encoder = common.text_encoder(options, scene, hint, stand_in=True) if query.texts else None
     answer = scene.ask(query, encoder=encoder, places=options.top > 0)
     view_mask = None if view is None else scene.view_mask(answer, view)
     objects = scene.objects(answer) if options.objects else None
     document = _document(answer, objects, view_mask, encoder)
-    photo = None if view_mask is None else _picture(options.photo, view_mask.mask.shape[::-1])
+    photo = None
+    if options.photo is not None and view_mask is not None:
+        photo = read_image(options.photo, view_mask.mask.shape[::-1])[0]
     export = partial(scene.export, source=answer, view=view, view_mask=view_mask, photo=photo)
     document["files"] = write_files(files, {kind: partial(export, what=kind) for kind in files})
     if options.object is not None and options.object.suffix.lower() in LOCAL_SUFFIXES and any(scene.splats.origin):
@@ -120,12 +113,6 @@ def _document(
         share = float(view_mask.mask.mean())
         document["view"] = {"name": view_mask.view, "explanation": view_mask.explanation, "mask_share": share}
     return document
-
-
-def _picture(photo: Path | None, size: tuple[int, int]) -> Image | None:
-    from liftcore.files import read_image
-
-    return None if photo is None else read_image(photo, size)[0]
 
 
 def _lines(document: dict[str, Any]) -> Iterable[str]:

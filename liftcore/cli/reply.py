@@ -47,9 +47,6 @@ def check_outputs(
 
     Args:
         files: by option. scene: whose own files are inputs too. kind: of the option ``output``.
-
-    Raises:
-        InvalidInput: a file cannot be written (`liftcore.files.check_output`), or two are the same file.
     """
     from liftcore.files import check_output
 
@@ -63,6 +60,11 @@ def check_outputs(
         inputs += [Path(file.path) for file in (metadata.splats, metadata.cameras, *metadata.features)]
     for name, path in files.items():
         check_output(path, inputs, kind if name == "output" else OUTPUTS[name.partition("-")[0]])
+
+
+def outputs_of(options: argparse.Namespace) -> dict[str, Path]:
+    """Return the files that options ask for, by option."""
+    return {name: path for name in OUTPUTS if isinstance(path := getattr(options, name, None), Path)}
 
 
 def paths_of(value: Any) -> list[Path]:
