@@ -30,7 +30,8 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
     arrays = formats.add_parser("npy", parents=[shared], help="IMG.npy (.npz, .pt), one dense map a view")
     arrays.add_argument("--layout", choices=("hwc", "chw"), default="hwc", help="of the axes; default hwc")
     fit = "what the encoder did to photos of another shape"
-    arrays.add_argument("--map-fit", choices=("stretch", "pad", "crop"), help=fit)
+    fits = ("stretch", "pad", "crop")
+    arrays.add_argument("--map-fit", choices=fits, default=argparse.SUPPRESS, help=fit)
     masks = formats.add_parser("masks", parents=[shared], help="IMG.npy, a vector a mask, with JSON or pictures")
     unlabelled = "of pixels without a mask"
     masks.add_argument("--unlabelled", type=_grey, default=0, metavar="VALUE", help=f"{unlabelled}; default 0")
@@ -86,24 +87,14 @@ def run(options: argparse.Namespace) -> int:
     from liftcore import pack_folder
     from liftcore.evaluate import inspect_file
 
-    values = {
-        name: value
-        for name, value in vars(options).items()
-        if name in OPTIONS and not (name == "map_fit" and value is None)
-    }
+    values = {name: value for name, value in vars(options).items() if name in OPTIONS}
     with option_errors(NAMES):
         facts = pack_folder(options.folder, options.output, options.format, **values, progress=True)
     description = inspect_file(options.output, "features")
-    names = ("bytes", "views", "channels", "encoder", "text_space", "normalised")
-    document = {
-        "out": str(options.output),
-        **{name: description[name] for name in names},
-        "folders": facts["folders"],
-        "sizes": description["sizes"],
-        "renamed": facts["renamed"],
-        "words": facts["words"],
-        "warnings": [*facts["warnings"], *description["warnings"]],
-    }
+    names = ("bytes", "views", "channels", "encoder", "text_space", "normalised", "sizes")
+    document = {"out": str(options.output), **{name: description[name] for name in names}}
+    document |= {name: facts[name] for name in ("folders", "renamed", "words")}
+    document["warnings"] = [*facts["warnings"], *description["warnings"]]
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
 
