@@ -261,9 +261,10 @@ def get_viewer_file(
     """
     record = deps.store.lift(owner, lift)
     if file == "splats":
-        encoding = {"Content-Encoding": "zstd"} if "zstd" in request.headers.get("accept-encoding", "") else {}
-        work = scene_request("scene", record, deps) | {"compressed": bool(encoding)}
+        headers = request.headers
+        compressed = "zstd" in headers.get("accept-encoding", "") and "range" not in headers
+        work = scene_request("scene", record, deps) | {"compressed": compressed}
         answer = respond(request, deps, work, BINARY, f"scene-{record.id}.splat")
-        answer.headers.update(encoding | {"Vary": "Accept-Encoding"})
+        answer.headers.update({"Vary": "Accept-Encoding"} | ({"Content-Encoding": "zstd"} if compressed else {}))
         return answer
     return respond(request, deps, scene_request("colours", record, deps) | {"what": what}, NPY)
