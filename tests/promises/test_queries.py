@@ -119,6 +119,21 @@ def test_splats_nearer_to_another_word_are_left_to_it(tmp_path: Path) -> None:
     assert np.flatnonzero(pair.selected).tolist() == list(range(40))
 
 
+@pytest.mark.parametrize(("own_splats", "is_named"), [(3, False), (4, True)])
+def test_word_is_named_where_a_quarter_of_its_selection_is_its_own(
+    own_splats: int, is_named: bool, tmp_path: Path
+) -> None:
+    axes = np.eye(8)
+    rows = np.repeat(
+        [(0.9 * axes[0] + 0.95 * axes[1]) / np.hypot(0.9, 0.95), 0.7 * axes[0] + np.sqrt(0.51) * axes[3], axes[4]],
+        [10, own_splats, 40],
+        axis=0,
+    )
+    table = write_table(tmp_path / "words.safetensors", ["one", "nearer"], axes[:2])
+    labels = scene_with(rows).segment(["one", "nearer"], encoder=lc.open_encoder(table))
+    assert {word.word for word in labels.named_words} == ({"one", "nearer"} if is_named else {"nearer"})
+
+
 def test_thin_object_does_not_select_the_scene() -> None:
     words = ["cat"] * 21 + ["cow"] * 2320 + ["curtain"] * 659
     answer = scene_with(photo_vectors(words, 0.2)).ask("cat", encoder="lvis")
@@ -181,6 +196,8 @@ def test_selections_by_hand_are_asked_as_they_are(lift: Path) -> None:
     assert [group.splats for group in scene.objects(lc.Query(sets=["selection:mine"])).objects] == [
         40
     ]  # one of its own
+    edits = len(selection.history)
+    assert len(selection.undo().history) == edits - 1
 
 
 @pytest.mark.parametrize(

@@ -89,6 +89,7 @@ ROWS: list[Row] = [
     (lc.FeatureGrid, {"grid": np.ones((2, 2, 2), int)}, F, "grid"),
     (lc.FeatureGrid, {"grid": np.ones((2, 0, 3))}, F, "grid"),
     (lc.FeatureGrid, {"grid": np.full((1, 1, 2), np.inf)}, F, "grid"),
+    (lc.FeatureGrid, {"grid": np.full((1, 1, 2), 1e30)}, F, "grid"),
     *((call, LIFT | {name: value}, error, argument)
       for call in (lc.lift, lc.plan, lc.region_weights)
       for name, value, error, argument in (

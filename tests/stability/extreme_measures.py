@@ -45,8 +45,8 @@ def always(_: object) -> bool:
 class Outcome:
     """The result of float32 on one extreme with one kernel."""
 
-    error: float | None  # against exact arithmetic, as the case says; None where the input is refused
-    text: tuple[str, ...] = ()  # what the user reads: warnings, or the error
+    error: float  # against exact arithmetic, as the case says
+    text: tuple[str, ...] = ()  # warnings that the user reads
     holds: bool = True  # whether what exact arithmetic says is so, of the float64 and of the float32 result
 
 
@@ -244,19 +244,6 @@ def lift_of(
         return Outcome(float(errors[~faint].max(initial=0)), messages, bool(sound) and claim(result))
 
     return Extreme(name, measure, bound=bound, **options)
-
-
-def error_of(name: str, work: Callable[[], object], text: str) -> Extreme:
-    """An extreme that no answer could be right for: the input is refused, with ``text`` in the error."""
-
-    def measure(_: Kernel) -> Outcome:
-        try:
-            work()
-        except lc.SplatliftError as error:
-            return Outcome(None, (str(error),))
-        return Outcome(None, holds=False)
-
-    return Extreme(name, measure, GAUSSIAN, text=text)
 
 
 def cloud(kernel: Kernel = Kernel.GAUSSIAN_3D) -> lc.Splats:

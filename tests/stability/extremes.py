@@ -14,7 +14,6 @@ import numpy as np
 import torch
 
 import liftcore as lc
-from liftcore.io.colmap import MODELS_BY_NAME, calibration
 from liftcore.scene.cameras import MAX_FOCAL, MAX_SIDE, MIN_FOCAL, behind_lens, distortion_warning, drawn_by
 from liftcore.scene.distortion import Brown, Distortion, Fisheye, photo_places
 from liftcore.scene.splats import Kernel
@@ -35,11 +34,8 @@ from tests.stability.extreme_measures import (
     View,
     always,
     at,
-    cloud,
-    error_of,
     lift_of,
     messages_of,
-    run,
     view_of,
     weights_of,
 )
@@ -299,11 +295,6 @@ LENSES: tuple[Extreme, ...] = (
     view_of("a frame 0.01 times as large", _transformed(0.01), like=at(ROW, LENS_SCALES)),
     view_of("a frame 1e+06 times as large", _transformed(1e6), like=at(ROW, LENS_SCALES), text="further than"),
     view_of("a frame given in float32", _transformed(0.37, digits=np.float32), like=at(ROW, LENS_SCALES)),
-    error_of("a barrel that turns back near the axis (k1 = -9)", lambda: _behind(Brown(k1=-9.0)), "of the photo"),
-    error_of("a thin prism", lambda: calibration(MODELS_BY_NAME["THIN_PRISM_FISHEYE"], [0.0] * 12, "camera 1"),
-        "undistort the photos first"),
-    error_of("a frame that mirrors", lambda: camera_at_origin().transformed(np.diag([1.0, 1.0, -1.0, 1.0])),
-        "no reflection"),
 )
 # fmt: on
 
@@ -423,19 +414,4 @@ MAPS: tuple[Extreme, ...] = (
 )
 # fmt: on
 
-# fmt: off
-REFUSALS: tuple[Extreme, ...] = (
-
-
-
-    error_of("no splats (P = 0)", lambda: splats_at(np.zeros((0, 3))), "empty scene"),
-
-    error_of("values of 1e30", lambda: run({"v0": checkerboard(scale=1e30)}, cloud()), "finite values within"),
-    error_of("a label beyond the codebook", lambda: run({"v0": _labelled(np.full((2, 2), 4), 4)}, cloud()),
-        "rows of its codebook"),
-
-)
-# fmt: on
-
-
-EXTREMES = (*OPACITIES, *SHAPES, *PLACES, *VIEWS, *LENSES, *LENGTHS, *MAPS, *REFUSALS)
+EXTREMES = (*OPACITIES, *SHAPES, *PLACES, *VIEWS, *LENSES, *LENGTHS, *MAPS)

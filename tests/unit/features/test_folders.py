@@ -137,6 +137,7 @@ def test_values_in_memory_and_in_packs_may_have_unit_axes(tmp_path: Path) -> Non
     [
         (np.ones((8, 6), np.float32), r"floats \[F, h, w\].*got float32 \[8, 6\]; .*reshape\(F, h, w\)"),
         (np.ones((5, 2, 3, 4), np.float32), r"got float32 \[5, 2, 3, 4\]; a file is of one view: save each of the 5"),
+        (np.ones((5, 2, 3, 1), np.float32), r"save each of the 5 .*or take the last axis off: array\[\.\.\., 0\]"),
     ],
 )
 def test_other_axes_are_refused_with_a_remedy(stored: np.ndarray, message: str, tmp_path: Path) -> None:

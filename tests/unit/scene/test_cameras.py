@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from camera_files import CAMERAS, IMAGES, assert_same, binary_files, text_files, with_json, write_files
+from camera_files import CAMERAS, IMAGES, binary_files, text_files, with_json, write_files
 
 from liftcore.errors import InvalidCameras, InvalidFeatures
 from liftcore.evaluate.inspect import inspect_file
@@ -131,21 +131,6 @@ def test_image_names_that_are_no_utf8_give_a_warning(tmp_path: Path) -> None:
     assert len(cameras) == 2 and "2 images are not UTF-8" in " ".join(cameras.warnings)
     with pytest.raises(InvalidFeatures, match="names of cameras are not UTF-8"):
         require_pairs(["K\u00fcche_0", "K\u00fcche_1"], cameras)
-
-
-BROKEN_POSES = {
-    "a zero quaternion": binary_files(images=[*IMAGES, (1, (0.0,) * 4, (0.0,) * 3, "broken.jpg")]),
-    "a place that is no number": text_files(images=[*IMAGES, (1, IMAGES[0][1], (math.nan, 0.0, 0.0), "broken.jpg")]),
-}
-
-
-@pytest.mark.parametrize("case", BROKEN_POSES)
-def test_a_broken_pose_of_a_model_is_named_and_the_others_are_read(case: str, tmp_path: Path) -> None:
-    expected = read_cameras(write_files(tmp_path / "whole", binary_files()))
-    path = write_files(tmp_path / "model", BROKEN_POSES[case])
-    cameras = read_cameras(path)
-    assert_same(cameras, expected)
-    assert any("1 cameras were skipped" in text and "'broken'" in text for text in inspect_file(path)["warnings"])
 
 
 def test_broken_poses_of_json_are_named_and_the_others_are_read(tmp_path: Path) -> None:

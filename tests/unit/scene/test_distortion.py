@@ -10,8 +10,8 @@ import pytest
 
 from liftcore.errors import InvalidCameras
 from liftcore.io.colmap import MODELS_BY_NAME, calibration
-from liftcore.scene.cameras import Camera, behind_lens, distortion_warning, drawn_by, pixel_of
-from liftcore.scene.distortion import FARTHEST, Brown, Distortion, Fisheye, Lens, photo_places
+from liftcore.scene.cameras import Camera, behind_lens, distortion_warning
+from liftcore.scene.distortion import FARTHEST, Brown, Distortion, Fisheye, Lens
 
 POINTS = np.array([[0.1, 0.2], [-0.6, 0.45], [0.7, -0.5], [0.0, 0.55]])
 RATIONAL = Brown(k1=-0.28, k2=0.09, k3=-0.015, k4=0.02, k5=-0.01, k6=0.004, p1=0.0012, p2=-0.0007)
@@ -126,20 +126,6 @@ def test_the_pinhole_of_a_photo_is_the_largest_that_it_shows_whole(name: str) ->
         view.replace(height=view.height + 1),
     ]
     assert all(outside(other) > 0 for other in wider)
-
-
-@pytest.mark.parametrize("name", ["barrel", "pincushion"])
-def test_every_pixel_of_a_perspective_photo_is_drawn(name: str) -> None:
-    view = camera(LENSES[name])
-    lens, pinhole = lens_of(view), drawn_by(view)
-    u, v = photo_places(lens)
-    assert u.shape == v.shape == (48, 64)
-    assert u.min() >= 0 and u.max() < pinhole.width and v.min() >= 0 and v.max() < pinhole.height
-    back = lens.on_photo((u - pinhole.cx) / pinhole.fx, (v - pinhole.cy) / pinhole.fy)
-    assert np.abs(back[0] - (np.arange(64) + 0.5)).max() < 1e-4
-    assert np.abs(back[1] - (np.arange(48)[:, None] + 0.5)).max() < 1e-4
-    for x, y in ((0, 0), (10, 20), (63, 47)):
-        assert pixel_of(view, x, y) == (math.floor(u[y, x]), math.floor(v[y, x]))
 
 
 @pytest.mark.parametrize(

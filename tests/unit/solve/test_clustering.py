@@ -35,6 +35,15 @@ def test_planted_clusters_are_found_whatever_the_lengths_of_the_features():
     assert same_partition(labels[labels >= 0], group[labels >= 0])
 
 
+@pytest.mark.parametrize(("smallest", "are_found"), [(20, True), (21, False)])
+def test_a_group_of_fewer_splats_than_the_setting_is_no_cluster(smallest: int, are_found: bool) -> None:
+    group = np.repeat([0, 1, 2], [20, 20, 30])
+    rows = np.eye(3, 24)[group] + np.random.default_rng(0).normal(0, 0.01, (70, 24))
+    settings = SETTINGS.model_copy(update={"aggregation_cluster_size": smallest})
+    clustering = cluster_splats(torch.from_numpy(rows).float(), np.ones(70), settings)
+    assert (clustering.count == 3) == are_found
+
+
 def test_splats_outside_the_sample_join_their_cluster(monkeypatch):
     monkeypatch.setattr("liftcore.solve.clusters.SAMPLE", 400)
     features, group = planted(5_000)
