@@ -152,14 +152,14 @@ def sample(name: str) -> bytes:
 
 
 def sog(part: str, key: str, value: Any) -> Callable[[], bytes]:
-    """Return a builder of a SOG whose description has another value; an empty key breaks it."""
+    """Return a builder of a SOG whose description has another value."""
 
     def build() -> bytes:
         with zipfile.ZipFile(SPLATS / "degree3.sog") as archive:
             members = {name: archive.read(name) for name in archive.namelist()}
         meta = json.loads(members["meta.json"])
         (meta[part] if part else meta)[key] = value
-        return zipped(members | {"meta.json": json.dumps(meta).encode() if key else b"{"})
+        return zipped(members | {"meta.json": json.dumps(meta).encode()})
 
     return build
 
@@ -213,7 +213,6 @@ SPLAT_FILES = [
     ("empty scene", ply(ROWS[:0]), "empty scene"),
     ("big-endian", b"ply\nformat binary_big_endian 1.0\nend_header\n", "binary_little_endian"),
     ("list property", head("element vertex 1", "property list uchar int a") + bytes(8), "scalar"),
-    ("huge count", head("element vertex 999999999999999", "property float x"), "truncated"),
     ("count of 5,000 digits", head("element vertex " + "9" * 5000), "zero or more"),
     ("no element", head(), "without one"),
     ("property twice", head("element vertex 1", "property float x", "property float x"), "same name"),
@@ -226,10 +225,8 @@ SPLAT_FILES = [
     ("odd number of harmonics", with_columns("f_rest_0"), "f_rest"),
     ("gap in harmonics", with_columns("f_rest_1"), "f_rest_0"),
     ("NaN everywhere", with_values("rot_3", np.nan), "finite"),
-    ("infinite place", with_values("x", np.inf), "finite"),
     ("Git LFS", POINTER, "git lfs pull"),
     ("web page", b"<!DOCTYPE html>\n<html>", "web page"),
-    ("gzip", b"\x1f\x8b\x08" + bytes(60), "expected splats"),
     ("pickle", PICKLE, "pickle"),
     ("a pickle of code", checkpoint({"splats": {"means": Intruder()}}), "more than tensors"),
     ("another checkpoint", checkpoint({"model": {"weight": torch.zeros(2)}}), "'model'"),
@@ -238,18 +235,14 @@ SPLAT_FILES = [
     ("spz of version 9", b"NGSP\x09\0\0\0" + bytes(40), "version 9"),
     ("spz cut", sample("degree3.v4.spz")[:-40], "truncated"),
     ("compressed PLY without bounds", compressed(b"float min_x", b"float mon_x"), "'min_x'"),
-    ("compressed PLY without colour", compressed(b"packed_color", b"packed_colur"), "packed_color"),
-    ("compressed PLY of more chunks", compressed(b"element chunk 1", b"element chunk 2"), "bytes"),
     ("SOG of version 1", sog("", "version", 1), "version 2"),
     ("SOG of more splats than pixels", sog("", "count", 400), "400"),
     ("SOG without places", sog("", "means", None), "'means'"),
     ("SOG of NaN", sog("means", "mins", [float("nan")] * 3), "finite"),
     ("SOG that leads elsewhere", sog("means", "files", ["../x", "y"]), "'../x'"),
     ("SOG of a short palette", sog("scales", "codebook", [0.0] * 255), "256"),
-    ("SOG of no picture", sog("sh0", "files", ["meta.json"]), "meta.json"),
     ("SOG of labels beyond", sog("shN", "count", 1), "labels"),
     ("glb that leads elsewhere", glb("buffers/0/uri", "../../etc/passwd"), "within the file"),
-    ("glb of an address", glb("buffers/0/uri", "http://127.0.0.1/s.bin"), "within the file"),
     ("glb of a circle", glb("nodes", [{"mesh": 0, "children": [0]}]), "node twice"),
     ("glb mirrored", glb("nodes/0/scale", [-1, 1, 1]), "reflection"),
     ("glb stretched", glb("nodes/0/scale", [1, 2, 1]), "rotation"),
@@ -260,15 +253,12 @@ SPLAT_FILES = [
 ]
 SPLAT_BOMBS = [
     ("header of 64 MB", lambda: b"ply\n" + b"x" * (64 << 20), "end_header"),
-    ("200,000 comments", HEADER + b"comment\n" * 200_000 + b"end_header\n", "first"),
     ("spz 3 of 2^30 splats", lambda: zlib.compress(spz(3, 1 << 30), wbits=31), "1073741824"),
-    ("spz 4 of 2^30 splats", spz(4, 1 << 30, 5), "1073741824"),
     ("SOG of 2^40 splats", zipped({"meta.json": b'{"version": 2, "count": 1099511627776}'}), "1099511627776"),
     ("SOG of zeros", sog_of_zeros, "bytes"),
     ("SOG of a deep description", zipped({"meta.json": b"[" * 100_000}), "meta.json"),
     ("compressed PLY of 10^11 splats", compressed(b"element vertex 40", b"element vertex 99999999999"), "bytes"),
     ("glb of 2^30 splats", glb("accessors/0/count", 1 << 30), "splats"),
-    ("glb of 100,000 nodes", glb("nodes", [{"children": [1] * 50_000}, *[{"children": [1]}] * 10]), "twice"),
     (
         "checkpoint of a stretched number",
         checkpoint({"splats": {"means": torch.zeros(1).expand(1 << 30, 3)}}),
@@ -302,8 +292,9 @@ BINARY = {
 MANY_ROWS = struct.pack("<Q", 2**63)
 CAMERA_FILES = [
     ("empty", b"", "empty file"),
+    ("text", b"hello", "'hello'"),
+    ("COLMAP's half", BINARY["cameras.bin"], "together"),
     ("not UTF-8", b'{"a": "\xff\xfe"}', "parse"),
-    ("Git LFS", POINTER, "git lfs pull"),
     ("no frames", with_camera(frames=None), "'frames'"),
     ("empty list", b"[]", "at least one view"),
     ("list of nothing", b"[{}]", "'img_name'"),
@@ -315,14 +306,12 @@ CAMERA_FILES = [
     ("10^18 pixels", with_camera(w=10**18), "size"),
     ("focal length of zero", with_camera(fl_x=0), "focal"),
     ("NaN", with_camera(fl_x=float("nan")), "finite"),
-    ("Infinity", with_camera(fl_x=float("inf")), "finite"),
     ("4,000 digits", cameras_json().replace(b"30.0", b"9" * 4000), "finite"),
     ("scaled pose", with_pose(np.diag([2.0, 2, 2, 1]).tolist()), "scaled by 2"),
     ("mirroring pose", with_pose(np.diag([1.0, -1, 1, 1]).tolist()), "mirrors (determinant -1)"),
     ("intrinsics by the size", with_camera(fl_x=0.94, fl_y=1.25, cx=0.5, cy=0.5), "multiply fx and cx by 32"),
     ("VGGT's predictions", zipped({"extrinsic.npy": b"\x93NUMPY", "intrinsic.npy": b"\x93NUMPY"}), "COLMAP model"),
     ("3D Tiles", b'{"asset": {"version": "1.1"}, "geometricError": 1, "root": {}}', "tileset"),
-    ("crooked pose", with_pose(np.diag([4.0, 2, 1, 1]).tolist()), "proper rotation"),
     ("pose of three rows", with_pose([*EYE[:3], [1]]), "4x4"),
     ("pose of another scale", with_pose((2 * np.eye(4)).tolist()), "last row"),
     ("lens beyond the model", with_camera(camera_model="FISHEYE624"), "FISHEYE624"),
@@ -355,8 +344,8 @@ ONES, BOOK, LABELS = np.ones((2, 2, 3), np.float32), np.ones((4, 3), np.float32)
 REGIONS = {"v/labels": LABELS, "v/codebook": BOOK}
 FEATURE_FILES = [
     ("empty", b"", "empty file"),
+    ("text", b"short", "begins with"),
     ("truncated", save({"v/grid": ONES})[:-1], "open"),
-    ("overlapping offsets", tensors(12, v__grid=GRID, w__grid=tensor([1, 1, 2], 4, 12)), "open"),
     ("a tensor twice", safetensors(f"{{{GRID_TEXT},{GRID_TEXT}}}".encode()) + bytes(8), "twice"),
     ("no channels", tensors(0, v__grid=tensor([1, 1, 0], 0, 0)), "empty"),
     ("no views", save({}), "at least one view"),
@@ -364,14 +353,10 @@ FEATURE_FILES = [
     ("codebook alone", save({"v/codebook": BOOK}), "codebook"),
     ("labels beside a grid", save(REGIONS | {"v/grid": ONES}), "with grid"),
     ("grid of two sides", save({"v/grid": BOOK}), "[h, w, F]"),
-    ("grid of integers", save({"v/grid": ONES.astype(np.int32)}), "F16 or F32"),
-    ("codebook of three sides", save({"v/labels": LABELS, "v/codebook": ONES}), "[M, F]"),
     ("labels of floats", save({"v/labels": ONES, "v/codebook": BOOK}), "I16"),
     ("views of other channels", save({"v/grid": ONES, "w/grid": np.ones((1, 1, 4), np.float32)}), "channels"),
     ("label beyond the codebook", save(REGIONS | {"v/labels": LABELS + 4}), "the label 4"),
-    ("label below none", save(REGIONS | {"v/labels": LABELS - 2}), "the label -2"),
     ("NaN in a codebook", save(REGIONS | {"v/codebook": BOOK * np.nan}), "finite"),
-    ("infinite grid", save({"v/grid": ONES * np.inf}), "finite"),
     ("text table", tiny_scene.text_table(), "text embeddings"),
     ("zip of a pickle", zipped({"archive/data.pkl": b"\x80\x02."}), "code"),
     ("pickle", PICKLE, "pickle"),
@@ -379,7 +364,6 @@ FEATURE_FILES = [
 FEATURE_BOMBS = [
     ("header of 2^63 bytes", safetensors(b"{}", 2**63), "header"),
     ("deep header", safetensors(b'{"a":' * 100_000), "open"),
-    ("npy of 4 TB, as it says", b"\x93NUMPY\x01\x00v\x00" + SHAPE.ljust(117) + b"\n", "NumPy"),
 ]
 
 WORD = {"embeddings": tensor([1, 1], 0, 4)}
@@ -462,8 +446,8 @@ BAD_FILES = [
 ]  # fmt: skip
 
 
-def binary_image(camera: int = 1, quaternion: tuple[float, ...] = (1, 0, 0, 0), x: float = 0.0) -> bytes:
-    return struct.pack("<QI7dI", 1, 1, *quaternion, x, 0.0, 1.0, camera) + b"a.png\0" + bytes(8)
+def binary_image(camera: int = 1, quaternion: tuple[float, ...] = (1, 0, 0, 0)) -> bytes:
+    return struct.pack("<QI7dI", 1, 1, *quaternion, 0.0, 0.0, 1.0, camera) + b"a.png\0" + bytes(8)
 
 
 def binary_camera(model: int, *values: float) -> bytes:
@@ -480,15 +464,12 @@ MODELS = [
     ("unknown camera", BINARY | {"images.bin": binary_image(9)}, "camera 9"),
     ("quaternion of zeros", BINARY | {"images.bin": binary_image(quaternion=(0, 0, 0, 0))}, "zero"),
     ("quaternion of NaN", BINARY | {"images.bin": binary_image(quaternion=(np.nan, 0, 0, 0))}, "finite"),
-    ("place of NaN", BINARY | {"images.bin": binary_image(x=np.nan)}, "finite"),
-    ("focal length of NaN", BINARY | {"cameras.bin": binary_camera(1, np.nan, 1, 1, 1)}, "focal"),
     ("half a model", {"cameras.bin": BINARY["cameras.bin"]}, "images.bin"),
     ("pointer", BINARY | {"images.bin": POINTER}, "git lfs pull"),
     ("width of letters", MODEL | {"cameras.txt": b"1 PINHOLE wide 48 1 1 1 1\n"}, "CAMERA_ID"),
     ("parameters missing", MODEL | {"cameras.txt": b"1 PINHOLE 64 48 1 1 1\n"}, "4 parameters"),
     ("pose of letters", MODEL | {"images.txt": b"0 1 0 0 0 0 0 zwei 1 a.jpg\n\n"}, "IMAGE_ID"),
     ("no empty lines", MODEL | {"images.txt": LINE + LINE}, "empty line"),
-    ("name twice", MODEL | {"images.txt": LINE + b"\n" + LINE + b"\n"}, "one view a name"),
 ]
 VECTORS = np.arange(15, dtype=np.float32).reshape(3, 5)
 IDS = np.array([[-1, 0, 0, 2], [1, 1, -1, 2], [1, 1, -1, -1]])
@@ -511,18 +492,13 @@ def with_vectors(**files: bytes) -> dict[str, bytes]:
 GREY = (IDS + 1).astype(np.uint8)
 MASK_FOLDERS = [
     ("vectors of one axis", {"a.npy": npy(np.zeros(3)), "a.png": png(GREY)}, "[M, F]"),
-    ("vectors of integers", {"a.npy": npy(np.zeros((3, 5), np.int32)), "a.png": png(GREY)}, "int32"),
     ("vectors of objects", {"a.npy": npy(OBJECTS), "a.png": png(GREY)}, "code"),
-    ("vectors of NaN", {"a.npy": npy(VECTORS * np.nan), "a.png": png(GREY)}, "codebook"),
     ("fewer vectors than ids", {"a.npy": npy(VECTORS[:2]), "a_masks.npy": npy(IDS)}, "labels"),
     ("fewer masks than vectors", with_vectors(a_masks_npy=npy(MASKS[:2])), "3 masks"),
     ("masks of no axis", with_vectors(a_masks_npy=npy(MASKS[0])), "[M, H, W]"),
-    ("ids beyond", with_vectors(a_masks_npy=npy(np.full((3, 4), 3))), "the label 3"),
     ("ids of halves", with_vectors(a_masks_npy=npy(np.full((3, 4), 0.5))), "whole numbers"),
-    ("masks of objects", with_vectors(a_masks_npy=npy(OBJECTS)), "code"),
     ("masks of text", with_vectors(a_masks_npy=npy(np.array(["a"]))), "numbers"),
     ("JSON too deep", with_vectors(a_json=b"[" * 100_000), "JSON"),
-    ("JSON of no masks", with_vectors(a_json=b"[]"), "3 masks"),
     ("JSON of a number", with_vectors(a_json=b"3"), "list of masks"),
     ("picture of nothing", with_vectors(a_png=png(GREY * 0)), "values"),
     ("picture in colours", with_vectors(a_png=png(Image.new("RGB", (4, 3)))), "colours"),
@@ -531,10 +507,7 @@ MASK_FOLDERS = [
 ARRAY_FOLDERS = [
     ("no arrays", {"notes.txt": b"x"}, "files"),
     ("pickles", {"a.pkl": PICKLE}, "pickles"),
-    ("objects", {"a.npy": npy(OBJECTS)}, "code"),
-    ("integers", {"a.npy": npy(np.zeros((2, 3, 4), np.int32))}, "[h, w, F]"),
     ("four axes", {"a.npy": npy(np.zeros((5, 2, 3, 4), np.float32))}, "[h, w, F]"),
-    ("NaN", {"a.npy": npy(np.full((2, 3, 4), np.nan, np.float32))}, "finite"),
     ("4 TB, as it says", {"a.npy": b"\x93NUMPY\x01\x00v\x00" + SHAPE.ljust(117) + b"\n"}, "a.npy"),
 ]
 BAD_FOLDERS = [
