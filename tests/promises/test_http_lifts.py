@@ -10,13 +10,12 @@ from typing import Any
 import httpx
 import liftcore as lc
 import numpy as np
-import pytest
 from PIL import Image
 
 from tests.server import Server
-from tests.tiny_scene import FOCAL, HEIGHT, SPLATS_A_CLUSTER, VIEWS, WIDTH, WORDS, TinyScene, splat_rows
+from tests.tiny_scene import FOCAL, HEIGHT, SPLATS_A_CLUSTER, VIEWS, WIDTH, WORDS
 
-from .over_http import NO_ID, array, assert_problem, delete_lift, lift_of, picture, upload
+from .over_http import NO_ID, array, assert_problem, delete_lift, lift_of, upload
 
 COUNT = 3 * SPLATS_A_CLUSTER
 
@@ -62,31 +61,6 @@ def test_downloaded_lift_is_the_file_that_the_library_reads(
     assert (part.status_code, part.content) == (206, reply.content[100:200])
 
 
-def test_answers_of_a_downloaded_lift_are_those_of_the_service(
-    client: httpx.Client, lift: dict[str, Any], tiny: TinyScene, tmp_path: Path
-) -> None:
-    files = {"lift.safetensors": client.get(lift["links"]["features"]).content}
-    files |= {"s.ply": tiny.splats, "c.json": tiny.cameras, "t.safetensors": tiny.table}
-    for name, content in files.items():
-        (tmp_path / name).write_bytes(content)
-    scene = lc.Scene(tmp_path / "lift.safetensors", tmp_path / "s.ply", tmp_path / "c.json")
-    answer = scene.ask(lc.Query(text=["lamp"]), encoder=f"table:{tmp_path}/t.safetensors")
-    other = client.get("/query", params={"lift": lift["id"], "text": "lamp"}).json()
-    assert (other["count"], other["threshold"]["value"]) == (answer.count, answer.threshold.value)
-
-
-def test_splats_for_a_viewer_are_in_the_rows_of_the_lift(client: httpx.Client, lift: dict[str, Any]) -> None:
-    content = client.get(f"/lifts/{lift['id']}/splats").content
-    assert len(content) == 32 * COUNT  # .splat: means and scales as f32, colour and turn as u8
-    floats, octets = np.frombuffer(content, "<f4").reshape(COUNT, 8), np.frombuffer(content, np.uint8)
-    rows = splat_rows()
-    np.testing.assert_array_equal(floats[:, :3], rows[:, :3])
-    np.testing.assert_allclose(floats[:, 3:6], np.exp(rows[:, 7:10]), rtol=1e-6)
-    colours = octets.reshape(COUNT, 32)[:, 24:28] / 255
-    np.testing.assert_allclose(colours[:, :3], np.clip(0.5 + 0.282095 * rows[:, 3:6], 0, 1), atol=3e-3)
-    np.testing.assert_allclose(colours[:, 3], 1 / (1 + np.exp(-rows[:, 6])), atol=3e-3)
-
-
 def test_each_splat_has_a_colour_of_its_features(client: httpx.Client, lift: dict[str, Any]) -> None:
     colours = array(client.get(f"/lifts/{lift['id']}/colours", params={"what": "pca"}).content)
     assert (colours.shape, colours.dtype) == ((COUNT, 3), np.uint8)
@@ -105,20 +79,12 @@ def test_views_have_the_cameras_of_their_file(client: httpx.Client, lift: dict[s
         np.testing.assert_allclose(-pose[:3, :3].T @ pose[:3, 3], (VIEWS[view["name"]], 0, 0), atol=1e-6)
 
 
-@pytest.mark.parametrize("channel", ["rgb", "pca", "depth"])
-def test_render_has_the_size_of_its_view(client: httpx.Client, lift: dict[str, Any], channel: str) -> None:
-    parameters = {"lift": lift["id"], "view": "left", "channel": channel}
-    reply = client.get("/render", params=parameters)
-    assert reply.headers["content-type"] == "image/png" and picture(reply.content).shape[:2] == (HEIGHT, WIDTH)
-    (view, *_) = client.get(lift["links"]["views"]).json()["views"]
-    body = {"lift": lift["id"], "camera": view, "channel": channel}
-    assert (picture(client.post("/render", json=body).content) == picture(reply.content)).all()
-    other = client.get("/render", params=parameters | {"view": "right"})
-    assert (picture(other.content) != picture(reply.content)).any()
-    assert_problem(client.get("/render", params=parameters | {"view": "behind"}), 404)
-    assert (
-        assert_problem(client.get("/render", params=parameters | {"channel": "x-rays"}), 422)["argument"] == "channel"
-    )
+def test_views_pixels_and_channels_that_are_none_are_refused(client: httpx.Client, lift: dict[str, Any]) -> None:
+    for change, status, argument in (({"view": "behind"}, 404, "view"), ({"channel": "x-rays"}, 422, "channel")):
+        reply = client.get("/render", params={"lift": lift["id"], "view": "left"} | change)
+        assert assert_problem(reply, status)["argument"] == argument
+    outside = {"view": "left", "x": WIDTH, "y": 0}
+    assert_problem(client.get(f"/lifts/{lift['id']}/regions", params=outside), 422)
 
 
 def test_photos_are_shown_as_they_were_uploaded(client: httpx.Client, lift: dict[str, Any]) -> None:
@@ -150,11 +116,6 @@ def test_objects_are_there_without_words_and_words_name_them(client: httpx.Clien
         middle = entry["centre"][0]
         assert entry["name"] == WORDS[round(middle / 1.2) + 1] and entry["score"] > 0.9
         assert entry["box"]["low"][0] < middle < entry["box"]["high"][0]
-    splats = {"lift": lift["id"], "sets": "object:1"}
-    ply = client.get("/query/splats", params=splats).content
-    assert f"element vertex {SPLATS_A_CLUSTER}\n".encode() in ply[:200]
-    assert_problem(client.get("/query/splats", params=splats | {"sets": "object:77"}))
-    assert_problem(client.get(lift["links"]["objects"], params={"encoder": "nowhere"}), 422)
 
 
 def test_object_takes_a_name_and_is_hidden(client: httpx.Client, lift: dict[str, Any]) -> None:
@@ -180,17 +141,6 @@ def test_sizes_are_in_metres_once_a_unit_has_a_length(client: httpx.Client, lift
         assert_problem(client.patch(path, json={"world": wrong}), 422)
     client.patch(path, json={"world": None})
     assert [entry["size"] for entry in client.get(objects).json()["objects"]] == before
-
-
-def test_region_under_a_pixel_is_an_example_to_ask_by(client: httpx.Client, lift: dict[str, Any]) -> None:
-    at = {"view": "middle", "x": 26, "y": 12}
-    (region,) = client.get(f"/lifts/{lift['id']}/regions", params=at).json()["regions"]
-    assert region["example"] == "region:middle:0:2"
-    answer = client.get("/query", params={"lift": lift["id"], "like": region["example"], "threshold": 0.5}).json()
-    assert {splat["splat"] // SPLATS_A_CLUSTER for splat in answer["top"]} == {WORDS.index("lamp")}
-    mask = client.get(f"/lifts/{lift['id']}/regions/mask", params={"view": "middle", "level": 0, "region": 2})
-    assert picture(mask.content)[12, 26] == 255 and picture(mask.content)[12, 2] == 0
-    assert_problem(client.get(f"/lifts/{lift['id']}/regions", params=at | {"x": WIDTH}), 422)
 
 
 def test_deleted_lift_is_gone_with_all_that_is_of_it(
