@@ -133,9 +133,7 @@ def test_other_methods_are_405_and_other_paths_404(fast: httpx.Client, operation
         assert_problem(fast.get(path), 404)
 
 
-@pytest.mark.parametrize(
-    "content_type", ["multipart/form-data; boundary=x", "nonsense", "application/json; charset=x"]
-)
+@pytest.mark.parametrize("content_type", ["multipart/form-data; boundary=x", "nonsense"])
 def test_odd_media_types_are_refused_or_read(
     fast: httpx.Client, operations: Operations, content_type: str, lift: dict[str, Any]
 ) -> None:
