@@ -19,7 +19,7 @@ import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import httpx
 from fastapi.testclient import TestClient
@@ -36,30 +36,12 @@ ROOT = Path(__file__).parents[1]
 PATIENCE_SECONDS = 900.0  # of a machine that has other things to do, kernels to compile among them
 FINAL_STATES = ("succeeded", "failed", "canceled")
 MARK = "SERVER_UNDER_TEST"  # in the environment of a server and of all that it starts
-# Setting -> the fields that it stands for, where the service has other names.
-FIELDS = {
-    "memory_bytes": ("check_memory_bytes",),
-    "floor_bytes": ("disk_floor_bytes",),
-}
-
-
-class Client(Protocol):
-    """Common interface of httpx's client and the test client."""
-
-    def get(self, url: str, /) -> Any:
-        """Return the response to a GET."""
-        ...
-
-
-def fields_of(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return the fields of the service's settings and their values."""
-    return {field: value for name, value in settings.items() for field in FIELDS.get(name, (name,))}
 
 
 @contextmanager
 def serving(data: Path, **settings: Any) -> Iterator[TestClient]:
     """Yield a client of the application over a data directory; settings are those of `splatlift serve`."""
-    options = ServiceSettings.model_validate({"data": data, **fields_of(settings)})
+    options = ServiceSettings.model_validate({"data": data, **settings})
     store = Store(options.data, options.disk_floor_bytes)
     try:
         with TestClient(create_app(options, store), ADDRESS, raise_server_exceptions=False) as client:
@@ -77,7 +59,7 @@ def until(condition: Callable[[], Result | None], seconds: float = PATIENCE_SECO
     return value
 
 
-def wait_for_end(client: Client, job: str) -> dict[str, Any]:
+def wait_for_end(client: Any, job: str) -> dict[str, Any]:
     """Poll the job at a path until it has ended; return it."""
 
     def final_job() -> dict[str, Any] | None:
@@ -87,7 +69,7 @@ def wait_for_end(client: Client, job: str) -> dict[str, Any]:
     return until(final_job)
 
 
-def digest_of_lift(client: Client, lift: str) -> str:
+def digest_of_lift(client: Any, lift: str) -> str:
     """Return the digest of the tensors and diagnostics of the lift at a path: all that does not tell of time."""
     tensors = load(client.get(f"{lift}/features").content)
     total = hashlib.sha256()
@@ -122,26 +104,18 @@ def refused_start(*options: str, data: Path) -> str:
 class Server:
     """`splatlift serve` as a process, over a data directory; it may be killed and started again."""
 
-    def __init__(
-        self,
-        data: Path,
-        *,
-        command: tuple[str, ...] = ("-m", "service", "--port", "0"),
-        options: tuple[str, ...] = (),
-        **settings: Any,
-    ) -> None:
+    def __init__(self, data: Path, **settings: Any) -> None:
         self.data = data
-        self._command = command
         self._mark = uuid.uuid4().hex
         texts = {
             name: json.dumps(value) if isinstance(value, dict) else str(value)
-            for name, value in fields_of({"data": data, **settings}).items()
+            for name, value in {"data": data, **settings}.items()
         }
         self._environment = {f"SPLATLIFT_{name.upper()}": text for name, text in texts.items()}
         self._process: subprocess.Popen[str] | None = None
         # No connection is used twice: one that lay idle may be closed in the moment in which it is taken up again.
         self.client = httpx.Client(timeout=PATIENCE_SECONDS, limits=httpx.Limits(max_keepalive_connections=0))
-        self.start(*options)
+        self.start()
 
     def __enter__(self) -> Self:
         return self
@@ -163,14 +137,14 @@ class Server:
         """The file with what the server says on stderr."""
         return self.data.with_name(f"{self.data.name}.log")
 
-    def start(self, *options: str) -> None:
+    def start(self) -> None:
         """Start, and wait until it listens."""
         inherited = {name: value for name, value in os.environ.items() if not name.startswith("SPLATLIFT_")}
         environment = inherited | {"PYTHONPATH": str(ROOT), MARK: self._mark} | self._environment
         self.data.parent.mkdir(parents=True, exist_ok=True)
         with self.log.open("ab") as stderr:
             self._process = subprocess.Popen(
-                [sys.executable, *self._command, *options],
+                [sys.executable, "-m", "service", "--port", "0"],
                 stdout=subprocess.PIPE, stderr=stderr, text=True, cwd=ROOT, env=environment,
             )  # fmt: skip
         assert self._process.stdout is not None
@@ -219,17 +193,3 @@ class Server:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
         return len(children)
-
-    def usage(self) -> dict[str, int]:
-        """Return the descriptors, threads and resident kilobytes of the server's process."""
-        return usage(self.pid)
-
-
-def usage(pid: int) -> dict[str, int]:
-    """Return the descriptors, threads and resident kilobytes of a process."""
-    status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
-    return {
-        "descriptors": len(list(Path(f"/proc/{pid}/fd").iterdir())),
-        "threads": int(status["Threads"]),
-        "resident_kb": int(status["VmRSS"].split()[0]),
-    }
