@@ -11,20 +11,29 @@ entries is compared as a group of its own, in pieces.
 
 import numpy as np
 import torch
-from llvmlite import ir
-from numba import types
-from numba.core.datamodel import models
-from numba.extending import register_model
 from torch import Tensor
 
-from liftcore.raster.cpu.simd import compiled
+from liftcore.raster.cpu.simd import (
+    WIDE,
+    WIDE_LANES,
+    first_lanes,
+    loader_of,
+    minus,
+    plus,
+    plus_product,
+    plus_times,
+    store_lanes,
+    sum_of_lanes,
+    zeros_of,
+)
 from liftcore.runtime.jit import kernel
 
 GROUP = 4  # rows; the code below is unrolled over them
 LONG = 256  # terms of a sum that float32 adds one by one
 MOST_COMPARED = 1024  # entries of a row that is compared at once: four levels of 256 views
-LANES = 32  # channels per LLVM vector; LLVM splits it into the machine's registers
+LANES = WIDE_LANES  # channels of a vector
 NO_REGION = np.int32(2**31 - 1)
+no_lanes, lanes_at = zeros_of(WIDE), loader_of(WIDE)
 
 
 def new_table(rows: int, columns: int, place: torch.device) -> Tensor:
@@ -44,136 +53,6 @@ def flat_table(table: Tensor) -> np.ndarray:
     if table.is_contiguous() and table.storage_offset() == 0 and storage.nbytes() == 4 * size:
         return table.as_strided((size,), (1,)).numpy()
     return torch.cat([table.reshape(-1), table.new_zeros(LANES)]).numpy()
-
-
-# ---- LANES numbers at a time
-
-
-class _Lanes(types.Type):
-    """LANES float32 values as a numba type; LLVM splits them into the machine's registers."""
-
-    def __init__(self) -> None:
-        super().__init__(name=f"Lanes{LANES}")
-
-
-ALL = _Lanes()
-FLOATS = ir.VectorType(ir.FloatType(), LANES)
-FLOAT_ARRAY = types.Array(types.float32, 1, "C")
-_FUSE = ("contract",)  # a*b + c may become one fused instruction
-
-
-@register_model(_Lanes)
-class _LanesModel(models.PrimitiveModel):
-    """The data model of ``_Lanes``: an LLVM vector."""
-
-    def __init__(self, manager, kind) -> None:
-        super().__init__(manager, kind, FLOATS)
-
-
-def _pointer(context, builder, kind, array, offset):
-    data = context.make_array(kind)(context, builder, value=array).data
-    return builder.bitcast(builder.gep(data, [offset]), FLOATS.as_pointer())
-
-
-def _numbers(values) -> ir.Constant:
-    return ir.Constant(ir.VectorType(ir.IntType(32), len(values)), list(values))
-
-
-def _fused(builder, left, right, total):
-    return builder.fadd(builder.fmul(left, right, flags=_FUSE), total, flags=_FUSE)
-
-
-@compiled
-def no_lanes(typingctx):
-    """Return zeros."""
-    return ALL(), lambda context, builder, signature, args: ir.Constant(FLOATS, [0.0] * LANES)
-
-
-@compiled
-def lanes_at(typingctx, values, offset):
-    """Load ``values[offset + i]``."""
-
-    def codegen(context, builder, signature, args):
-        return builder.load(_pointer(context, builder, signature.args[0], *args), align=4)
-
-    return ALL(FLOAT_ARRAY, types.intp), codegen
-
-
-@compiled
-def store_lanes(typingctx, values, offset, lanes):
-    """Store ``values[offset + i] = lanes[i]``."""
-
-    def codegen(context, builder, signature, args):
-        builder.store(args[2], _pointer(context, builder, signature.args[0], *args[:2]), align=4)
-        return context.get_dummy_value()
-
-    return types.void(FLOAT_ARRAY, types.intp, ALL), codegen
-
-
-@compiled
-def plus_times(typingctx, total, factor, lanes):
-    """Return ``total[i] + factor lanes[i]``, for one factor."""
-
-    def codegen(context, builder, signature, args):
-        undefined = ir.Constant(FLOATS, ir.Undefined)
-        first = builder.insert_element(undefined, args[1], ir.Constant(ir.IntType(32), 0))
-        return _fused(builder, builder.shuffle_vector(first, undefined, _numbers([0] * LANES)), args[2], args[0])
-
-    return ALL(ALL, types.float32, ALL), codegen
-
-
-@compiled
-def plus_product(typingctx, total, left, right):
-    """Return ``total[i] + left[i] right[i]``."""
-    return ALL(ALL, ALL, ALL), lambda context, builder, signature, args: _fused(builder, args[1], args[2], args[0])
-
-
-@compiled
-def plus(typingctx, left, right):
-    """Return ``left[i] + right[i]``."""
-    return ALL(ALL, ALL), lambda context, builder, signature, args: builder.fadd(*args)
-
-
-@compiled
-def minus(typingctx, left, right):
-    """Return ``left[i] - right[i]``."""
-    return ALL(ALL, ALL), lambda context, builder, signature, args: builder.fsub(*args)
-
-
-@compiled
-def first_lanes(typingctx, lanes, count):
-    """Return ``lanes[i]`` for i < count, else zero."""
-
-    def codegen(context, builder, signature, args):
-        numbers = ir.VectorType(ir.IntType(32), LANES)
-        undefined = ir.Constant(numbers, ir.Undefined)
-        count = builder.trunc(args[1], ir.IntType(32))
-        first = builder.insert_element(undefined, count, ir.Constant(ir.IntType(32), 0))
-        counts = builder.shuffle_vector(first, undefined, _numbers([0] * LANES))
-        return builder.select(
-            builder.icmp_signed("<", _numbers(range(LANES)), counts), args[0], ir.Constant(FLOATS, [0.0] * LANES)
-        )
-
-    return ALL(ALL, types.intp), codegen
-
-
-@compiled
-def sum_of_lanes(typingctx, lanes):
-    """Return the sum of the lanes, in a fixed tree."""
-
-    def codegen(context, builder, signature, args):
-        total, size = args[0], LANES
-        while size > 1:
-            size //= 2
-            undefined = ir.Constant(total.type, ir.Undefined)
-            halves = [builder.shuffle_vector(total, undefined, _numbers(range(at, at + size))) for at in (0, size)]
-            total = builder.fadd(*halves)
-        return builder.extract_element(total, ir.Constant(ir.IntType(32), 0))
-
-    return types.float32(ALL), codegen
-
-
-# ---- groups of rows
 
 
 @kernel

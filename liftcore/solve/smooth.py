@@ -30,7 +30,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from liftcore.raster.cpu.simd import LANES, in_all_lanes, lanes_at, plus, plus_product, store_lanes, times
+from liftcore.raster.cpu.simd import (
+    LANES,
+    in_all_lanes,
+    lanes_at,
+    minus,
+    plus,
+    plus_product,
+    plus_times,
+    store_lanes,
+    times,
+)
 from liftcore.runtime.cores import cores
 from liftcore.runtime.jit import kernel
 from liftcore.runtime.one_thread import one_thread
@@ -112,16 +122,14 @@ def smooth(
     with ThreadPoolExecutor(threads or cores()) as pool:
         if smoothness and has_weight.any():
             steps, residual = _conjugate_gradients(system, _probe(X, graph.order, has_weight, pool), pool)
-            staged = torch.empty(count, BLOCK, dtype=X.dtype)  # a block in the graph's order, in X's dtype
-            source, target = _in_words(X, staged)
             values, *iterates = (np.zeros((count, BLOCK), np.float32) for _ in range(3))
             for begin in range(0, channels, BLOCK):
-                width = min(BLOCK, channels - begin)
+                part = X[:, begin : begin + BLOCK]
+                width = part.shape[1]
 
-                def read(rows: slice, begin: int = begin, width: int = width) -> tuple[np.ndarray, np.ndarray]:
+                def read(rows: slice, part: Tensor = part, width: int = width) -> tuple[np.ndarray, np.ndarray]:
                     """Copy rows of X in the graph's order; return the minimum and maximum of each channel."""
-                    take_rows(rows.start, rows.stop, graph.order, source, begin // BLOCK * target.shape[1], target)
-                    torch.from_numpy(values[rows, :width]).copy_(staged[rows, :width])
+                    values[rows, :width] = part.index_select(0, torch.from_numpy(graph.order[rows])).float().numpy()
                     low, high = np.full(width, np.inf, np.float32), np.full(width, -np.inf, np.float32)
                     bound_rows(rows.start, rows.stop, has_weight, values, low, high)
                     for iterate in iterates:
@@ -134,13 +142,11 @@ def smooth(
                 arguments = system.weights, values, low, high, solution
                 squares[:, begin : begin + width] = _row_sums(clip_rows, arguments, (2, width), count, pool)
 
-                def write(
-                    rows: slice, begin: int = begin, width: int = width, solution: np.ndarray = solution
-                ) -> None:
-                    """Copy rows back to X."""
-                    staged[rows, :width].copy_(torch.from_numpy(solution[rows, :width]))
-                    first_word = begin // BLOCK * target.shape[1]
-                    put_rows(rows.start, rows.stop, graph.order, has_weight, target, first_word, source)
+                def write(rows: slice, part: Tensor = part, solution: np.ndarray = solution) -> None:
+                    """Copy rows that have weight back to X."""
+                    mask = has_weight[rows]
+                    smooth_rows = torch.from_numpy(solution[rows, : part.shape[1]][mask])
+                    part.index_copy_(0, torch.from_numpy(graph.order[rows][mask]).long(), smooth_rows.to(X.dtype))
 
                 _map_rows(write, count, pool)
                 progress("smooth", begin + width, channels, "channels")
@@ -246,19 +252,15 @@ def step_rows(
     """Overwrite the iterate before X by that after it, in rows first..last of flat [P, 64] arrays."""
     for j in range(first, last):
         far = length / diagonal[j] if diagonal[j] > 0 else np.float32(0.0)
-        at, middle = BLOCK * j, BLOCK * j + wide.LANES
-        x, y = wide.lanes_at(X, at), wide.lanes_at(X, middle)
-        p = wide.plus_times(wide.no_lanes(), weights[j], wide.lanes_at(start, at))
-        q = wide.plus_times(wide.no_lanes(), weights[j], wide.lanes_at(start, middle))
-        p, q = wide.plus_times(p, -diagonal[j], x), wide.plus_times(q, -diagonal[j], y)
-        for n in range(starts[j], starts[j + 1]):
-            k = BLOCK * np.int64(neighbours[n])
-            p = wide.plus_times(p, couplings[n], wide.lanes_at(X, k))
-            q = wide.plus_times(q, couplings[n], wide.lanes_at(X, k + wide.LANES))
-        p = wide.plus_times(wide.plus_times(x, far, p), turn, wide.minus(x, wide.lanes_at(before, at)))
-        wide.store_lanes(before, at, p)
-        q = wide.plus_times(wide.plus_times(y, far, q), turn, wide.minus(y, wide.lanes_at(before, middle)))
-        wide.store_lanes(before, middle, q)
+        for c in range(0, BLOCK, wide.LANES):
+            at = BLOCK * j + c
+            x = wide.lanes_at(X, at)
+            p = plus_times(wide.no_lanes(), weights[j], wide.lanes_at(start, at))
+            p = plus_times(p, -diagonal[j], x)
+            for n in range(starts[j], starts[j + 1]):
+                p = plus_times(p, couplings[n], wide.lanes_at(X, BLOCK * np.int64(neighbours[n]) + c))
+            p = plus_times(plus_times(x, far, p), turn, minus(x, wide.lanes_at(before, at)))
+            store_lanes(before, at, p)
 
 
 @kernel
@@ -295,36 +297,6 @@ def turn_rows(first, last, inverse, turn, rest, direction, dots):
     for j in range(first, last):
         for c in range(direction.shape[1]):
             direction[j, c] = inverse[j] * rest[j, c] + turn * direction[j, c]
-
-
-def _in_words(*tables: Tensor) -> list[np.ndarray]:
-    """View tables as integers of 64 bits, if rows are whole numbers of these, else of 16; they are copied faster."""
-    arrays = [table.numpy() for table in tables]
-    is_aligned = all(
-        size % 8 == 0
-        for array in arrays
-        for size in (array.ctypes.data, array.strides[0], array.shape[1] * array.itemsize)
-    )
-    return [array.view(np.int64 if is_aligned else np.int16) for array in arrays]
-
-
-@kernel
-def take_rows(first, last, order, source, begin, target):
-    """Copy rows of X, in the graph's order, to rows first..last of a block; both in words, X's from ``begin`` on."""
-    for j in range(first, last):
-        row = order[j]
-        for word in range(min(target.shape[1], source.shape[1] - begin)):
-            target[j, word] = source[row, begin + word]
-
-
-@kernel
-def put_rows(first, last, order, has_weight, source, begin, target):
-    """Copy rows first..last of a block that have weight back to X, inverse to `take_rows`."""
-    for j in range(first, last):
-        if has_weight[j]:
-            row = order[j]
-            for word in range(min(source.shape[1], target.shape[1] - begin)):
-                target[row, begin + word] = source[j, word]
 
 
 @kernel

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 LANES = 8
+WIDE_LANES = 32  # where sums of several splats share a load; LLVM splits them into the machine's registers
 ROWS = TILE
 SIDES = TILE // LANES
 SEGMENTS = SIDES * ROWS  # of a tile
@@ -50,13 +51,14 @@ FLOAT_ARRAY = types.Array(types.float32, 1, "C")
 
 
 class _Lanes(types.Type):
-    """Eight float32 values in one vector register, as a numba type."""
+    """Float32 values in vector registers, as a numba type."""
 
-    def __init__(self) -> None:
-        super().__init__(name="Lanes")
+    def __init__(self, count: int) -> None:
+        super().__init__(name=f"Lanes{count}")
+        self.vector = ir.VectorType(FLOAT, count)
 
 
-EIGHT = _Lanes()
+EIGHT, WIDE = _Lanes(LANES), _Lanes(WIDE_LANES)
 
 
 @register_model(_Lanes)
@@ -64,7 +66,7 @@ class _LanesModel(models.PrimitiveModel):
     """The data model of ``_Lanes``: an LLVM vector."""
 
     def __init__(self, manager: Any, kind: _Lanes) -> None:
-        super().__init__(manager, kind, FLOATS)
+        super().__init__(manager, kind, kind.vector)
 
 
 def compiled(function: Callable) -> Any:
@@ -136,7 +138,7 @@ def _of_two(build: Callable[..., ir.Value]) -> Any:
     """Return an intrinsic of two vectors of lanes."""
 
     def operation(typingctx, left, right):
-        return EIGHT(EIGHT, EIGHT), lambda context, builder, signature, args: build(builder, *args)
+        return left(left, right), lambda context, builder, signature, args: build(builder, *args)
 
     return intrinsic(operation)
 
@@ -145,12 +147,13 @@ def _of_three(build: Callable[..., ir.Value]) -> Any:
     """Return an intrinsic of three vectors of lanes."""
 
     def operation(typingctx, first, second, third):
-        return EIGHT(EIGHT, EIGHT, EIGHT), lambda context, builder, signature, args: build(builder, *args)
+        return first(first, second, third), lambda context, builder, signature, args: build(builder, *args)
 
     return intrinsic(operation)
 
 
 plus = _of_two(lambda builder, left, right: builder.fadd(left, right))
+minus = _of_two(lambda builder, left, right: builder.fsub(left, right))
 times = _of_two(lambda builder, left, right: builder.fmul(left, right))
 larger = _of_two(_maximum)
 smaller = _of_two(_minimum)
@@ -159,10 +162,30 @@ where_above = _of_three(_where(">"))  # (left, right, values): values[i] where l
 where_equal = _of_three(_where("=="))
 
 
-@compiled
-def no_lanes(typingctx):
-    """Return eight zeros."""
-    return EIGHT(), lambda context, builder, signature, args: _constant(0.0)
+def zeros_of(lanes: _Lanes) -> Any:
+    """Return an intrinsic that returns zeros."""
+
+    def zeros(typingctx):
+        constant = ir.Constant(lanes.vector, [0.0] * lanes.vector.count)
+        return lanes(), lambda context, builder, signature, args: constant
+
+    return intrinsic(zeros)
+
+
+def loader_of(lanes: _Lanes) -> Any:
+    """Return an intrinsic that loads ``values[offset + i]``."""
+
+    def load(typingctx, values, offset):
+        def codegen(context, builder, signature, args):
+            place = _pointer(context, builder, signature.args[0], *args)
+            return _load(builder, builder.bitcast(place, lanes.vector.as_pointer()))
+
+        return lanes(FLOAT_ARRAY, types.intp), codegen
+
+    return intrinsic(load)
+
+
+no_lanes, lanes_at = zeros_of(EIGHT), loader_of(EIGHT)
 
 
 @compiled
@@ -172,24 +195,38 @@ def in_all_lanes(typingctx, value):
 
 
 @compiled
-def lanes_at(typingctx, values, offset):
-    """Load ``values[offset + i]``."""
-
-    def codegen(context, builder, signature, args):
-        return _load(builder, _lanes_pointer(context, builder, signature.args[0], *args))
-
-    return EIGHT(FLOAT_ARRAY, types.intp), codegen
-
-
-@compiled
 def store_lanes(typingctx, values, offset, lanes):
     """Store ``values[offset + i] = lanes[i]``."""
 
     def codegen(context, builder, signature, args):
-        builder.store(args[2], _lanes_pointer(context, builder, signature.args[0], *args[:2]), align=4)
+        place = _pointer(context, builder, signature.args[0], *args[:2])
+        builder.store(args[2], builder.bitcast(place, args[2].type.as_pointer()), align=4)
         return context.get_dummy_value()
 
-    return types.void(FLOAT_ARRAY, types.intp, EIGHT), codegen
+    return types.void(FLOAT_ARRAY, types.intp, lanes), codegen
+
+
+@compiled
+def plus_times(typingctx, total, factor, lanes):
+    """Return ``total[i] + factor lanes[i]``, for one factor."""
+
+    def codegen(context, builder, signature, args):
+        return _fused(builder, _broadcast(builder, args[1], args[2].type), args[2], args[0])
+
+    return total(total, types.float32, lanes), codegen
+
+
+@compiled
+def first_lanes(typingctx, lanes, count):
+    """Return ``lanes[i]`` for i < count, else zero."""
+
+    def codegen(context, builder, signature, args):
+        kind = ir.VectorType(INT, args[0].type.count)
+        numbers, counts = ir.Constant(kind, list(range(kind.count))), builder.trunc(args[1], INT)
+        is_first = builder.icmp_signed("<", numbers, _broadcast(builder, counts, kind))
+        return builder.select(is_first, args[0], ir.Constant(args[0].type, [0.0] * kind.count))
+
+    return lanes(lanes, types.intp), codegen
 
 
 @compiled
@@ -197,13 +234,14 @@ def sum_of_lanes(typingctx, lanes):
     """Return the sum of the lanes, in a fixed tree."""
 
     def codegen(context, builder, signature, args):
-        parts = [builder.extract_element(args[0], ir.Constant(INT, lane)) for lane in range(LANES)]
-        while len(parts) > 1:
-            half = len(parts) // 2
-            parts = [builder.fadd(parts[k], parts[k + half]) for k in range(half)]
-        return parts[0]
+        total = args[0]
+        while total.type.count > 1:
+            size, undefined = total.type.count // 2, ir.Constant(total.type, ir.Undefined)
+            places = (ir.Constant(ir.VectorType(INT, size), list(range(at, at + size))) for at in (0, size))
+            total = builder.fadd(*(builder.shuffle_vector(total, undefined, half) for half in places))
+        return builder.extract_element(total, ir.Constant(INT, 0))
 
-    return types.float32(EIGHT), codegen
+    return types.float32(lanes), codegen
 
 
 @compiled
