@@ -27,7 +27,6 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="LIFT", help="the lift to write")
     add_settings(parser)
     add_world(parser)
-    parser.add_argument("--explain", action="store_true", help="print the plan before the lift")
     add_verbose(parser)
     parser.add_argument("--checkpoint", type=Path, metavar="DIR", help="keep rasterized views, to resume")
     parser.add_argument("--engine", metavar="NAME", help="lift in blocks of bounded memory: local or ray")
@@ -59,7 +58,7 @@ def run(options: argparse.Namespace) -> int:
     def add_plan(plan: Plan) -> None:
         plans.append(plan)
         if not options.json:
-            print(*(plan.lines() if options.explain else plan_lines(plan)), sep="\n", flush=True)
+            print(*plan_lines(plan), sep="\n", flush=True)
 
     result = lift_files(
         options.splats,
@@ -182,7 +181,7 @@ def _lines(document: dict[str, Any], verbose: bool) -> Iterable[str]:
     if not verbose:
         return
     for key, value in document["diagnostics"].items():
-        if key not in ("plan", "warnings"):  # --explain prints the whole plan
+        if key not in ("plan", "warnings"):  # the plan is printed before the lift
             yield f"  {key}: {smoothing_line(value) if key == 'smoothing' else short_text(value)}"
     yield "timings:"
     yield from (f"  {stage}: {seconds:.3f} s" for stage, seconds in document["timings"].items())

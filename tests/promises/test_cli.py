@@ -281,7 +281,7 @@ def test_plan_is_that_of_the_lift_and_said_once(scene: Path) -> None:
     assert plan.views and len(plan.views) + len(plan.left_out) == 3 > len(plan.views)
     assert (document["splats"], document["channels"], document["dtype"]) == (60, 3, "float16")
     assert document["warnings"] == list(plan.warnings) != []
-    lift = ["lift", *sources(scene), "-o", scene / "x.safetensors", "--explain", "--verbose"]
+    lift = ["lift", *sources(scene), "-o", scene / "x.safetensors", "--verbose"]
     lines = run(*lift).out
     assert lines.startswith("plan: 60 splats") and "timings:\n" in lines and "row_sum_mean" in lines
     for text in (lines, json.dumps(run(*lift, "--json").document["warnings"])):

@@ -57,15 +57,12 @@ def plan_of_a_worker(plan: Plan) -> Plan:
     """Replace the memory of a plan by the estimate for one worker: bytes of each part at its peak."""
     splats, views = min(1.0, ROWS / plan.splats), min(1.0, PIECE_VIEWS / len(plan.views))
     splat_share = min(1.0, max(SELECTED, plan.splats_a_view) / plan.splats)
-    shares = {"splats": splat_share, "scene": splat_share, "features": splats}
-    # Some of their steps work on blocks of views, some on blocks of splats.
-    shares |= dict.fromkeys(("objects", "reweighting"), max(views, splats))
+    shares = {"splats": splat_share, "features": splats, "steps": max(views, splats)}
     weights = {share: min(int(share * plan.weight_bytes), MEMORY_LIMIT) for share in (views, splats)}
     phases = dict[str, dict[str, int]]()
     for phase, parts in plan.memory_phases.items():
         phases[phase] = {name: int(size * shares.get(name, 1.0)) for name, size in parts.items()}
-        phases[phase]["weights"] = weights[views if phase in ("geometry", "gather") else splats]
-    phases["gather"]["gathered"] = weights[splats]
+        phases[phase]["weights"] = weights[views if phase == "geometry" else splats]
     return replace(plan, memory_phases=phases, weight_bytes=0)
 
 

@@ -33,9 +33,7 @@ from liftcore.scene.cameras import Camera, Cameras, distortion_warning, intrinsi
 from liftcore.scene.compositing import TILE
 from liftcore.scene.render_mode import rendering_reason, rendering_warnings
 from liftcore.scene.splats import Splats
-from liftcore.solve.clusters import SAMPLE
 from liftcore.solve.codebook import LEAST_CHANNELS, TABLE_BYTES
-from liftcore.solve.consensus import BLOCK_ENTRIES
 from liftcore.solve.diagnostics import shape_warnings
 from liftcore.solve.objects import MOST_REGIONS
 from liftcore.solve.rays import sample_pixels
@@ -55,13 +53,10 @@ RECORD_BYTES = 240  # of a visible splat: projected, with its row of W
 TILE_BYTES = 100  # of a splat in a tile: its index in the tile's list, and its weights there
 ENTRY_BYTES, ROW_BYTES = 8, 20  # of W: region and weight; a splat's number, row start and total weight
 DENSE_BYTES = 27  # of an entry of a dense map: by tiles, and gathered by splat
-FACTOR_BYTES = 4  # of an entry: a factor, or its weight times the factor
-REWEIGHT_BYTES = 12  # of an entry: factors, and the products and squares behind them
-CONSENSUS_BYTES = 10  # of an entry: its share, the count of views, its membership; the tuple of its view
-BLOCK_BYTES = 9  # of an entry that lies by region
-OBJECT_BYTES = 12  # of an entry: the membership of its splat, the node, its place in the node's list
+STEP_BYTES = 12  # of an entry, in the steps between W and X
+FACTOR_BYTES = 19  # of an entry there whose factor is in memory
 HIT_BYTES = 24  # of a splat on a ray, in the matrix of the least-squares optimum and what it is joined from
-CLUSTERING = 80_000_000  # of hdbscan and its dependencies
+CLUSTERING = 320_000_000  # of hdbscan with its dependencies and its sample
 SMOOTHING_BYTES = 2_100  # of a splat: the graph while it is built, or with a block of channels
 SPARE = 0.9  # of the free memory: 10 % are left to other processes
 DEVICE_SPLAT_BYTES = 400  # of a splat on a GPU, with the smallest batches of tiles
@@ -93,7 +88,6 @@ class Plan:
     view_cosine: float | None  # expected, of the views' features to those of all, if the setting chose views
     seen_share: float  # of the splats, that some view can see, before occlusion
     splats_a_view: float  # that a view can see, before occlusion
-    levels: tuple[int, int] | None  # the single level of the setting, and the number of levels in maps; None: all
     channels: int  # F
     dtype: str  # of X, if it can represent the codebooks
     memory_phases: Mapping[str, Mapping[str, int]]  # bytes a part in each phase, about; what a phase frees is gone
@@ -103,11 +97,6 @@ class Plan:
     seconds: float | None  # estimate for the geometry of all views on this machine now; None for few views
     machine_warnings: tuple[str, ...]  # of this machine, today
     input_warnings: tuple[str, ...]  # of splats, cameras and features; the diagnostics of the lift have them too
-
-    @property
-    def rendered(self) -> str:
-        """The kernel and the rendering, as text for people."""
-        return f"{self.kernel}, antialiased: {self.rendering}" if self.antialiased else self.kernel
 
     def __repr__(self) -> str:
         views = f"{len(self.views)} of {self.available_views} views"
@@ -137,48 +126,24 @@ class Plan:
 
     def facts(self) -> dict[str, Any]:
         """Return plain values for the diagnostics, without those that depend on this machine alone."""
-        return {
-            "kernel": self.kernel,
-            "antialiased": self.antialiased,
-            "rendering": self.rendering,
-            "splats": self.splats,
-            "seen_share": self.seen_share,
-            "splats_a_view": self.splats_a_view,
+        names = "kernel", "antialiased", "rendering", "splats", "seen_share", "splats_a_view", "view_cosine"
+        return {name: getattr(self, name) for name in (*names, "channels", "dtype", "memory_bytes")} | {
             "views": len(self.views),
             "views_left_out": len(self.left_out),
-            "view_cosine": self.view_cosine,
-            "levels": None if self.levels is None else {"alone": self.levels[0], "of": self.levels[1]},
-            "channels": self.channels,
-            "dtype": self.dtype,
-            "memory_bytes": self.memory_bytes,
             "memory": dict(self.memory),
-            "weights_in_files_bytes": max(0, self.weight_bytes - MEMORY_LIMIT),
+            "weights_in_files_bytes": self.in_files,
             "device": self.device.kind,
         }
 
     def summary(self) -> Iterator[str]:
         """Yield three lines for people: the scene and its views, the channels, the memory."""
+        kernel = f"{self.kernel}, antialiased: {self.rendering}" if self.antialiased else self.kernel
         visible = f"{self.seen_share:.1%} in some view's field"
-        views = f"{len(self.views)} of {self.available_views} views"
-        yield f"{self.splats} splats ({self.rendered}), {visible}; {views}"
-        level = f", level {self.levels[0]} alone of {self.levels[1]}, as the settings choose" if self.levels else ""
-        yield f"{self.channels} channels, stored as {self.dtype}{level}"
+        cosine = "" if self.view_cosine is None else f" (features of cosine {self.view_cosine:.3f} to all)"
+        yield f"{self.splats} splats ({kernel}), {visible}; {len(self.views)} of {self.available_views} views{cosine}"
+        yield f"{self.channels} channels, stored as {self.dtype}"
         files = f", {self.in_files / MIB:.0f} MiB of region weights in files" if self.in_files else ""
         yield f"about {self.memory_bytes / MIB:.0f} MiB at the peak{files}, on {self.device.name}"
-
-    def lines(self) -> Iterator[str]:
-        """Yield all lines of the plan for people."""
-        head, channels, memory = self.summary()
-        yield f"plan: {head}"
-        yield f"  a view shows {self.splats_a_view:.0f} of them, before occlusion"
-        omitted = f"{len(self.left_out)} views left out" if self.left_out else "no view left out"
-        if self.view_cosine is not None:
-            omitted += f" (expected: features with a cosine of {self.view_cosine:.3f} to those of all)"
-        yield f"  {omitted}"
-        yield f"  {channels}"
-        parts = ", ".join(f"{name} {size / MIB:.0f}" for name, size in self.memory.items())
-        yield f"  {memory} ({parts})"
-        yield from (f"warning: {warning}" for warning in self.warnings)
 
 
 @one_thread()
@@ -241,7 +206,6 @@ def plan_lift(
         view_cosine=expected,
         seen_share=visible.seen_share,
         splats_a_view=visible.splats_a_view,
-        levels=_single_level(features, names, settings),
         channels=features.channels,
         dtype=settings.dtype,
         memory_phases=phases,
@@ -298,8 +262,8 @@ def _seconds(raster: Raster, views: LiftViews, names: Sequence[str], settings: L
 
 def weight_bytes(visible: Visibility, entries: np.ndarray, settings: LiftSettings) -> int:
     """Estimate the bytes of W of all views from the number of entries of each [V]."""
-    factor_bytes = FACTOR_BYTES if settings.robust else 0
-    return int(ROW_BYTES * _splat_counts(visible).sum() + (ENTRY_BYTES + factor_bytes) * entries.sum())
+    entry_bytes = ENTRY_BYTES + 4 * settings.robust  # with its factor
+    return int(ROW_BYTES * _splat_counts(visible).sum() + entry_bytes * entries.sum())
 
 
 def _splat_counts(visible: Visibility) -> np.ndarray:
@@ -387,47 +351,35 @@ def memory_phases(
     """
     inputs = sum(t.nbytes for t in (splats.means, splats.quats, splats.log_scales, splats.opacity_logits))
     largest, channels = max(camera.width * camera.height for camera in cameras), features.channels
-    of_all, masks = float(entries.sum()), any(features.is_regions(name) for name in names)
-    in_memory = min(weight_bytes(visible, entries, settings), MEMORY_LIMIT)
+    weights = min(weight_bytes(visible, entries, settings), MEMORY_LIMIT)
     view = int(_splat_counts(visible).max(initial=0) * (RECORD_BYTES + TILE_BYTES * _tiles(visible))) + 16 * largest
-    dense = max(
-        (int(count) for count, name in zip(entries, names, strict=True) if _is_dense(features, name)), default=0
-    )
-    books = [math.prod(_codebook(features, name)) for name in names]
-    regions = sum(books) // max(channels, 1)
-    size = 2 if settings.dtype == "float16" else 4
-    always = {
+    dense = (int(count) for count, name in zip(entries, names, strict=True) if _is_dense(features, name))
+    books = sum(math.prod(_codebook(features, name)) for name in names)
+    regions, size = books // max(channels, 1), 2 if settings.dtype == "float16" else 4
+    scene = {
         "libraries": LIBRARIES,
-        "splats": inputs,
-        "scene": splats.count * SCENE_BYTES,
-        "codebooks": size * sum(books) + min(8 * sum(books), 2 * max(TABLE_BYTES, 4 * LEAST_CHANNELS * regions)),
+        "splats": inputs + splats.count * SCENE_BYTES,
+        "codebooks": size * books + min(8 * books, 2 * max(TABLE_BYTES, 4 * LEAST_CHANNELS * regions)),
+        "weights": weights,
     }
-    weighed = always | {"weights": in_memory}  # W by views, then of all views
-    solved = weighed | {"features": splats.count * channels * size}
-    phases = {
-        # Two views are in work, or one and what is made of it; of dense ones one.
-        "geometry": weighed | {"view": 2 * view + DENSE_BYTES * dense},
-        "gather": weighed | {"gathered": in_memory},
-        "solve": solved,
-    }
-    if settings.finds_objects(masks):
-        phases["objects"] = weighed | {"objects": int(OBJECT_BYTES * of_all) + 8 * min(MOST_REGIONS, regions) ** 2}
-    if settings.robust:
-        factors = int(REWEIGHT_BYTES * min(of_all, MEMORY_LIMIT / ENTRY_BYTES))  # more lies in files
-        if masks:
-            factors += int(CONSENSUS_BYTES * of_all + BLOCK_BYTES * min(of_all, BLOCK_ENTRIES))
-        phases["reweighting"] = weighed | {"reweighting": factors}
+    steps, solving = weights, [0]  # W by views is copied by splats
+    if settings.robust or settings.finds_objects(any(map(features.is_regions, names))):
+        factors = min(float(entries.sum()), MEMORY_LIMIT / ENTRY_BYTES)
+        nodes = min(MOST_REGIONS, regions)
+        steps = max(steps, int(STEP_BYTES * entries.sum() + FACTOR_BYTES * factors) + 8 * nodes**2)
     if settings.reference_channels:
         hits = float(visible.areas.sum(dtype=np.float64)) / visible.areas.shape[1] * visible.splats
-        phases["reference"] = solved | {"reference": int(HIT_BYTES * hits / settings.stride**2), "view": view}
+        solving.append(int(HIT_BYTES * hits / settings.stride**2) + view)
     if settings.smoothness:
-        phases["smoothing"] = solved | {"smoothing": SMOOTHING_BYTES * splats.count}
+        solving.append(SMOOTHING_BYTES * splats.count)
     if settings.aggregation:
-        clusters = CLUSTERING + 24 * channels * min(splats.count, SAMPLE)
-        phases["aggregation"] = solved | {"aggregation": clusters}
-        if masks:  # regions are compared with rendered clusters
-            phases["aggregation"]["view"] = view
-    return phases
+        solving.append(CLUSTERING + view)
+    return {
+        # Two views are in work, or one and what is made of it; of dense ones one.
+        "geometry": scene | {"view": 2 * view + DENSE_BYTES * max(dense, default=0)},
+        "steps": scene | {"steps": steps},
+        "solve": scene | {"features": splats.count * channels * size, "work": max(solving)},
+    }
 
 
 def _tiles(visible: Visibility) -> float:
@@ -446,12 +398,6 @@ def _levels(features: Views, view: str) -> int:
     """Return the number of levels of a view's region map; 1 for a grid."""
     shape = features.specs(view)["labels"].shape if features.is_regions(view) else ()
     return shape[0] if len(shape) == 3 else 1
-
-
-def _single_level(features: Views, names: Sequence[str], settings: LiftSettings) -> tuple[int, int] | None:
-    """Return the single level of the settings, and the number of levels of the maps; None if all are used."""
-    level_count = max(_levels(features, name) for name in names) if isinstance(settings.levels, int) else 1
-    return (settings.levels, level_count) if isinstance(settings.levels, int) and level_count > 1 else None
 
 
 def _codebook(features: Views, view: str) -> tuple[int, ...]:

@@ -52,5 +52,4 @@ def test_the_peak_of_a_plan_is_that_of_one_phase() -> None:
     plan = lc.plan(room_splats(300), {camera.name: camera}, views, aggregation=True)
     totals = {phase: sum(parts.values()) for phase, parts in plan.memory_phases.items()}
     assert plan.memory_bytes == max(totals.values()) == sum(plan.memory.values())
-    assert {"geometry", "gather", "objects", "reweighting", "solve", "aggregation"} == totals.keys()
     assert "view" not in plan.memory_phases["solve"] and "features" not in plan.memory_phases["geometry"]
