@@ -3,100 +3,26 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
-import numpy as np
-import torch
 from torch import Tensor
 
 from liftcore.lifting.algebra import WeightStatistics
 from liftcore.lifting.geometry import Geometry, weigh_views
-from liftcore.lifting.pieces import Pieces, Shape
+from liftcore.lifting.pieces import Pieces
 from liftcore.lifting.planning.contradictions import contradictions, probe_views
 from liftcore.lifting.planning.plan import TIMED_VIEWS, Plan
 from liftcore.lifting.steps import row_arrays
 from liftcore.raster import open_raster
-from liftcore.runtime.memory import zeros
 from liftcore.runtime.one_thread import one_thread
-from liftcore.solve.sums import PieceSums, sum_pieces
 
 if TYPE_CHECKING:
     from liftcore.lifting.checkpoint import Checkpoint
     from liftcore.lifting.inputs import LiftInputs
     from liftcore.runtime.progress import Timings
-    from liftcore.solve.codebook import Codebook
-    from liftcore.solve.directions import RegionDirections
-    from liftcore.solve.rays import SampledRays
     from liftcore.values.settings import LiftSettings
-
-
-@dataclass(frozen=True, kw_only=True)
-class InMemory(Pieces):
-    """A lift in one piece, in the memory of this process."""
-
-    centres: Tensor  # [P, 3], of the splats
-    vectors: Codebook
-    rays: Sequence[SampledRays] = ()
-    memory_limit: int | None = None  # bytes of X, beyond which it is a mapped file; None for no limit
-    arrays: dict[tuple[str, int | None], dict[str, Any]] = field(default_factory=dict)
-
-    @property
-    def means(self) -> Tensor:
-        return self.centres
-
-    @property
-    def codebook(self) -> Codebook:
-        return self.vectors
-
-    def has(self, step: str, number: int) -> bool:
-        return (step, number) in self.arrays
-
-    def load(self, step: str, number: int | None = None) -> dict[str, Any]:
-        return self.arrays[step, number]
-
-    def save(
-        self,
-        step: str,
-        number: int | None,
-        arrays: dict[str, Any],
-        sums: Iterable[PieceSums] = (),
-        shape: Shape | None = None,
-    ) -> None:
-        parts = list(sums) if shape is None else [PieceSums.of(sum_pieces(sums, shape))]
-        columns = {name: part.numpy() if isinstance(part, Tensor) else part for name, part in arrays.items()}
-        self.arrays[step, number] = columns | {"pieces": parts}
-
-    def sums(self, step: str) -> Iterable[PieceSums]:
-        return self.arrays[step, 0]["pieces"]
-
-    def drop(self, *steps: str) -> None:
-        for step in steps:
-            self.arrays.pop((step, 0), None)
-
-    def writable(self, array: np.ndarray) -> Tensor:
-        return torch.from_numpy(array)
-
-    def keep_directions(self, directions: RegionDirections) -> None:
-        self.arrays["directions", None] = {"all": directions}
-
-    def directions(self) -> RegionDirections:
-        return self.arrays["directions", None]["all"]
-
-    def new_features(self, piece: int) -> Tensor:
-        size = self.splats * self.channels * self.dtype.itemsize
-        is_large = self.memory_limit is not None and size > self.memory_limit
-        return zeros((self.splats, self.channels), self.dtype, name="features", in_file=is_large)
-
-    def save_features(self, piece: int, X: Tensor) -> None:
-        self.arrays["features", 0] = {"X": X}
-
-    def features(self) -> Tensor:
-        return self.arrays.pop(("features", 0))["X"]
-
-    def samples(self) -> Sequence[SampledRays]:
-        return self.rays
 
 
 @one_thread()
@@ -108,17 +34,17 @@ def scene_of(
     *,
     threads: int | None = None,
     memory_limit: int | None = None,
-) -> InMemory:
+) -> Pieces:
     """Return W of all views in one piece, before any step.
 
     Args:
         means: [P, 3], of the splats. names: of the views. memory_limit: bytes of X beyond which it is a mapped file.
     """
     W, book = geometry.weights, geometry.codebook
-    scene = InMemory(
-        settings=settings, names=names, splats=W.splats.shape[0], channels=book.channels, centres=means,
-        vectors=book, rays=geometry.samples, memory_limit=memory_limit,
-    )  # fmt: skip
+    scene = Pieces(
+        settings=settings, names=names, splats=W.splats.shape[0], channels=book.channels, memory_limit=memory_limit
+    )
+    scene.arrays["scene", None] = {"means": means, "codebook": book, "samples": geometry.samples}
     scene.save("regions", None, {"offsets": W.offsets, "levels": geometry.levels})
     tensors = {"splats": W.splats, "starts": W.indptr, "region": W.region, "weight": W.weight}
     scene.save("weights", 0, tensors)
@@ -133,7 +59,7 @@ def weigh_in_memory(
     timings: Timings,
     threads: int | None,
     checkpoint: Checkpoint | None,
-) -> tuple[InMemory, WeightStatistics]:
+) -> tuple[Pieces, WeightStatistics]:
     """Compute W of the plan's views; call ``on_plan`` once, as soon as contradictions of the inputs are known."""
     splats, views, settings = inputs.splats, inputs.views, inputs.settings
     raster = open_raster(splats, plan.device, threads)

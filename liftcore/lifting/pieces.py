@@ -1,22 +1,29 @@
-"""W of a lift in pieces, and the arrays that its steps make; in memory all of W is one piece.
+"""W of a lift in pieces, and the arrays that its steps make.
 
 A step (`liftcore.lifting.steps`) works on a piece of views, which has all splats of their regions, or on a block of
 splats, which has all their views. It loads the arrays of earlier steps and saves its own, by the name of the step and
-the number of the piece; tables of the whole scene have no number. `lifting.engines.blocks` has them in files.
+the number of the piece; tables of the whole scene have no number. Here all of W is one piece, in the memory of this
+process; `lifting.engines.blocks` has pieces in files.
+
+Tables with a row a splat (W, the consensus of its entries, tuples) are stored in parts, by views. Each part has some
+rows of a block and some columns of the table, in the order of the columns: a row of the block is the concatenation of
+its rows in all parts.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from liftcore.runtime.jit import kernel
+from liftcore.runtime.memory import zeros
 from liftcore.solve.sums import PieceSums, sum_pieces
+from liftcore.values.region_weights import MEMORY_LIMIT
 
 if TYPE_CHECKING:
     from liftcore.solve.codebook import Codebook
@@ -28,7 +35,7 @@ Shape = tuple[int, int]  # of a table of sums
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pieces(ABC):
+class Pieces:
     """The pieces of a lift, as each step receives them."""
 
     settings: LiftSettings
@@ -41,6 +48,8 @@ class Pieces(ABC):
     levels_apart: bool = False  # True if regions are compared with those of their own level alone
     view_pieces: int = 1
     rows: int = 0  # of a block of splats: pieces of sums; 0: all of them
+    memory_limit: int | None = None  # bytes of X, beyond which it is a mapped file; None for no limit
+    arrays: dict[tuple[str, int | None], dict[str, Any]] = field(default_factory=dict)
 
     @property
     def splat_pieces(self) -> int:
@@ -57,24 +66,23 @@ class Pieces(ABC):
         return piece * rows, min((piece + 1) * rows, self.splats)
 
     @property
-    @abstractmethod
     def means(self) -> Tensor:
         """[P, 3], of the splats."""
+        return self.load("scene")["means"]
 
     @property
-    @abstractmethod
     def codebook(self) -> Codebook:
         """E of all views."""
+        return self.load("scene")["codebook"]
 
-    @abstractmethod
     def has(self, step: str, number: int) -> bool:
         """Return True if a piece of a step is done."""
+        return (step, number) in self.arrays
 
-    @abstractmethod
     def load(self, step: str, number: int | None = None) -> dict[str, Any]:
         """Return the arrays of a piece by name, or those of a table."""
+        return self.arrays[step, number]
 
-    @abstractmethod
     def save(
         self,
         step: str,
@@ -88,42 +96,48 @@ class Pieces(ABC):
         Args:
             shape: of the table of the sums; None if it would be too large.
         """
+        parts = list(sums) if shape is None else [PieceSums.of(sum_pieces(sums, shape))]
+        columns = {name: part.numpy() if isinstance(part, Tensor) else part for name, part in arrays.items()}
+        self.arrays[step, number] = columns | {"pieces": parts}
 
-    @abstractmethod
     def sums(self, step: str) -> Iterable[PieceSums]:
         """Iterate over the sums of all pieces of a step, in order."""
+        return self.arrays[step, 0]["pieces"]
 
-    @abstractmethod
     def drop(self, *steps: str) -> None:
         """Free the memory of steps that are read no more."""
+        for step in steps:
+            self.arrays.pop((step, 0), None)
 
-    @abstractmethod
     def writable(self, array: np.ndarray) -> Tensor:
         """Return the values of a loaded array, to be overwritten."""
+        return torch.from_numpy(array)
 
-    @abstractmethod
     def keep_directions(self, directions: RegionDirections) -> None:
         """Store the directions of all regions."""
+        self.arrays["directions", None] = {"all": directions}
 
-    @abstractmethod
     def directions(self) -> RegionDirections:
         """Return what `keep_directions` stored."""
+        return self.load("directions")["all"]
 
-    @abstractmethod
-    def new_features(self, piece: int) -> Tensor:
+    def new_features(self, _piece: int) -> Tensor:
         """Return zeros for X of a block of splats."""
+        size = self.splats * self.channels * self.dtype.itemsize
+        is_large = self.memory_limit is not None and size > self.memory_limit
+        return zeros((self.splats, self.channels), self.dtype, name="features", in_file=is_large)
 
-    @abstractmethod
     def save_features(self, piece: int, X: Tensor) -> None:
         """Store X of a block."""
+        self.arrays["features", piece] = {"X": X}
 
-    @abstractmethod
     def features(self) -> Tensor:
         """Return X of all blocks, [P, F]."""
+        return self.arrays.pop(("features", 0))["X"]
 
-    @abstractmethod
     def samples(self) -> Sequence[SampledRays]:
         """Return the sampled rays of each view."""
+        return self.load("scene")["samples"]
 
     def table(self, step: str, shape: Shape) -> np.ndarray:
         """Add up the sums of a step over all splats."""
@@ -132,3 +146,78 @@ class Pieces(ABC):
     def column(self, step: str, name: str) -> np.ndarray:
         """Return a column of all splats [P] from the blocks of a step."""
         return np.concatenate([self.load(step, number)[name] for number in range(self.splat_pieces)])
+
+
+# ---- rows of tables in parts
+
+
+@dataclass(frozen=True)
+class SomeRows:
+    """Rows of one part."""
+
+    rows: np.ndarray  # [r] i32 or i64 ascending, row numbers in the block
+    starts: np.ndarray  # [r + 1] i64, offsets of the rows in the values; the first need not be 0
+    values: Sequence[np.ndarray]  # each [n]
+
+
+def row_starts(parts: Iterable[SomeRows], count: int) -> np.ndarray:
+    """Return the offsets of a block's rows, [count + 1] i64."""
+    lengths = np.zeros(count + 1, np.int64)
+    for part in parts:
+        lengths[part.rows + 1] += np.diff(part.starts)
+    return np.cumsum(lengths)
+
+
+def fill_rows(parts: Iterable[SomeRows], starts: np.ndarray, targets: Sequence[np.ndarray]) -> None:
+    """Copy the values of all parts to those of the block, whose rows begin at ``starts`` (`row_starts`)."""
+    cursors = starts[:-1].copy()
+    for part in parts:
+        at = cursors[part.rows]
+        for source, target in zip(part.values, targets, strict=True):
+            copy_rows(part.starts, at, source, target)
+        cursors[part.rows] += np.diff(part.starts)
+
+
+def values_of(count: int, dtype: torch.dtype) -> Tensor:
+    """Return zeros [n], in a mapped file if they are many."""
+    return zeros((count,), dtype, name="weights", in_file=count * dtype.itemsize > MEMORY_LIMIT >> 1)
+
+
+def gather_rows(
+    parts: Callable[[], Iterable[SomeRows]], count: int, dtypes: Sequence[torch.dtype]
+) -> tuple[np.ndarray, list[Tensor]]:
+    """Return the offsets [count + 1] i64 of a block's rows, and their values, of the given dtypes.
+
+    Args:
+        parts: returns an iterator over the parts, one in memory at a time; called twice.
+    """
+    starts = row_starts(parts(), count)
+    targets = [values_of(int(starts[-1]), dtype) for dtype in dtypes]
+    fill_rows(parts(), starts, [target.numpy() for target in targets])
+    return starts, targets
+
+
+def take_rows(starts: np.ndarray, rows: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return some rows [r] of a table: their offsets [r + 1] i64, and their values."""
+    begins = np.concatenate([[0], np.cumsum(np.diff(starts)[rows])])
+    target = np.empty(begins[-1], values.dtype)
+    take(starts, rows, begins, values, target)
+    return begins, target
+
+
+@kernel
+def copy_rows(starts, at, source, target):
+    """Copy row i of the source, from ``starts[i]`` on, to ``at[i]`` of the target."""
+    for i in range(at.size):
+        shift = at[i] - starts[i]
+        for k in range(starts[i], starts[i + 1]):
+            target[k + shift] = source[k]
+
+
+@kernel
+def take(starts, rows, begins, values, target):
+    """Copy the rows of `take_rows`."""
+    for i in range(rows.size):
+        shift = begins[i] - starts[rows[i]]
+        for k in range(starts[rows[i]], starts[rows[i] + 1]):
+            target[k + shift] = values[k]

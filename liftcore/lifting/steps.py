@@ -29,12 +29,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from liftcore.lifting.pieces import Pieces, Shape
+from liftcore.lifting.pieces import Pieces, Shape, SomeRows, fill_rows, gather_rows, take_rows, values_of
 from liftcore.runtime.one_thread import one_thread
 from liftcore.solve.closed_form import solve_rows
-from liftcore.solve.consensus import SplatTuples, along_curve, region_shares, splat_tuples, with_mean
+from liftcore.solve.consensus import (
+    RegionGroups,
+    SplatTuples,
+    along_curve,
+    memberships,
+    region_shares,
+    splat_tuples,
+    with_mean,
+)
 from liftcore.solve.directions import region_totals
-from liftcore.solve.membership import RegionGroups, memberships
 from liftcore.solve.objects import (
     count_members,
     node_containers,
@@ -46,7 +53,6 @@ from liftcore.solve.objects import (
 )
 from liftcore.solve.region_tree import RegionTree
 from liftcore.solve.reweight import BlockReweighter, SceneConsistency, confidence_of, of_regions, scale_weights
-from liftcore.solve.rows import SomeRows, fill_rows, gather_rows, take_rows, values_of
 from liftcore.solve.sums import PieceSums
 from liftcore.values.region_weights import RegionWeights
 

@@ -1,7 +1,7 @@
 """Mask consensus: agreement of other views that a splat belongs to the object of a region. Features are not used.
 
-A mask that merges two objects has splats that other views separate, which W shows. With ``j in m`` if region m has at
-least BELONGS of splat j's weight in its group g (a level of a view), and ``t_j`` the sum of row j of W::
+A mask that merges two objects has splats that other views separate, which W shows. With ``j in m`` if splat j
+belongs to region m (below) of the group g, a level of a view, and ``t_j`` the sum of row j of W::
 
     R_mn = sum of t_j over the splats j in both m and n          vis_mg = sum of R_mn over the regions n of g
     q_jmv = the largest R_mn / vis_mg(n) of the regions n of view v with j in n
@@ -30,6 +30,10 @@ Memory is that of the entries, a number and a byte each, of a tuple per splat an
 region at a time; there is no matrix of regions, only a row of R per thread. A region's R is estimated from
 MOST_SPLATS of its splats, and an entry's sum from MOST_WITNESSES views, evenly chosen.
 
+**Memberships.** Splat j belongs to region m if m has at least BELONGS of the splat's weight in its group, and the
+group has more weight than FAINT there. A splat with an entry of a region need not belong to it: on the border of two
+regions it belongs to neither. A membership is a function of the splat's weights in one view.
+
 **Blocks of views.** A tuple is a function of the splat's weights in one view, so views number their own tuples
 (`splat_tuples`). The sums of q of a view's entries (`region_shares`) need only the tuples of its splats in other
 views and their t_j: a few bytes per splat and view. Sums over the scene are integers, and the scene's mean is applied
@@ -45,9 +49,10 @@ from torch import Tensor
 
 from liftcore.runtime.jit import kernel
 from liftcore.solve.closed_form import morton_codes
-from liftcore.solve.membership import RegionGroups
 from liftcore.values.region_weights import RegionWeights, run_each
 
+BELONGS = 0.7  # of a splat's weight in a level of a view; with less, the splat lies on the border of two regions
+FAINT = 0.05  # sum of weights below which a level hardly sees a splat
 OBSERVES = 0.3  # share of a region that a level of a view must see to observe it
 PRIOR = 2.0  # weight of the scene's mean, in views: a single other view may be the wrong one
 MOST_SPLATS = 1 << 12  # of equal weight estimate a share with a standard error of .5 / 64 = .008 at most
@@ -57,6 +62,39 @@ PIECES = 16  # of the rows, for threads
 STEPS = 1 << 30  # units of a share
 ONE_VIEW = 1 << 40  # counts an observing view; the sum of MOST_WITNESSES shares is less
 UNKNOWN = 1 << 56  # answer of a tuple that is not computed yet
+
+
+@dataclass(frozen=True)
+class RegionGroups:
+    """The view and the group of each region of all views. Cells of grids have no group and are ignored."""
+
+    views: int  # V
+    view: np.ndarray  # [M] i32
+    group: np.ndarray  # [M] i32, view * levels + level; -1 for cells of grids
+    levels: int  # the maximum over views, at least one
+
+    @classmethod
+    def of(cls, offsets: np.ndarray, levels: np.ndarray) -> "RegionGroups":
+        """Build from the first region of each view [V + 1] i64 and the level of each region [M] i8, -1 for cells."""
+        view = np.repeat(np.arange(offsets.size - 1), np.diff(offsets)).astype(np.int32)
+        several = int(levels.max(initial=0)) + 1
+        return cls(
+            offsets.size - 1, view, np.where(levels < 0, -1, view * several + levels).astype(np.int32), several
+        )
+
+
+def memberships(W: RegionWeights, groups: RegionGroups, threads: int | None = None) -> np.ndarray:
+    """Return [nnz] bool: the entries of W whose splat belongs to their region.
+
+    Args:
+        W: of views by rows of codebooks, on the CPU; its regions are numbered as those of the groups.
+        threads: None uses the cores that this process may use. The result is bitwise identical for any value.
+    """
+    indptr, region, weight = (part.numpy() for part in (W.indptr, W.region, W.weight))
+    own_region = np.zeros(region.size, np.bool_)
+    arrays = indptr, region, weight, groups.view, groups.group, groups.levels, own_region
+    run_each(lambda first, last: mark_memberships(first, last, *arrays), W.blocks(1 << 16, 1 << 18), threads)
+    return own_region
 
 
 @dataclass(frozen=True)
@@ -353,3 +391,23 @@ def blend_with_mean(first, last, sums, views, mean):
     for k in range(first, last):
         total = sums[k] if views[k] > 0 else 0.0
         sums[k] = (total + PRIOR * mean) / (views[k] + PRIOR)
+
+
+@kernel
+def mark_memberships(first, last, indptr, region, weight, view, group, levels, own_region):
+    """Compute `memberships` of rows ``first..last``."""
+    sums = np.zeros(levels)
+    for j in range(first, last):
+        k, end = indptr[j], indptr[j + 1]
+        while k < end:
+            begin, v = k, view[region[k]]
+            sums[:] = 0.0
+            while k < end and view[region[k]] == v:
+                if group[region[k]] >= 0:
+                    sums[group[region[k]] - v * levels] += weight[k]
+                k += 1
+            for n in range(begin, k):
+                g = group[region[n]]
+                if g >= 0:
+                    group_weight = sums[g - v * levels]
+                    own_region[n] = group_weight > FAINT and weight[n] >= BELONGS * group_weight

@@ -32,8 +32,7 @@ from scipy.sparse import csr_array
 
 from liftcore.runtime.jit import kernel
 from liftcore.solve.codebook import Codebook
-from liftcore.solve.consensus import SplatTuples
-from liftcore.solve.membership import RegionGroups
+from liftcore.solve.consensus import RegionGroups, SplatTuples
 from liftcore.solve.region_tree import NO_NODE, SPLIT, UNSEEN, RegionTree, node_groups
 from liftcore.solve.sums import PieceSums, in_order, piece_sums, pieces
 from liftcore.values.region_weights import RegionWeights, row_blocks, run_each

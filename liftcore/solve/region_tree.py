@@ -29,7 +29,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from liftcore.runtime.jit import kernel
-from liftcore.solve.membership import RegionGroups
+from liftcore.solve.consensus import RegionGroups
 from liftcore.values.region_weights import run_each
 
 NO_NODE = -1

@@ -26,7 +26,7 @@ from torch import Tensor
 from liftcore.errors import InvalidInput
 from liftcore.io.safetensors_file import map_tensors, tensor_bytes, write_tensors
 from liftcore.lifting.geometry import WeightRequest, weight_request
-from liftcore.lifting.pieces import Pieces, Shape
+from liftcore.lifting.pieces import Pieces, Shape, SomeRows, gather_rows, values_of
 from liftcore.lifting.steps import Saved, part_of, row_arrays, saved_as, weights_of
 from liftcore.lifting.warm_up import warm_up_lift
 from liftcore.raster import open_raster
@@ -39,18 +39,16 @@ from liftcore.scene.splats import Splats
 from liftcore.solve.codebook import Codebook, ViewCodebook
 from liftcore.solve.directions import RegionDirections, StoredDirections
 from liftcore.solve.rays import Readout, SampledRays
-from liftcore.solve.rows import SomeRows, gather_rows, values_of
 from liftcore.solve.sums import PieceSums, pack_sums, unpack_sums
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.pack import Views, pair, read_features
-from liftcore.values.region_weights import RegionWeights
+from liftcore.values.region_weights import MEMORY_LIMIT, RegionWeights
 
 PIECE_VIEWS = 8  # some seconds of work, which is what is lost with a worker
 ROWS = 1 << 17  # splats of a block: with 512 channels of float16, 128 MiB
 SELECTED = 1 << 22  # splats beyond which a worker loads only those that its views see: 1 GB in the raster
 STEP = 1 << 18  # splats that are tested together for it
 SCENE = "scene.safetensors"
-CODEBOOK = "codebook.safetensors"  # rows/v [M_v, F] and, where regions are tuples of rows, tuples/v [T_v, L] i32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,8 +67,8 @@ class Job(Pieces):
 
     @property
     def codebook(self) -> Codebook:
-        path = self.folder / CODEBOOK
-        return _codebook(path, file_version(path), len(self.names))
+        paths = tuple(map(self.view_file, range(len(self.names))))
+        return _codebook(paths, file_version(self.piece_file("regions", None)))
 
     def view_file(self, number: int) -> Path:
         """Return the file of a view's codebook and sampled rays; ``number`` is of the view."""
@@ -150,9 +148,8 @@ def _table(path: Path, _version: tuple[int, int]) -> dict[str, np.ndarray]:
 
 
 @lru_cache(maxsize=1)
-def _codebook(path: Path, _version: tuple[int, int], views: int) -> Codebook:
-    tensors = {name: torch.from_numpy(array) for name, array in map_tensors(path)[0].items()}
-    return Codebook([ViewCodebook(tensors[f"rows/{v}"], tensors.get(f"tuples/{v}")) for v in range(views)])
+def _codebook(paths: tuple[Path, ...], _version: tuple[int, int]) -> Codebook:
+    return Codebook([read_view(path).codebook for path in paths])
 
 
 def forget_files() -> None:
@@ -176,33 +173,24 @@ class ViewFiles(NamedTuple):
 
 @one_thread()
 def weigh(job: Job, piece: int, threads: int | None) -> None:
-    """Write W, E and sampled rays of a few views; existing files stay.
+    """Write W, E and sampled rays of a few views, unless they are there.
 
     Raises:
         InvalidFeatures: a view is malformed.
     """
     if not job.has("weights", piece):
-        numbers = [number for number in job.views_of(piece) if not job.view_file(number).exists()]
-        if numbers:
-            _weigh_views(job, numbers, threads)
-        try:
-            _write_weights(job, piece)
-        except InvalidInput:
-            if not job.has("weights", piece):  # else another worker has finished the same piece
-                raise
-    for number in job.views_of(piece):
-        _entries_file(job, number).unlink(missing_ok=True)
+        _write_weights(job, piece, _weigh_views(job, job.views_of(piece), threads))
 
 
-def _weigh_views(job: Job, numbers: list[int], threads: int | None) -> None:
+def _weigh_views(job: Job, numbers: range, threads: int | None) -> list[RegionWeights]:
+    """Write the files of some views, and return their W."""
     device = choose_device(job.settings.device)
     packs = packs_at(job.packs, tuple(map(file_version, job.packs)))
     views = LiftViews(job.cameras, pair(packs, job.cameras)[0], job.names, [])
-    cameras = [views.camera(number) for number in numbers]
-    splats, ids = visible_splats(job, cameras, threads)
+    splats, ids = visible_splats(job, [views.camera(number) for number in numbers], threads)
     warm_up_lift(job.kernel, device, job.settings)
     raster = open_raster(splats, device, threads)
-    waiting = deque[WeightRequest]()
+    waiting, parts, in_memory = deque[WeightRequest](), list[RegionWeights](), 0
 
     def requests():
         for number in numbers:
@@ -212,16 +200,12 @@ def _weigh_views(job: Job, numbers: list[int], threads: int | None) -> None:
     with closing(raster.iterate_views(requests())) as answers:
         for number, view in zip(numbers, answers, strict=True):
             request = waiting.popleft()
-            weights = request.weights(_renumbered(view, ids)).cpu()
-            weights.save(_entries_file(job, number))
-            _write_view(
-                job.view_file(number), weights, request, replace(view.rows, splats=ids[view.rows.splats.long()])
-            )
-
-
-def _entries_file(job: Job, number: int) -> Path:
-    """Return the file of W of a view, which exists until W of its piece is written."""
-    return job.piece_file("entries", number)
+            W = request.weights(_renumbered(view, ids)).cpu()
+            in_memory += W.nbytes
+            parts.append(W if in_memory <= MEMORY_LIMIT else W.in_files())
+            rows = replace(view.rows, splats=ids[view.rows.splats.long()])
+            _write_view(job.view_file(number), W, request, rows)
+    return parts
 
 
 def visible_splats(job: Job, cameras: list[Camera], threads: int | None) -> tuple[Splats, Tensor]:
@@ -319,8 +303,7 @@ def read_view(path: Path) -> ViewFiles:
 # The file of a piece of views: their W, gathered by splats.
 
 
-def _write_weights(job: Job, piece: int) -> None:
-    parts = [RegionWeights.load(_entries_file(job, number)) for number in job.views_of(piece)]
+def _write_weights(job: Job, piece: int, parts: list[RegionWeights]) -> None:
     bases = np.cumsum([0, *(int(part.offsets[-1]) for part in parts[:-1])]).astype(np.int32)
     splats = _union([part.splats for part in parts], job.splats)
     hit_splats = _union([part.total_weight_splats for part in parts], job.splats)

@@ -1,6 +1,6 @@
 """The folder of a lift in blocks, for scenes whose W or X does not fit one machine: what workers need, and W of all.
 
-An engine runs the steps. The driver copies codebooks a view at a time.
+An engine runs the steps.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import json
 import re
 import secrets
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,7 +25,6 @@ from liftcore.lifting.algebra import WeightStatistics
 from liftcore.lifting.checkpoint import Checkpoint
 from liftcore.lifting.engines.base import Engine, LocalEngine
 from liftcore.lifting.engines.blocks import (
-    CODEBOOK,
     PIECE_VIEWS,
     ROWS,
     SCENE,
@@ -226,7 +225,7 @@ def block_folder(
 
 
 def _share_regions(job: Job, plan: Plan) -> WeightStatistics:
-    """Write the numbers of regions and the codebook of all views."""
+    """Write the numbers of the regions of all views."""
     counts, levels, blind, entries = [0], list[np.ndarray](), list[str](), 0
     for number, name in enumerate(job.names):
         view = read_view(job.view_file(number))
@@ -240,25 +239,4 @@ def _share_regions(job: Job, plan: Plan) -> WeightStatistics:
         got, hint = f"{arrays['offsets'][-1]} in {len(job.names)} views", "lift fewer views, or smaller maps"
         raise Unavailable("features", expected=f"at most {MOST_REGIONS} regions", got=got, hint=hint)
     job.save("regions", None, arrays)
-    write_tensors(job.folder / CODEBOOK, _Books(job), {})
     return WeightStatistics(plan, arrays["levels"], entries, tuple(blind))
-
-
-class _Books(Mapping[str, Tensor]):
-    """The codebooks of all views by names of their tensors, each read on access."""
-
-    def __init__(self, job: Job) -> None:
-        self._job, self._names = job, list[str]()
-        for number in range(len(job.names)):
-            tuples = read_view(job.view_file(number)).codebook.tuples
-            self._names += [f"rows/{number}", *([] if tuples is None else [f"tuples/{number}"])]
-
-    def __len__(self) -> int:
-        return len(self._names)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
-
-    def __getitem__(self, name: str) -> Tensor:
-        part, number = name.split("/")
-        return getattr(read_view(self._job.view_file(int(number))).codebook, part)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.solve.consensus import OBSERVES, PRIOR
-from liftcore.solve.membership import BELONGS, FAINT
+from liftcore.solve.consensus import BELONGS, FAINT, OBSERVES, PRIOR
 from liftcore.solve.reweight import SHARPNESS
 from liftcore.values.region_weights import RegionWeights, stacked
 from tests.unit.solve.one_piece import mask_consensus, reweighting_of
