@@ -46,11 +46,9 @@ class KeptRegionSums:
     counts: np.ndarray  # [K] i64, numbers of kept regions
     regions: int = 0  # of all views, kept or not
 
-    def add(self, codebook: Tensor, clusters: np.ndarray, mask: np.ndarray) -> None:
-        """Add the kept rows [M] bool of a codebook [M, F] to their clusters [M]."""
-        rows = np.flatnonzero(mask)
-        np.add.at(self.sums, clusters[rows], codebook[torch.from_numpy(rows)].to(torch.float64).numpy())
-        np.add.at(self.counts, clusters[rows], 1)
+    def means(self) -> Tensor:
+        """Return the mean of each cluster's kept rows, [K, F] f64; zero if there is none."""
+        return torch.from_numpy(self.sums / np.maximum(self.counts, 1)[:, None])
 
 
 def aggregate(
@@ -78,7 +76,7 @@ def aggregate(
         merged = torch.zeros(0, features.shape[1], dtype=features.dtype)
     elif any(views.features.is_regions(name) for name in views.names):
         region_sums = filter_regions(clustering, features.shape[1], raster, views, settings, progress)
-        merged, kept_count = kept_means(region_sums, features.dtype), int(region_sums.counts.sum())
+        merged, kept_count = region_sums.means().to(features.dtype), int(region_sums.counts.sum())
         facts = {"filter": "iou", "regions": region_sums.regions, "kept_regions": kept_count}
     else:
         merged = weighted_means(features, total_weight, clustering)
@@ -116,19 +114,14 @@ def filter_regions(
         if isinstance(observation, Regions):
             kappa = raster.strongest_labels(camera, clustering.labels, params).numpy()
             kappa = np.where(raster.row_sums(camera, params).numpy() < LEAST_LIGHT, NO_CLUSTER, kappa)
-            rows = observation.codebook.shape[0]
-            matches = match_regions(observation.labels.numpy(), kappa, rows, clustering.count)
-            kept_rows = (matches.clusters >= 0) & (matches.ious >= settings.aggregation_iou)
-            region_sums.add(observation.codebook, matches.clusters, kept_rows)
-            region_sums.regions += int(matches.present.sum())
+            codebook = observation.codebook.double().numpy()
+            areas, clusters, ious = match_regions(observation.labels.numpy(), kappa, len(codebook), clustering.count)
+            rows = np.flatnonzero((clusters != NO_CLUSTER) & (ious >= settings.aggregation_iou))
+            np.add.at(region_sums.sums, clusters[rows], codebook[rows])
+            np.add.at(region_sums.counts, clusters[rows], 1)
+            region_sums.regions += int((areas > 0).sum())
         progress("aggregate", number + 1, len(views), "views")
     return region_sums
-
-
-def kept_means(region_sums: KeptRegionSums, dtype: torch.dtype) -> Tensor:
-    """Return the mean of each cluster's kept rows, [K, F]; zero if there is none."""
-    means = region_sums.sums / np.maximum(region_sums.counts, 1)[:, None]
-    return torch.from_numpy(means).to(dtype)
 
 
 def weighted_means(features: Tensor, total_weight: np.ndarray, clustering: Clustering) -> Tensor:
@@ -145,64 +138,27 @@ def weighted_means(features: Tensor, total_weight: np.ndarray, clustering: Clust
     return torch.from_numpy(means).to(features.dtype)
 
 
-@dataclass(frozen=True)
-class RegionMatches:
-    """The majority cluster of each region of a view, and their IoU."""
-
-    clusters: np.ndarray  # [M] i64, -1 for no cluster, or if no pixel reads the region
-    ious: np.ndarray  # [M] f64, 0 without a cluster
-    present: np.ndarray  # [M] bool, True if any pixel reads the region
-
-
-def match_regions(labels: np.ndarray, kappa: np.ndarray, rows: int, clusters: int) -> RegionMatches:
+def match_regions(
+    labels: np.ndarray, kappa: np.ndarray, rows: int, clusters: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Match the regions of a view with clusters.
 
     Args:
         labels: [L, h, w] i32 in -1..rows - 1, of any size; a region is the union of its pixels on all levels.
         kappa: [H, W] i32 in -1..clusters - 1.
+
+    Returns:
+        Of each region [M] the pixels i64, the majority cluster i64, -1 for none, and their IoU f64, 0 for none.
     """
-    table = contingency(labels, kappa, rows, clusters)
-    areas = np.asarray(table.sum(axis=1)).ravel()
-    majority, shared = _largest(table)
-    footprints = np.bincount(kappa.ravel() + 1, minlength=clusters + 1)
-    unions = areas + footprints[majority] - shared
-    matched = (areas > 0) & (majority > 0)
-    ious = np.divide(shared, unions, out=np.zeros(rows), where=matched)
-    return RegionMatches(np.where(matched, majority - 1, NO_CLUSTER), ious, areas > 0)
-
-
-def contingency(labels: np.ndarray, kappa: np.ndarray, rows: int, clusters: int) -> csr_matrix:
-    """Count the pixels that read a region and show a cluster, [M, K + 1] i64; the first column is no cluster."""
-    height, width = kappa.shape
-    levels, label_rows, label_columns = labels.shape
-    y = cells_under(np.arange(height), height, label_rows)
-    x = cells_under(np.arange(width), width, label_columns)
-    shown_cluster = (kappa + 1).ravel()
-    total = csr_matrix((rows, clusters + 1), dtype=np.int64)
-    earlier_levels: list[np.ndarray] = []
-    for level in range(levels):
-        regions = labels[level][y[:, None], x].ravel()
-        is_counted = regions >= 0
-        for other in earlier_levels:
-            is_counted &= regions != other  # a pixel counts once for a region on two levels
-        earlier_levels.append(regions)
-        ones = np.ones(int(is_counted.sum()), np.int64)
-        # Equal places add up.
-        total += csr_matrix((ones, (regions[is_counted], shown_cluster[is_counted])), shape=total.shape)
-    return total
-
-
-def _largest(table: csr_matrix) -> tuple[np.ndarray, np.ndarray]:
-    """Return column and value of the largest entry of each row, the first of ties; (0, 0) for an empty row."""
-    table.sort_indices()
-    indices, starts, data = (np.asarray(part, np.int64) for part in (table.indices, table.indptr, table.data))
-    columns, values = np.zeros(starts.size - 1, np.int64), np.zeros(starts.size - 1, np.int64)
-    lengths = np.diff(starts)
-    nonempty = np.flatnonzero(lengths)
-    if nonempty.size:
-        largest = np.maximum.reduceat(data, starts[nonempty])
-        row_of_entry = np.repeat(np.arange(nonempty.size), lengths[nonempty])
-        places = np.flatnonzero(data == largest[row_of_entry])
-        first = places[np.unique(row_of_entry[places], return_index=True)[1]]
-        columns[nonempty], values[nonempty] = indices[first], largest
-    return columns, values
+    y, x = (cells_under(np.arange(side), side, n) for side, n in zip(kappa.shape, labels.shape[1:], strict=True))
+    regions = labels[:, y[:, None], x].reshape(len(labels), -1)
+    level, pixel = np.nonzero(regions >= 0)
+    reads = csr_matrix((np.ones(level.size, np.int64), (regions[level, pixel], pixel)), shape=(rows, kappa.size))
+    reads.data[:] = 1  # a pixel counts once for a region on two levels
+    shown_cluster = np.ones(kappa.size, np.int64), kappa.ravel() + 1, np.arange(kappa.size + 1)
+    table = reads @ csr_matrix(shown_cluster, shape=(kappa.size, clusters + 1))  # the first column is no cluster
+    areas, majority = (np.asarray(part).ravel() for part in (table.sum(axis=1), table.argmax(axis=1)))
+    shared = table.max(axis=1).toarray().ravel()
+    unions = areas + np.bincount(kappa.ravel() + 1, minlength=clusters + 1)[majority] - shared
+    ious = np.divide(shared, unions, out=np.zeros(rows), where=(areas > 0) & (majority > 0))
+    return areas, np.where(areas > 0, majority, 0) - 1, ious
