@@ -14,7 +14,7 @@ not a bound. `liftcore.solve.optimum` computes x^ and the beta of the theorem.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from typing import Any
@@ -24,21 +24,16 @@ import torch
 from torch import Tensor
 
 from liftcore.runtime.cores import cores
-from liftcore.runtime.jit import vectorised
 from liftcore.runtime.one_line import join_names
 from liftcore.runtime.one_thread import one_thread
 from liftcore.scene.cameras import Camera
 from liftcore.scene.compositing import LOW_PASS, MAX_LOG_SCALE
 from liftcore.scene.splats import Splats
-from liftcore.solve.codebook import row_lengths
 from liftcore.solve.rays import SampledRays
 from liftcore.values.pack import Views
 from liftcore.values.settings import LiftSettings
 
-_CHUNK_VALUES = 1 << 21  # float32 values per chunk: 8 MB, as larger arrays are newly mapped each time
-_READS_A_RAY = 8  # levels or taps of a ray; few scenes have more
-_MU_FLOOR = 1e-6  # of the longest vector: a row whose splats all equal its observation has no dispersion
-_SCALES = 120  # exponent of powers of two by which float32 is scaled without rounding
+_MU_FLOOR = 1e-6  # of the observation's length
 
 
 @dataclass(frozen=True)
@@ -87,92 +82,40 @@ def measure_samples(
 ) -> ViewMeasures:
     """Measure the sampled rays of all views, one view after the other: features [P, C], codebooks [M, C]."""
     with ThreadPoolExecutor(threads or cores()) as pool:
-        return join_measures(
-            list(pool.map(lambda sample, book: measure_view(sample, features, book), samples, codebooks))
-        )
-
-
-def join_measures(views: Sequence[ViewMeasures]) -> ViewMeasures:
-    """Concatenate the measures of all views."""
+        views = list(pool.map(lambda sample, book: measure_view(sample, features, book), samples, codebooks))
     names = [part.name for part in fields(ViewMeasures)]
     return ViewMeasures(*(np.concatenate([getattr(view, name) for view in views]) for name in names))
 
 
 def measure_view(sample: SampledRays, features: Tensor, codebook: Tensor) -> ViewMeasures:
     """Compute row sums, residuals, surrogates and betas of one view's sampled rays."""
-    starts = sample.rows.indptr.numpy()
-    lengths = np.diff(starts)
-    ray_of_entry = np.repeat(np.arange(lengths.size), lengths)
-    weights = sample.rows.weights.numpy().astype(np.float64)
-    row_sums = np.bincount(ray_of_entry, weights, minlength=lengths.size)
-    readout, splats = sample.readout, sample.rows.splats.long()
-    longest = float(row_lengths(codebook).max()) if codebook.numel() else 0.0
-    scale = 2.0 ** round(math.log2(min(max(longest, 2.0**-_SCALES), 2.0**_SCALES)))  # against overflow of squares
-    measures, by_ray = np.zeros((readout.rays.size, 3)), np.argsort(readout.rays, kind="stable")
-    for first, last in _ray_chunks(starts, _CHUNK_VALUES // features.shape[1]):
-        rows = by_ray[slice(*np.searchsorted(readout.rays, [first, last], sorter=by_ray))]
-        X = features[splats[starts[first] : starts[last]]].float()  # [entries, F]
-        B = readout.rows(rows).observed(codebook)  # [rows, F]
-        if scale != 1.0:
-            X, B = X.div_(scale), B.div_(scale)
-        own_starts, own_weights = starts[first : last + 1] - starts[first], weights[starts[first] : starts[last]]
-        measures[rows] = measure_rows(readout.rays[rows] - first, own_starts, own_weights, X.numpy(), B.numpy())
-    measures[:, :2] *= scale**2
-    measures[row_sums[readout.rays] == 0, 2] = np.nan
-    return ViewMeasures(row_sums, measures[:, 0], measures[:, 1], measures[:, 2])
+    starts, splats = sample.rows.indptr.tolist(), sample.rows.splats.long()
+    weights, readout = sample.rows.weights.double().numpy(), sample.readout
+    B, order = readout.observed(codebook).double().numpy(), np.argsort(readout.rays, kind="stable")
+    ends = np.searchsorted(readout.rays, np.arange(len(starts)), sorter=order)
+    row_sums, measures = np.zeros(len(starts) - 1), np.zeros((B.shape[0], 3))
+    for ray in range(row_sums.size):
+        hits, rows = slice(starts[ray], starts[ray + 1]), order[ends[ray] : ends[ray + 1]]
+        row_sums[ray] = weights[hits].sum()
+        measures[rows] = measure_rows(weights[hits], features[splats[hits]].double().numpy(), B[rows])
+    return ViewMeasures(row_sums, *measures.T)
 
 
-def _ray_chunks(starts: np.ndarray, entries: int) -> Iterator[tuple[int, int]]:
-    """Yield ranges of rays with at most ``entries`` entries together, or single rays; the number of rays is bounded
-    too.
-    """
-    first, rays = 0, starts.size - 1
-    while first < rays:
-        fitting = int(np.searchsorted(starts, starts[first] + entries, side="right")) - 1
-        last = min(max(fitting, first + 1), first + max(entries // _READS_A_RAY, 1), rays)
-        yield first, last
-        first = last
-
-
-@vectorised
-def measure_rows(rays, starts, weights, X, B):
-    """Compute residual, surrogate and beta of every row, [rows, 3] f64.
+def measure_rows(weights: np.ndarray, X: np.ndarray, B: np.ndarray) -> np.ndarray:
+    """Return residual, surrogate and beta of the rows of one ray, [rows, 3] f64.
 
     Args:
-        rays: [rows] i64 ascending, the ray of a row. starts: [n + 1] i64, each ray's entries.
-        weights: [entries] f64. X: [entries, F] f32, the entries' splats. B: [rows, F] f32.
+        weights: [n] f64, of the ray's splats. X: [n, F] f64, of these. B: [rows, F] f64.
     """
-    measures = np.zeros((rays.shape[0], 3))
-    channels = B.shape[1]
-    rendered = np.empty(channels, np.float32)
-    for row in range(rays.shape[0]):
-        begin, end = starts[rays[row]], starts[rays[row] + 1]
-        if row == 0 or rays[row] != rays[row - 1]:
-            rendered[:] = 0
-            for entry in range(begin, end):
-                small_weight = np.float32(weights[entry])
-                for c in range(channels):
-                    rendered[c] += small_weight * X[entry, c]
-        observed = B[row]
-        surrogate = distance = total = 0.0
-        for entry in range(begin, end):
-            weight, lifted = weights[entry], X[entry]
-            square = np.float32(0.0)
-            for c in range(channels):
-                difference = lifted[c] - observed[c]
-                square += difference * difference
-            surrogate += weight * square
-            distance += weight * math.sqrt(square)
-            total += weight
-        residual = np.float32(0.0)
-        for c in range(channels):
-            difference = rendered[c] - observed[c]
-            residual += difference * difference
-        measures[row, 0] = residual
-        measures[row, 1] = surrogate
-        if distance > _MU_FLOOR * total:
-            measures[row, 2] = max(surrogate * total / distance**2 - 1.0, 0.0)
-    return measures
+    total = weights.sum()
+    residuals = np.square(weights @ X - B).sum(axis=1)
+    offsets = X[None] - B[:, None]
+    squares = np.einsum("rnf,rnf->rn", offsets, offsets)
+    surrogates, distances = squares @ weights, np.sqrt(squares) @ weights
+    # A row whose splats all equal its observation has no dispersion.
+    disperse = distances > _MU_FLOOR * total * np.sqrt(np.square(B).sum(axis=1))
+    betas = np.divide(surrogates * total, distances**2, out=np.ones_like(surrogates), where=disperse) - 1.0
+    return np.stack([residuals, surrogates, betas.clip(min=0.0) if total else np.full(len(B), np.nan)], axis=1)
 
 
 def _mean(values: np.ndarray) -> float | None:

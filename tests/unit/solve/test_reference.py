@@ -36,11 +36,8 @@ def reference_facts(scene: SmallScene, features: torch.Tensor, **overrides: int)
 
 
 def measures_of(A: np.ndarray, X: np.ndarray, B: np.ndarray) -> ViewMeasures:
-    """The kernel of the diagnostics on dense rows."""
-    rows, splats = A.shape
-    entries = np.tile(X.astype(np.float32), (rows, 1))
-    starts = np.arange(rows + 1) * splats
-    columns = measure_rows(np.arange(rows), starts, A.ravel(), entries, B.astype(np.float32)).T
+    """The measures of the diagnostics on dense rows."""
+    columns = np.concatenate([measure_rows(row, X, observed[None]) for row, observed in zip(A, B, strict=True)]).T
     return ViewMeasures(A.sum(axis=1), *columns)
 
 
