@@ -29,10 +29,8 @@ from liftcore.io.cameras import read_cameras
 from liftcore.io.photos import PhotoHeader, orientation_warnings, read_header
 from liftcore.io.splats import read_splats
 from liftcore.lifting.planning.contradictions import (
-    FAR_SCALES,
     LEAST_IN_VIEW,
     LEAST_ROW_SUM,
-    NEAR_SCALES,
     agreement_of_views,
     disagreement,
     empty,
@@ -60,6 +58,7 @@ from liftcore.values.views import FeatureGrid, Regions
 
 VIEWS = 12  # that are checked, evenly spread
 CONTROLS = 3  # photos of other views that a render is compared with
+SCALES = 0.5, 2.0, 0.25, 3.0, 4.0  # of the cameras' positions, that are tried
 LEAST_GAIN = 3.0  # dB, of a render over other views' photos to its own
 MATCHING = 30.0  # dB of a render to its photo, at which other views and the filled share of rays need not be asked
 SCALED_VIEWS = 4  # that are rendered again for each scale
@@ -187,7 +186,7 @@ def _check(
         if agreement is not None:
             figures["agreement_of_views"] = agreement
             if not (found_wrong or wrong):  # wrong cameras are reported already, and broken maps agree nowhere
-                found_wrong += disagreement(raster, lifted, settings, agreement)
+                found_wrong += disagreement(agreement)
         wrong += found_wrong
     with_psnr = [view for view in views if view.psnr is not None]
     worst = min(with_psnr, key=lambda view: view.psnr or 0.0).view if with_psnr else None
@@ -448,7 +447,7 @@ def _controls(name: str, pictures: Mapping[str, np.ndarray]) -> list[np.ndarray]
 
 def _scaled_positions(floor: Mapping[str, float], pictures: Mapping[str, np.ndarray], scaled: _Scaled) -> str:
     """Report the scale of the cameras' positions that makes renders match; empty if none does."""
-    gain, factor = scaled.best(floor, pictures, (*NEAR_SCALES, *FAR_SCALES))
+    gain, factor = scaled.best(floor, pictures, SCALES)
     if gain < LEAST_GAIN:
         return ""
     finding = f"with positions times about {factor:g} they are {gain:.1f} dB more so"

@@ -7,25 +7,15 @@ part of a view's feature that all views share, as a share of the squared length 
 (`planning.views` has the sums): 1 where views agree, 0 where they are unrelated. Its upper limit follows from the
 features without any geometry: each region's cosine to the most similar region of another view. The ratio of the two
 is .39 to .91 on the scenes of the first tests, which include noisy, merged and wrong masks (.26 with 6 views). With
-positions times 0.3 it is .05 to .31, and with another scene's cameras .15 at most. If it is low, positions times
-other factors are the control: on healthy scenes these reach .42 of it at most, and on scenes whose positions are off
-by .3 or .5 at least 1.4 of it. Half and double come first: if the
-original scale reaches LEAST_AGREEMENT and neither of these more, the others are skipped, which saves half of the
-work.
-
-A scale is reported only if views agree well at it (CONVINCING): positions off by .3 to 3 reach .61 or more at the
-factor that corrects them. If views disagree for another reason (a shifted principal point, photos turned by EXIF,
-missing masks), some factor may still help a little: then no cause is reported.
+positions times 0.3 it is .05 to .31, and with another scene's cameras .15 at most.
 
 Maps are also checked alone (`liftcore.features.smoothness`).
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
-import numpy as np
 import torch
 
 from liftcore.features.smoothness import some_grids, unlike_maps
@@ -34,7 +24,6 @@ from liftcore.lifting.planning.views import NOISE_CHANNELS, SAMPLE, ViewDisagree
 from liftcore.raster.base import Raster
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import silent
-from liftcore.scene.cameras import Cameras
 from liftcore.solve.optimum import random_axes
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.settings import LiftSettings
@@ -46,10 +35,6 @@ RAYS = 2_000  # whose sums of weights are averaged
 MAX_REGIONS = 2_048  # that are compared with each other
 MAX_SAME_VIEW = 0.8  # chance that two observations of a splat are from one view: beyond it, overlap is too small
 LEAST_AGREEMENT = 0.2  # of what the features allow: healthy scenes have .26 or more, foreign cameras .15 or less
-LOW_AGREEMENT = 0.6  # below it, other scales are tried
-NEAR_SCALES, FAR_SCALES = (0.5, 2.0), (0.25, 3.0, 4.0)  # of the cameras' positions
-LEAST_GAIN = 1.25  # of another scale's agreement over the given one's: cameras near one place agree at any scale
-CONVINCING = 0.55  # agreement at another scale, for it to be named as the cause
 LEAST_ROW_SUM = 0.05  # in the mean: a scene of one object without a background has about 0.2
 LEAST_IN_VIEW = 0.05  # of the splats
 FRAME = (
@@ -79,7 +64,7 @@ def contradictions(
     if consistency.row_sum is not None and consistency.row_sum < LEAST_ROW_SUM:
         return [*warnings, empty(consistency.row_sum)]
     if not warnings and consistency.agreement is not None:  # broken maps agree nowhere
-        warnings += disagreement(raster, views, settings, consistency.agreement)
+        warnings += disagreement(consistency.agreement)
     return warnings
 
 
@@ -105,48 +90,21 @@ def empty(row_sum: float) -> str:
     return f"cameras: splats fill {row_sum:.1%} of the rays of a view; {FRAME}"
 
 
-def disagreement(raster: Raster, views: LiftViews, settings: LiftSettings, agreement: float) -> list[str]:
-    """Report views that contradict each other, with the scale of positions that corrects it; empty if they agree."""
-    if agreement >= LOW_AGREEMENT:
+def disagreement(agreement: float) -> list[str]:
+    """Report views that contradict each other; empty if they agree."""
+    if agreement >= LEAST_AGREEMENT:
         return []
-    by_factor: dict[float, float] = {}
-    for factors in (NEAR_SCALES, FAR_SCALES):
-        if len(by_factor) == len(NEAR_SCALES) and agreement >= max(LEAST_AGREEMENT, *by_factor.values()):
-            return []
-        for factor in factors:
-            scaled_agreement = agreement_of_views(raster, _scaled(views, factor), settings, rays=0).agreement
-            if scaled_agreement is not None:
-                by_factor[factor] = scaled_agreement
-    best = max(by_factor, key=lambda factor: by_factor[factor], default=None)
     finding = (
         f"views agree on what they see to {max(agreement, 0):.0%} of what their most similar regions would allow"
     )
-    is_better = best is not None and by_factor[best] > max(LEAST_AGREEMENT, LEAST_GAIN * agreement)
-    if best is not None and is_better and by_factor[best] >= CONVINCING:
-        return [f"cameras: {finding}, and to {by_factor[best]:.0%} with positions times about {best:g}; {FRAME}"]
-    return [f"features: {finding}: {MANY_CAUSES}; {HINT}"] if is_better or agreement < LEAST_AGREEMENT else []
+    return [f"features: {finding}: {MANY_CAUSES}; {HINT}"]
 
 
-def _scaled(views: LiftViews, factor: float) -> LiftViews:
-    """Select the views that are compared, and multiply their cameras' positions by a factor."""
-    scale = np.ones((4, 4))
-    scale[:3, 3] = factor
-    names = evenly_spaced(views.names, PROBE_VIEWS)
-    cameras = [views.cameras[name].replace(viewmat=views.cameras[name].viewmat * scale) for name in names]
-    return replace(views, names=names, cameras=Cameras(cameras))
-
-
-def agreement_of_views(
-    raster: Raster, views: LiftViews, settings: LiftSettings, *, rays: int = RAYS
-) -> ViewAgreement:
-    """Compute W of a few views at coarse pixels, and measure their consistency.
-
-    Args:
-        rays: of all these views, whose sums of weights are averaged.
-    """
+def agreement_of_views(raster: Raster, views: LiftViews, settings: LiftSettings) -> ViewAgreement:
+    """Compute W of a few views at coarse pixels, and measure their consistency."""
     few = views.only(evenly_spaced(views.names, PROBE_VIEWS))
     longest = max(max(few.camera(k).width, few.camera(k).height) for k in range(len(few)))
-    coarse = {"stride": max(1, longest // SIDE), "diagnostic_rays": rays}
+    coarse = {"stride": max(1, longest // SIDE), "diagnostic_rays": RAYS}
     coarse_settings = settings.model_copy(update=coarse)
     with one_thread():
         return agreement_of(weigh_views(raster, raster.splats.count, few, coarse_settings, silent, by_rows=False))
