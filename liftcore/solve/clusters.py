@@ -201,17 +201,10 @@ def _unit(rows: np.ndarray, floor: float = 0.0) -> np.ndarray:
     return np.divide(scaled, lengths, out=np.zeros_like(rows), where=lengths * largest > floor)
 
 
-EXACT_CHANNELS = 1_024  # up to which all eigenvectors are computed, at a cost of the cube of F
-_OVERSAMPLE = 16  # directions beyond those requested, so that the last ones converge too
-_ITERATIONS = 6
-_SEED = 0
-
-
 def principal_axes(centred: np.ndarray, count: int) -> np.ndarray:
-    """Return the directions of the largest variance.
+    """Return the directions of the largest variance: eigenvectors of the covariance, at a cost of the cube of F.
 
-    All eigenvectors of the covariance for small F; subspace iteration from a seeded start (Halko, Martinsson and
-    Tropp 2011) for large F. Signs are fixed: the largest entry of an axis is positive.
+    Signs are fixed: the largest entry of an axis is positive.
 
     Args:
         centred: [n, F] f32, a sample without its mean.
@@ -220,24 +213,8 @@ def principal_axes(centred: np.ndarray, count: int) -> np.ndarray:
     Returns:
         [F, min(count, F)] f32, orthonormal columns, the largest variance first.
     """
-    channels = centred.shape[1]
-    count = min(count, channels)
+    count = min(count, centred.shape[1])
     with one_thread():
-        if channels <= EXACT_CHANNELS:
-            covariance = (centred.T @ centred).astype(np.float64)
-            axes = np.linalg.eigh(covariance)[1][:, ::-1][:, :count]
-        else:
-            axes = _subspace(centred, count)
+        axes = np.linalg.eigh((centred.T @ centred).astype(np.float64))[1][:, ::-1][:, :count]
     rows = np.abs(axes).argmax(axis=0)
     return (axes * np.sign(axes[rows, np.arange(count)])).astype(np.float32)
-
-
-def _subspace(centred: np.ndarray, count: int) -> np.ndarray:
-    width = min(count + _OVERSAMPLE, centred.shape[1])
-    start = np.random.default_rng(_SEED).standard_normal((centred.shape[1], width)).astype(np.float32)
-    basis = np.linalg.qr(start)[0]
-    for _ in range(_ITERATIONS):
-        basis = np.linalg.qr(centred.T @ (centred @ basis))[0]
-    projected = (centred @ basis).astype(np.float64)
-    rotation = np.linalg.eigh(projected.T @ projected)[1][:, ::-1][:, :count]
-    return basis @ rotation

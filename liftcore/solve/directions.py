@@ -21,7 +21,6 @@ from torch import Tensor
 
 from liftcore.io.safetensors_file import map_tensors, write_tensors
 from liftcore.runtime.jit import kernel
-from liftcore.solve.clusters import EXACT_CHANNELS, principal_axes
 from liftcore.solve.codebook import LEAST_CHANNELS, TABLE_BYTES, Codebook
 from liftcore.solve.shared_rows import flat_table, new_table
 from liftcore.solve.sums import PieceSums, piece_sums
@@ -113,11 +112,7 @@ class RegionDirections:
         if codebook.channels <= number or entries <= number * codebook.regions:
             return None
         step = -(-codebook.regions // SAMPLE)
-        e = self._full_rows(slice(None, None, step))
-        if codebook.channels > EXACT_CHANNELS:
-            weighted = e * self.totals[::step, None].sqrt().float()
-            return torch.from_numpy(principal_axes(weighted.numpy(), number))
-        e = e.double()
+        e = self._full_rows(slice(None, None, step)).double()
         return torch.linalg.eigh((e * self.totals[::step, None]).T @ e)[1][:, -number:].float().contiguous()
 
     def _full_rows(self, regions: slice) -> Tensor:
