@@ -29,7 +29,7 @@ from liftcore.solve.region_tree import RegionTree, region_tree
 from liftcore.solve.reweight import SceneConsistency, mask_regions, median_reliability
 
 if TYPE_CHECKING:
-    from liftcore.lifting.engines.base import Engine
+    from liftcore.lifting.engines import Engine
     from liftcore.lifting.pieces import Pieces
     from liftcore.lifting.planning.plan import Plan
     from liftcore.lifting.steps import Step

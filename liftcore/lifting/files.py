@@ -10,7 +10,7 @@ from liftcore.errors import InvalidFeatures
 from liftcore.io.cameras import read_cameras
 from liftcore.io.splats import read_splats
 from liftcore.lifting.checkpoint import Checkpoint
-from liftcore.lifting.engines.base import Engine
+from liftcore.lifting.engines import Engine
 from liftcore.lifting.pipeline import lift, plan
 from liftcore.lifting.planning.plan import Plan
 from liftcore.query.result import LiftResult

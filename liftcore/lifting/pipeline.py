@@ -15,7 +15,7 @@ from torch import Tensor
 from liftcore.errors import InvalidSettings
 from liftcore.lifting.algebra import Algebra, SplatSupport, WeightStatistics
 from liftcore.lifting.checkpoint import Checkpoint
-from liftcore.lifting.engines.base import Engine, LocalEngine
+from liftcore.lifting.engines import Engine, LocalEngine
 from liftcore.lifting.engines.lift import BlockFolder, block_folder, plan_of_a_worker
 from liftcore.lifting.geometry import strided
 from liftcore.lifting.in_memory import weigh_in_memory

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from liftcore.lifting.algebra import Algebra
-from liftcore.lifting.engines.base import LocalEngine
+from liftcore.lifting.engines import LocalEngine
 from liftcore.lifting.geometry import Geometry
 from liftcore.lifting.in_memory import scene_of
 from liftcore.raster.cpu.warm_up import warm_up

@@ -1,15 +1,70 @@
-"""Engines run a lift in blocks of views and of splats: in this process, or by the workers of a Ray cluster."""
+"""Engines run a lift in blocks of views and of splats: in this process, or by the workers of a Ray cluster.
+
+An engine runs numbered and independent pieces of work.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, Protocol
 
 from liftcore.errors import InvalidSettings
+from liftcore.runtime.arguments import check_count
+from liftcore.runtime.one_line import one_line
 
 if TYPE_CHECKING:
-    from liftcore.lifting.engines.base import Engine
+    from pathlib import Path
+
+    from liftcore.lifting.pieces import Pieces
+
+    Work = Callable[[Any, int, int | None], None]  # of a lift, the number of a piece, and the threads for it
 
 ENGINES = ("local", "ray")
+
+
+class Engine(Protocol):
+    """A runner of the pieces of a job, each at least once. A piece reads files and writes others atomically.
+
+    So a piece may be repeated elsewhere: the lift is bitwise identical for any assignment and order of pieces.
+    """
+
+    @property
+    def scratch(self) -> Path | None:
+        """A folder that all workers share, for lifts without a checkpoint; None: the system's temporary folder."""
+        ...
+
+    def run(self, work: Work, job: Pieces, pieces: int) -> Iterator[int]:
+        """Run ``work(job, piece, threads)`` for all pieces below ``pieces``; yield each finished one, in any order.
+
+        Raises:
+            SplatliftError, OSError: an error of a piece. Unavailable: no worker can run a piece.
+        """
+        ...
+
+
+class LocalEngine:
+    """An engine that runs one piece after the other in this process, with threads.
+
+    The memory of a lift is bounded by the size of a block, for any number of views and splats.
+
+    Args:
+        threads: None uses the cores that this process may use. The result is bitwise identical for any value.
+    """
+
+    scratch: Path | None = None
+
+    def __init__(self, threads: int | None = None) -> None:
+        check_count("threads", threads, "all cores")
+        self.threads = threads
+
+    def __repr__(self) -> str:
+        return one_line(self, f"threads={self.threads}")
+
+    def run(self, work: Work, job: Pieces, pieces: int) -> Iterator[int]:
+        """See the protocol."""
+        for piece in range(pieces):
+            work(job, piece, self.threads)
+            yield piece
 
 
 def open_engine(name: str | None, address: str | None = None, threads: int | None = None) -> Engine | None:
@@ -30,6 +85,4 @@ def open_engine(name: str | None, address: str | None = None, threads: int | Non
         from liftcore.lifting.engines.ray import RayEngine
 
         return RayEngine(address)
-    from liftcore.lifting.engines.base import LocalEngine
-
     return LocalEngine(threads) if name == "local" else None

@@ -23,7 +23,7 @@ from liftcore.errors import InvalidSettings, Unavailable
 from liftcore.io.safetensors_file import write_tensors
 from liftcore.lifting.algebra import WeightStatistics
 from liftcore.lifting.checkpoint import Checkpoint
-from liftcore.lifting.engines.base import Engine, LocalEngine
+from liftcore.lifting.engines import Engine, LocalEngine
 from liftcore.lifting.engines.blocks import (
     PIECE_VIEWS,
     ROWS,

@@ -18,7 +18,7 @@ from liftcore.errors import InvalidInput, SplatliftError, Unavailable
 from liftcore.runtime.one_line import one_line
 
 if TYPE_CHECKING:
-    from liftcore.lifting.engines.base import Work
+    from liftcore.lifting.engines import Work
     from liftcore.lifting.pieces import Pieces
 
 MAX_QUEUED = 1_000  # pieces that are submitted to Ray at a time
@@ -59,7 +59,7 @@ class RayEngine:
         return one_line(self, repr(self._address), f"cpus={self._cpus}", f"gpus={self._gpus}")
 
     def run(self, work: Work, job: Pieces, pieces: int) -> Iterator[int]:
-        """See `lifting.engines.base.Engine`."""
+        """See `lifting.engines.Engine`."""
         ray = self._ray
         needs: dict[str, float] = {"num_cpus": self._cpus, "max_retries": RETRIES}
         if job.settings.device == "cuda":

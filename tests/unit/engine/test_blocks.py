@@ -15,8 +15,7 @@ import torch
 
 import liftcore as lc
 from liftcore.lifting import pipeline
-from liftcore.lifting.engines import blocks
-from liftcore.lifting.engines.base import LocalEngine
+from liftcore.lifting.engines import LocalEngine, blocks
 from liftcore.lifting.engines.lift import block_folder
 from liftcore.lifting.inputs import LiftInputs
 from liftcore.lifting.planning.plan import Plan

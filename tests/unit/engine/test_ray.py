@@ -21,8 +21,7 @@ from typing import Any, cast
 import pytest
 
 import liftcore as lc
-from liftcore.lifting.engines import open_engine
-from liftcore.lifting.engines.base import LocalEngine
+from liftcore.lifting.engines import LocalEngine, open_engine
 from liftcore.lifting.engines.ray import RayEngine, check_reach
 from liftcore.values.pack import write_pack
 from liftcore.values.settings import LiftSettings

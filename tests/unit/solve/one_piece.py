@@ -11,7 +11,7 @@ from torch import Tensor
 
 from liftcore.lifting import steps
 from liftcore.lifting.algebra import Algebra
-from liftcore.lifting.engines.base import LocalEngine
+from liftcore.lifting.engines import LocalEngine
 from liftcore.lifting.geometry import Geometry
 from liftcore.lifting.in_memory import scene_of
 from liftcore.runtime.progress import silent
