@@ -37,7 +37,6 @@ def add_arguments_plan(parser: Parser) -> None:
     """Add the options of the command ``plan``."""
     add_sources(parser)
     add_settings(parser)
-    add_verbose(parser)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -94,7 +93,7 @@ def run_plan(options: argparse.Namespace) -> int:
         "views": {"lifted": list(plan.views), "left_out": list(plan.left_out)},
         "warnings": list(plan.warnings),
     }
-    reply(document, as_json=options.json, lines=plan.lines() if options.verbose else plan_lines(plan))
+    reply(document, as_json=options.json, lines=plan_lines(plan))
     return 0
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from liftcore.errors import InvalidCameras, InvalidSettings
 from liftcore.lifting.algebra import Algebra
-from liftcore.lifting.engines.base import LocalEngine
+from liftcore.lifting.engines import LocalEngine
 from liftcore.lifting.geometry import weigh_views
 from liftcore.lifting.in_memory import scene_of
 from liftcore.lifting.inputs import LiftInputs

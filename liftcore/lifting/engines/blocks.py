@@ -23,7 +23,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from liftcore.errors import InvalidInput
 from liftcore.io.safetensors_file import map_tensors, tensor_bytes, write_tensors
 from liftcore.lifting.geometry import WeightRequest, weight_request
 from liftcore.lifting.pieces import Pieces, Shape, SomeRows, gather_rows, values_of

@@ -17,10 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from torch import Tensor
 
 from liftcore.errors import InvalidSettings, Unavailable
-from liftcore.io.safetensors_file import write_tensors
 from liftcore.lifting.algebra import WeightStatistics
 from liftcore.lifting.checkpoint import Checkpoint
 from liftcore.lifting.engines import Engine, LocalEngine
