@@ -11,11 +11,10 @@ added in pieces of LONG, as a plain float32 sum of ten million equal terms is wr
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import embedding_bag
 
 from liftcore.solve.codebook import Codebook
-from liftcore.solve.shared_rows import LONG, flat_table, sum_rows
-from liftcore.values.region_weights import BLOCK_ENTRIES, BLOCK_ROWS, RegionWeights, from_zero, row_blocks, run_each
+from liftcore.solve.shared_rows import flat_table, sum_rows
+from liftcore.values.region_weights import BLOCK_ENTRIES, BLOCK_ROWS, RegionWeights, row_blocks, run_each
 
 
 def solve_rows(
@@ -33,16 +32,15 @@ def solve_rows(
         W: of all views, with a row for every splat of X, on the CPU. sums: [P] f64, of its rows, if they are known.
         means: [P, 3] f32, centres of the splats: neighbours read the same codebook rows, so they are solved in one
             block. None solves in the order of the rows.
-        threads: None uses the cores that this process may use. The result is bitwise identical for any.
     """
     rows, sums = torch.nonzero(W.indptr.diff())[:, 0], W.row_sums() if sums is None else sums
     if means is not None:
-        rows = rows[torch.argsort(morton_codes(means.cpu()[rows]))]
+        rows = rows[torch.argsort(morton_codes(means[rows]))]
     scales = torch.where(sums > 0, 1.0 / sums, 0.0).numpy()
     indptr, region, weight = (part.numpy() for part in (W.indptr, W.region, W.weight))
     blocks = row_blocks(W.indptr.diff()[rows].numpy(), BLOCK_ROWS, BLOCK_ENTRIES)
     for channels in codebook.slices():
-        table, width = flat_table(codebook.values(channels, X.device)), channels.stop - channels.start
+        table, width = flat_table(codebook.values(channels)), channels.stop - channels.start
 
         def solve_block(
             first: int, last: int, table: np.ndarray = table, width: int = width, channels: slice = channels
@@ -53,30 +51,6 @@ def solve_rows(
             X[:, channels].index_copy_(0, block_rows, torch.from_numpy(block_means).to(X.dtype))
 
         run_each(solve_block, blocks, threads)
-
-
-def bag_sums(index: Tensor, table: Tensor, starts: Tensor, shares: Tensor | None = None) -> Tensor:
-    """Return ``sum_k shares[k] table[index[k]]`` of each bag b, k in ``starts[b]..starts[b + 1]``: [B, C] f32.
-
-    Args:
-        index: [n] i32 or i64. table: [M, C] f32. starts: [B + 1] i64. shares: [n] f32; None for ones.
-    """
-    lengths = starts.diff()
-    if lengths.numel() == 0 or int(lengths.max()) <= LONG:
-        return _bags(index, table, starts, shares)
-    counts = (lengths + LONG - 1) // LONG  # of parts
-    bags = from_zero(counts)
-    total = int(bags[-1])
-    number = torch.arange(total, device=starts.device)
-    part_starts = torch.repeat_interleave(starts[:-1] - LONG * bags[:-1], counts, output_size=total) + LONG * number
-    parts = _bags(index, table, torch.cat([part_starts, starts[-1:]]), shares)
-    return bag_sums(number, parts, bags)
-
-
-def _bags(index: Tensor, table: Tensor, starts: Tensor, shares: Tensor | None) -> Tensor:
-    return embedding_bag(
-        index, table, starts.to(index.dtype), mode="sum", per_sample_weights=shares, include_last_offset=True
-    )
 
 
 def morton_codes(points: Tensor, bounds: Tensor | None = None) -> Tensor:

@@ -7,7 +7,7 @@ the same closed form, with half of the entries on real masks of four levels. Whe
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -47,10 +47,9 @@ class ViewCodebook:
         """
         if self.tuples is None:
             return rows
-        tuples = self.tuples.to(rows.device)
-        has_row = tuples != NO_LABEL
+        has_row = self.tuples != NO_LABEL
         shares = has_row.float() / has_row.sum(dim=1, keepdim=True)  # zero where a tuple has no row
-        means = embedding_bag(tuples.clamp_min(0), rows, mode="sum", per_sample_weights=shares)
+        means = embedding_bag(self.tuples.clamp_min(0), rows, mode="sum", per_sample_weights=shares)
         largest = torch.finfo(torch.float32).max
         return means.clamp_(-largest, largest)  # the rounded shares of six rows add up to more than one
 
@@ -58,7 +57,7 @@ class ViewCodebook:
         """Return W with each entry multiplied by the number of rows of its region."""
         if self.tuples is None:
             return weights
-        counts = (self.tuples != NO_LABEL).sum(dim=1).float().to(weights.device)
+        counts = (self.tuples != NO_LABEL).sum(dim=1).float()
         return replace(weights, weight=weights.weight * counts[weights.region])
 
 
@@ -84,31 +83,37 @@ class Codebook:
         return [row_lengths(view.rows) for view in self.views]
 
     def fits_float16(self) -> bool:
-        """Return True if float16 represents the rows of all codebooks."""
-        return float16_holds(((view.rows, lengths) for view, lengths in zip(self.views, self.lengths, strict=True)))
+        """Return True if float16 represents every value, and all rows to FLOAT16_ERROR of the longest."""
+        longest = 0.0
+        for view, lengths in zip(self.views, self.lengths, strict=True):
+            if view.rows.numel():
+                if max(abs(float(end)) for end in torch.aminmax(view.rows)) > FLOAT16_MAX:
+                    return False
+                longest = max(longest, float(lengths.max()))
+        return longest == 0 or FLOAT16_STEP * math.sqrt(self.channels) <= FLOAT16_ERROR * longest
 
     def slices(self) -> Iterator[slice]:
         """Return the slices of channels for `values`, such that a table takes TABLE_BYTES."""
         step = max(LEAST_CHANNELS, TABLE_BYTES // (4 * max(self.regions, 1)))
         return (slice(begin, min(begin + step, self.channels)) for begin in range(0, self.channels, step))
 
-    def values(self, channels: slice, place: torch.device) -> Tensor:
+    def values(self, channels: slice) -> Tensor:
         """Return some channels of the vectors of all regions, [M, C] f32."""
-        return self._table(channels, place, lambda _, rows: rows.float())
+        return self._table(channels, lambda _, rows: rows.float())
 
-    def unit_values(self, channels: slice, place: torch.device) -> Tensor:
+    def unit_values(self, channels: slice) -> Tensor:
         """Return some channels of all vectors, from rows of unit length, [M, C] f32; zero rows stay zero."""
 
         def unit_rows(view: int, rows: Tensor) -> Tensor:
-            lengths = self.lengths[view].to(place)
+            lengths = self.lengths[view]
             return (rows.double() / torch.where(lengths > 0, lengths, 1.0)[:, None]).float()
 
-        return self._table(channels, place, unit_rows)
+        return self._table(channels, unit_rows)
 
-    def _table(self, channels: slice, place: torch.device, of_rows: Callable[[int, Tensor], Tensor]) -> Tensor:
-        table, base = new_table(self.regions, channels.stop - channels.start, place), 0
+    def _table(self, channels: slice, of_rows: Callable[[int, Tensor], Tensor]) -> Tensor:
+        table, base = new_table(self.regions, channels.stop - channels.start), 0
         for number, view in enumerate(self.views):
-            table[base : base + view.regions] = view.means(of_rows(number, view.rows[:, channels].to(place)))
+            table[base : base + view.regions] = view.means(of_rows(number, view.rows[:, channels]))
             base += view.regions
         return table
 
@@ -128,22 +133,6 @@ def as_regions(observation: ViewFeatures, by_rows: bool) -> tuple[ViewFeatures, 
         return observation, codebook
     regions = Regions.unchecked(torch.from_numpy(numbers)[None], observation.codebook.new_empty(tuples.shape[0], 0))
     return regions, replace(codebook, tuples=torch.from_numpy(tuples))
-
-
-def float16_holds(books: Iterable[tuple[Tensor, Tensor]]) -> bool:
-    """Return True if float16 represents every value, and all rows to FLOAT16_ERROR of the longest.
-
-    Args:
-        books: codebooks [M, F], and the lengths [M] of their rows.
-    """
-    longest, channels = 0.0, 0
-    for rows, lengths in books:
-        if not rows.numel():
-            continue
-        if max(abs(float(end)) for end in torch.aminmax(rows)) > FLOAT16_MAX:
-            return False
-        longest, channels = max(longest, float(lengths.max())), rows.shape[1]
-    return longest == 0 or FLOAT16_STEP * math.sqrt(channels) <= FLOAT16_ERROR * longest
 
 
 def row_lengths(rows: Tensor) -> Tensor:

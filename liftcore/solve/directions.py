@@ -27,7 +27,6 @@ from liftcore.solve.sums import PieceSums, piece_sums
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import DIRECTIONS
 
-CPU = torch.device("cpu")
 ROWS = 1 << 14  # of a table in float64 at a time
 SAMPLE = 1 << 14  # regions from which principal directions are computed
 FILE = "directions.safetensors"
@@ -64,10 +63,10 @@ class RegionDirections:
     def table(self, columns: slice) -> Tensor:
         """Return some columns of e of all regions, [M, C] f32; zeros for regions without direction."""
         if self._axes is None:
-            return self._centre(self._codebook.unit_values(columns, CPU), columns)
-        table = new_table(self._codebook.regions, columns.stop - columns.start, CPU).zero_()
+            return self._centre(self._codebook.unit_values(columns), columns)
+        table = new_table(self._codebook.regions, columns.stop - columns.start).zero_()
         for channels in self._codebook.slices():
-            table += self._centre(self._codebook.unit_values(channels, CPU), channels) @ self._axes[channels, columns]
+            table += self._centre(self._codebook.unit_values(channels), channels) @ self._axes[channels, columns]
         return table
 
     def save(self, folder: Path) -> None:
@@ -94,7 +93,7 @@ class RegionDirections:
         total = float(totals[nonzero].sum()) or 1.0
         mean, squares = torch.zeros(codebook.channels, dtype=torch.float64), torch.zeros_like(totals)
         for channels in codebook.slices():
-            unit = codebook.unit_values(channels, CPU)
+            unit = codebook.unit_values(channels)
             for part, weights in zip(unit.split(ROWS), totals.split(ROWS), strict=True):
                 mean[channels] += weights @ part.double() / total
             for part, squared in zip(unit.split(ROWS), squares.split(ROWS), strict=True):
@@ -118,7 +117,7 @@ class RegionDirections:
     def _full_rows(self, regions: slice) -> Tensor:
         """Return all channels of e of some regions, [m, F] f32."""
         channels = list(self._codebook.slices())
-        parts = (self._centre(self._codebook.unit_values(part, CPU)[regions], part, regions) for part in channels)
+        parts = (self._centre(self._codebook.unit_values(part)[regions], part, regions) for part in channels)
         return torch.cat(list(parts), dim=1)
 
     def _centre(self, unit: Tensor, channels: slice, regions: slice = slice(None)) -> Tensor:

@@ -27,7 +27,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
 from scipy.sparse import csr_array
 
 from liftcore.runtime.jit import kernel
@@ -37,7 +36,6 @@ from liftcore.solve.region_tree import NO_NODE, SPLIT, UNSEEN, RegionTree, node_
 from liftcore.solve.sums import PieceSums, in_order, piece_sums, pieces
 from liftcore.values.region_weights import RegionWeights, row_blocks, run_each
 
-CPU = torch.device("cpu")
 OBSERVES = 0.3  # share of a region that a level must see to observe it, as for mask consensus
 CONTAINS = 0.7  # of the visible share of a region; with less, the region lies across two others
 SAME_SPLATS = 0.9  # share of a whole's splats from which a part is that whole
@@ -344,7 +342,7 @@ class NodeVectors:
         products, power = np.zeros(parts.size), np.zeros(number)
         weights = np.maximum(shares.sum(axis=1), 1e-30)
         for channels in codebook.slices():
-            unit = codebook.unit_values(channels, CPU).numpy()
+            unit = codebook.unit_values(channels).numpy()
             sums[:, channels] = shares @ unit
             unit = unit - (totals @ unit / total).astype(np.float32)
             centred = shares @ unit

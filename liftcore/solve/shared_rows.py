@@ -36,16 +36,16 @@ NO_REGION = np.int32(2**31 - 1)
 no_lanes, lanes_at = zeros_of(WIDE), loader_of(WIDE)
 
 
-def new_table(rows: int, columns: int, place: torch.device) -> Tensor:
+def new_table(rows: int, columns: int) -> Tensor:
     """Return an uninitialised table [rows, columns] f32, whose storage has LANES zeros more (`flat_table`)."""
     size = rows * columns
-    flat = torch.empty(size + LANES, dtype=torch.float32, device=place)
+    flat = torch.empty(size + LANES, dtype=torch.float32)
     flat[size:] = 0.0
     return flat[:size].view(rows, columns)
 
 
 def flat_table(table: Tensor) -> np.ndarray:
-    """Return the rows of a table [M, C] f32 on the CPU, flattened, with LANES finite numbers more.
+    """Return the rows of a table [M, C] f32, flattened, with LANES finite numbers more.
 
     A copy, unless its storage is of `new_table`: vectors are loaded LANES at a time, also beyond the last row.
     """

@@ -40,6 +40,7 @@ from typing import TypeVar
 
 import numpy as np
 import torch
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from liftcore.lifting.geometry import weigh_views
@@ -51,7 +52,6 @@ from liftcore.runtime.progress import silent
 from liftcore.scene.cameras import Camera
 from liftcore.scene.compositing import CompositingParams
 from liftcore.scene.splats import Splats
-from liftcore.solve.closed_form import bag_sums
 from liftcore.solve.optimum import random_axes
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.region_weights import RegionWeights, segment_sums
@@ -269,13 +269,15 @@ class ViewDisagreement:
         starts, entries = W.take(rows)
         region, weight = W.region[entries], W.weight[entries]
         runs, row = W.runs(starts, region)
-        sums, total = bag_sums(region, means, runs, weight).double(), segment_sums(weight, runs)
+        by_run = csr_array((weight.double().numpy(), region.numpy(), runs.numpy()), shape=(len(row), len(means)))
+        sums, total = torch.from_numpy(by_run @ means.double().numpy()), segment_sums(weight, runs)
         of_rows = torch.searchsorted(row, torch.arange(len(rows) + 1))
         squares = torch.where(total > 0, sums.square().sum(dim=1) / total, 0.0)
         self.weights, self._squared_weights, self._squares = (
             segment_sums(part, of_rows).numpy() for part in (total, total.square(), squares)
         )
-        self._vectors = bag_sums(torch.arange(len(row)), sums.float(), of_rows).double().numpy()
+        ones, numbers = np.ones(len(row)), np.arange(len(row))
+        self._vectors = csr_array((ones, numbers, of_rows.numpy()), shape=(len(rows), len(row))) @ sums.numpy()
 
     def means(self, weights: np.ndarray) -> tuple[float, float, float]:
         """Return S, M and b: means over the splats that a labelled ray hits, at least one of which has a weight.
