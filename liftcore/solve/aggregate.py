@@ -67,7 +67,6 @@ def aggregate(
             same tensor is returned.
         total_weight: [P] f64, sums of unscaled weights.
         views: the lifted views.
-        threads: None uses the cores that this process may use. The result is bitwise identical for any number.
     """
     progress("aggregate", 0, len(views), "views")
     clustering = cluster_splats(features, total_weight, settings, threads)

@@ -64,7 +64,6 @@ def cluster_splats(
         features: [P, F] f16 or f32; zero rows belong to no cluster.
         total_weight: [P], sums of unscaled weights; splats are sampled with odds ``min(total_weight, 1)``.
         settings: the ``aggregation_*`` settings and the seed.
-        threads: None uses the cores that this process may use. The result is bitwise identical for any number.
     """
     count = features.shape[0]
     has_feature = nonzero_rows(features)

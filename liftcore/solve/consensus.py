@@ -88,7 +88,6 @@ def memberships(W: RegionWeights, groups: RegionGroups, threads: int | None = No
 
     Args:
         W: of views by rows of codebooks, on the CPU; its regions are numbered as those of the groups.
-        threads: None uses the cores that this process may use. The result is bitwise identical for any value.
     """
     indptr, region, weight = (part.numpy() for part in (W.indptr, W.region, W.weight))
     own_region = np.zeros(region.size, np.bool_)

@@ -77,7 +77,6 @@ def region_tree(
     Args:
         nodes: [n] i64, regions, ascending. containers: [n, views * levels] i32, indices in ``nodes``, SPLIT or
             UNSEEN.
-        threads: None uses the cores that this process may use. The result is bitwise identical for any value.
     """
     view, group, views = node_groups(nodes, groups)
     node = np.full(nodes.size, NO_NODE, np.int32)

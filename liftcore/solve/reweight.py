@@ -151,7 +151,6 @@ class BlockReweighter:
     Args:
         W: of all views by rows of codebooks, on the CPU; a row for each splat of the block.
         means: [n, 3] of these splats; neighbours, which read the same directions, are processed together.
-        threads: None uses the cores that this process may use. The result is bitwise identical for any value.
     """
 
     def __init__(self, W: RegionWeights, means: Tensor | None, threads: int | None) -> None:

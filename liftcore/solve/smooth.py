@@ -107,7 +107,6 @@ def smooth(
         total_weight: [P] f32, sums of unscaled weights. confidence: [P] f32; None: one everywhere.
         solved: [P] bool, the splats with a row of X from the solve; the others keep theirs.
         smoothness: lambda; zero does not change X.
-        threads: None uses the cores that this process may use. The result is bitwise identical for any number.
 
     Returns:
         X, and its facts for the diagnostics: ``smoothness``, the ``steps``, the ``residual`` (the preconditioned

@@ -49,7 +49,6 @@ def piece_sums(
 
     Args:
         work: ``work(first, last, table)`` adds those of some splats to a table of that shape, f64.
-        threads: None uses the cores that this process may use. The result is bitwise identical for any value.
     """
 
     def sum_piece(first: int, last: int) -> PieceSums:

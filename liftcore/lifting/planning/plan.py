@@ -161,7 +161,6 @@ def plan_lift(
 
     Args:
         device: of the lift. With ``auto``, a GPU with too little memory is replaced by the CPU.
-        threads: of the CPU; None uses the cores that this process may use.
         in_workers: True if workers hold W and X, so that this machine needs no memory for them.
         probe: True computes W of a few views, to report contradictions of the inputs and to estimate the time. A lift
             in memory does both with the views that it begins with.
