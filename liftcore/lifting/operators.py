@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Unpack
 
 import numpy as np
@@ -11,18 +10,13 @@ import torch
 from torch import Tensor
 
 from liftcore.errors import InvalidCameras, InvalidSettings
-from liftcore.lifting.algebra import Algebra
-from liftcore.lifting.engines import LocalEngine
 from liftcore.lifting.geometry import weigh_views
-from liftcore.lifting.in_memory import scene_of
 from liftcore.lifting.inputs import LiftInputs
-from liftcore.lifting.pipeline import find_objects, needs_separate_levels, prepare_reweighting
-from liftcore.lifting.steps import reweighted, splat_block
 from liftcore.raster import check_splats_and_threads, open_raster
 from liftcore.raster.base import Raster
 from liftcore.runtime.device import choose_device
 from liftcore.runtime.one_thread import one_thread
-from liftcore.runtime.progress import Progress, Timings, shown_progress
+from liftcore.runtime.progress import Progress, shown_progress
 from liftcore.runtime.torch_modes import callers_modes, default_modes
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.compositing import CompositingParams, check_antialiased
@@ -172,7 +166,6 @@ def region_weights(
     views: ViewValues,
     preset: Preset | str | LiftSettings = Preset.DEFAULT,
     *,
-    reweight: bool = False,
     progress: Progress | bool | None = None,
     threads: int | None = None,
     **settings: Unpack[LiftOptions],
@@ -185,13 +178,10 @@ def region_weights(
     Args:
         splats, cameras, views, preset, progress, threads, settings: as in `lift`. All views count, whatever the
             settings' coverage. A label on several levels is one region a level.
-        reweight: False: W by geometry alone, which reads no feature. True: W of the solve of `lift`, reweighted by
-            the features of other views (``robust``); sums of rows stay the same.
 
     Returns:
-        W on the CPU, a row a splat: in memory, or in mapped files if it is large. With E the views' codebooks,
-        ``W E`` over the sums of rows of W are features: with ``reweight`` those of `lift` with the same settings,
-        before smoothing and aggregation; without it those of ``row-sum``.
+        W on the CPU, a row a splat, by geometry alone, which reads no feature: in memory, or in mapped files if it is
+        large. With E the views' codebooks, ``W E`` over the sums of rows of W are the features of ``row-sum``.
 
     Raises:
         InvalidFeatures, InvalidSettings, Unavailable: as in `lift`.
@@ -200,17 +190,4 @@ def region_weights(
     raster = open_raster(inputs.splats, choose_device(inputs.settings.device), threads)
     arguments = raster, inputs.splats.count, inputs.views, inputs.settings
     with shown_progress(progress) as reporter, one_thread():
-        geometry = weigh_views(*arguments, reporter, by_rows=True, threads=threads)
-        W = geometry.weights.cpu()
-        if not (reweight and inputs.settings.robust):
-            return W
-        scene = scene_of(geometry, inputs.splats.means, inputs.settings, inputs.views.names, threads=threads)
-        del geometry
-        timings, masks = Timings(reporter), bool((scene.load("regions")["levels"] >= 0).any())
-        algebra, levels_apart = Algebra(scene, LocalEngine(threads), reporter, threads), False
-        if np.unique(scene.load("regions")["levels"]).size > 1:
-            _, node_vectors = find_objects(algebra, masks, timings)
-            levels_apart = needs_separate_levels(node_vectors, len(inputs.views.names))
-        prepare_reweighting(algebra, masks, levels_apart, timings)
-        block = splat_block(algebra.scene, 0)
-        return replace(W, weight=reweighted(algebra.scene, 0, block, threads)[0].weight)
+        return weigh_views(*arguments, reporter, by_rows=True, threads=threads).weights.cpu()

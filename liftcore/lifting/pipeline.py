@@ -160,9 +160,17 @@ def _solve(
     """Run the steps after W is known."""
     settings, views, splats, aggregation = inputs.settings, inputs.views, inputs.splats, None
     algebra = Algebra(scene, engine, timings.progress, threads)
-    objects, node_vectors = find_objects(algebra, statistics.masks, timings)
-    levels_apart = needs_separate_levels(node_vectors, len(views))
-    reliability = prepare_reweighting(algebra, statistics.masks, levels_apart, timings)
+    objects = node_vectors = reliability = None
+    if settings.finds_objects(statistics.masks):
+        with timings.stage("objects"):
+            objects, node_vectors = algebra.find_objects()
+    levels_apart = node_vectors is not None and node_vectors.levels_disagree and len(views) >= MIN_LEVEL_VIEWS
+    if settings.robust:
+        if statistics.masks:
+            with timings.stage("consensus"):
+                algebra.compare_masks()
+        with timings.stage("robust"):
+            reliability = algebra.reweight(levels_apart)
     with timings.stage("solve"):
         X, support = algebra.solve()
     give_back_memory()
@@ -224,39 +232,6 @@ def object_tensors(objects: RegionObjects, node_vectors: NodeVectors) -> dict[st
     columns |= {"node_parents": objects.tree.parents, "node_views": objects.node_views}
     columns |= {"node_confidence": objects.tree.confidence, "node_features": node_vectors.vectors.astype(np.float16)}
     return {name: torch.from_numpy(column) for name, column in columns.items()}
-
-
-def find_objects(algebra: Algebra, masks: bool, timings: Timings) -> tuple[RegionObjects | None, NodeVectors | None]:
-    """Find objects and the mean features of their nodes; None and None if the settings have them off.
-
-    Args:
-        masks: True if any view has masks.
-    """
-    if not algebra.scene.settings.finds_objects(masks):
-        return None, None
-    with timings.stage("objects"):
-        return algebra.find_objects()
-
-
-def needs_separate_levels(node_vectors: NodeVectors | None, views: int) -> bool:
-    """Return True if each level of masks is compared separately: levels disagree, and there are enough views."""
-    return node_vectors is not None and node_vectors.levels_disagree and views >= MIN_LEVEL_VIEWS
-
-
-def prepare_reweighting(algebra: Algebra, masks: bool, levels_apart: bool, timings: Timings) -> float | None:
-    """Prepare the robust step of the settings; return the median reliability of regions, None without masks.
-
-    Args:
-        masks: True if any view has masks.
-        levels_apart: True if regions are compared with those of their own level alone.
-    """
-    if not algebra.scene.settings.robust:
-        return None
-    if masks:
-        with timings.stage("consensus"):
-            algebra.compare_masks()
-    with timings.stage("robust"):
-        return algebra.reweight(levels_apart)
 
 
 def diagnose(
