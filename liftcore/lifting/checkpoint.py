@@ -15,7 +15,6 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import time
 from collections import deque
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, replace
@@ -32,7 +31,7 @@ from liftcore.raster.base import RayRows, ViewWeights
 from liftcore.runtime.arguments import as_path
 from liftcore.runtime.version import __version__
 from liftcore.scene.origin import FILE_ORIGIN
-from liftcore.values.region_weights import FORMAT, MEMORY_LIMIT, RegionWeights
+from liftcore.values.region_weights import FORMAT, RegionWeights
 from liftcore.values.views import Regions
 
 if TYPE_CHECKING:
@@ -54,7 +53,6 @@ class Checkpoint:
     """
 
     folder: Path
-    seconds: float = 2.0  # between writes: the work that a killed process loses, besides views in progress
     identity: str = ""  # digest of the splats, the code and the device of all answers (`of`)
 
     def __post_init__(self) -> None:
@@ -86,7 +84,7 @@ class Checkpoint:
         If the disk is full, the lift continues without storing more.
         """
         pending = deque[tuple[Path, ViewWeights | None]]()  # requests without a reply yet, with their stored answer
-        names, unwritten, requests = set[str](), _UnwrittenAnswers(self.seconds), iter(requests)
+        names, requests, has_space = set[str](), iter(requests), True
 
         def look_up(request: ViewRequest) -> ViewWeights | None:
             path = self.folder / f"{request_digest(request, self.identity)}.safetensors"
@@ -109,10 +107,14 @@ class Checkpoint:
         with closing(raster.iterate_views(chain(first, rest))) as computed:
             for answer in computed:
                 yield from cached_answers()
-                unwritten.keep(pending.popleft()[0], answer)
+                path = pending.popleft()[0]
+                try:
+                    if has_space:
+                        _write(path, answer)
+                except OSError:
+                    has_space = False
                 yield answer
                 del answer  # frees its memory before the raster computes the next one
-        unwritten.write()
         yield from cached_answers()
         for path in self.folder.glob("*"):
             if path.name not in names and _ANSWER.fullmatch(path.name):
@@ -137,30 +139,11 @@ def request_digest(request: ViewRequest, identity: str) -> str:
     return digest.hexdigest()
 
 
-class _UnwrittenAnswers:
-    """Answers that are not on disk yet. If the disk is full, these and all later ones are dropped."""
-
-    def __init__(self, seconds: float) -> None:
-        self._answers: list[tuple[Path, ViewWeights]] = []
-        self._seconds, self._since, self._has_space = seconds, time.monotonic(), True
-
-    def keep(self, path: Path, answer: ViewWeights) -> None:
-        """Add an answer; write all of them after ``seconds``, or when they fill MEMORY_LIMIT."""
-        self._answers.append((path, replace(answer, weights=answer.weights.cpu())))
-        size = sum(answer.weights.nbytes for _, answer in self._answers)
-        if time.monotonic() - self._since >= self._seconds or size >= MEMORY_LIMIT:
-            self.write()
-
-    def write(self) -> None:
-        """Write the answers, a file each."""
-        try:
-            for path, answer in self._answers if self._has_space else ():
-                path.parent.mkdir(parents=True, exist_ok=True)
-                answer.weights.save(path, {key: getattr(answer.rows, name) for name, key in _ROWS.items()})
-        except OSError:
-            self._has_space = False
-        self._answers.clear()
-        self._since = time.monotonic()
+def _write(path: Path, answer: ViewWeights) -> None:
+    """Write an answer."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = {key: getattr(answer.rows, name) for name, key in _ROWS.items()}
+    answer.weights.cpu().save(path, rows)
 
 
 def _read(path: Path) -> ViewWeights | None:

@@ -159,7 +159,7 @@ def test_checkpoint_serves_the_same_geometry_and_features_alone(regions: RandomS
 
 @pytest.mark.parametrize("damage", ["cut", "empty", "noise"])
 def test_damaged_checkpoint_is_computed_again(damage: str, regions: RandomScene, tmp_path: Path) -> None:
-    expected = lift(regions, checkpoint=lc.Checkpoint(tmp_path, seconds=0))
+    expected = lift(regions, checkpoint=lc.Checkpoint(tmp_path))
     answers = [path for path in tmp_path.rglob("*") if path.is_file()]
     assert len(answers) >= 4
     (tmp_path / "thesis.tex").write_text("words")
