@@ -157,7 +157,7 @@ def match_regions(
     shown_cluster = np.ones(kappa.size, np.int64), kappa.ravel() + 1, np.arange(kappa.size + 1)
     table = reads @ csr_matrix(shown_cluster, shape=(kappa.size, clusters + 1))  # the first column is no cluster
     areas, majority = (np.asarray(part).ravel() for part in (table.sum(axis=1), table.argmax(axis=1)))
-    shared = csr_matrix(table.max(axis=1)).toarray().ravel()
+    shared = np.asarray(table[np.arange(rows), majority]).ravel()
     unions = areas + np.bincount(kappa.ravel() + 1, minlength=clusters + 1)[majority] - shared
     ious = np.divide(shared, unions, out=np.zeros(rows), where=(areas > 0) & (majority > 0))
     return areas, np.where(areas > 0, majority, 0) - 1, ious
