@@ -123,19 +123,6 @@ def check_params(kernel: Kernel, camera: Camera, params: CompositingParams) -> N
         raise InvalidInput("offset", expected=expected, got=str(params.offset))
 
 
-def check_rows(values: Tensor, splats: int) -> None:
-    """Refuse values that are not [P, C] (InvalidInput)."""
-    if values.ndim != 2 or values.shape[0] != splats:
-        raise InvalidInput("values", expected=f"one row for each of {splats} splats", got=f"{list(values.shape)}")
-
-
-def check_labels(labels: Tensor, splats: int) -> None:
-    """Refuse labels that are not [P], -1 or more (InvalidInput)."""
-    if labels.ndim != 1 or labels.shape[0] != splats or int(labels.min()) < -1:
-        got = f"{list(labels.shape)}, the smallest {int(labels.min())}"
-        raise InvalidInput("labels", expected=f"a label of -1 or more for each of {splats} splats", got=got)
-
-
 def strided_places(params: CompositingParams, pixels: Tensor) -> Tensor | None:
     """Return the pixels [n, 2] (x, y) as pixels of the strided view; None if any is not among its rays."""
     if params.stride == 1:

@@ -25,7 +25,7 @@ from triton.backends.compiler import BaseBackend, GPUTarget
 from triton.compiler import ASTSource, make_backend
 
 from liftcore.raster.cpu.warm_up import warm_up
-from liftcore.raster.gpu import launching, raster, render, tiles, weights
+from liftcore.raster.gpu import launching, raster, rays, tiles, weights
 from liftcore.raster.gpu.tiles import _cut as cut
 from liftcore.runtime.device import Device
 from liftcore.scene.compositing import CompositingParams, Weighting
@@ -119,7 +119,7 @@ def launches_of(work: Callable[[], None]) -> dict[Launch, None]:
             for name, value in (("rows", 0), ("firsts", 0), ("counts", 1)):
                 by_name[name].fill_(value)
 
-    modules: list[Any] = [render, tiles, weights]
+    modules: list[Any] = [rays, tiles, weights]
     for module in modules:
         module.launch = note
     work()
@@ -143,9 +143,6 @@ def _every_product() -> None:
     splats, camera = random_splats(3), random_camera(3)
     gpu = raster.GpuRaster(splats, torch.device("cpu"))
     gpu.region_weights(camera, random_regions(3), CompositingParams(), Weighting(2))
-    gpu.render(camera, torch.zeros(splats.count, render.WIDEST), CompositingParams())
-    gpu.strongest_labels(camera, torch.zeros(splats.count, dtype=torch.int32), CompositingParams())
-    gpu.row_sums(random_camera(3, 1, 1), CompositingParams())
 
 
 def main() -> None:

@@ -45,11 +45,9 @@ def every_product(raster: GpuRaster, camera: Camera) -> list[torch.Tensor]:
     """Return one of each product."""
     pixels = torch.tensor([[16, 35], [0, 0], [10, 20], [1, 0]], dtype=torch.int32)
     rows = raster.ray_rows(camera, pixels, PARAMS)
-    labels = torch.arange(16, dtype=torch.int32) - 1
     return [
         *top_two(raster, camera), *as_parts(raster.region_weights(camera, random_regions(8), PARAMS, Weighting(2))),
-        rows.indptr, rows.splats, rows.weights, raster.row_sums(camera, PARAMS),
-        raster.strongest_labels(camera, labels, PARAMS),
+        rows.indptr, rows.splats, rows.weights,
     ]  # fmt: skip
 
 
@@ -72,7 +70,7 @@ def test_no_bit_depends_on_the_size_of_blocks(monkeypatch, kernel):
 def test_memory_that_runs_out_halves_the_block(monkeypatch):
     """On a GPU with less free memory than a block needs, smaller blocks give the same result."""
     splats, camera = random_splats(8, 24), random_camera(8, 20, 36)
-    expected = gpu_raster(splats).row_sums(camera, PARAMS)
+    expected = top_two(gpu_raster(splats), camera)
     tries = []
 
     def crowded(*arguments: Any) -> Frame:
@@ -82,7 +80,8 @@ def test_memory_that_runs_out_halves_the_block(monkeypatch):
         return Frame(*arguments)
 
     monkeypatch.setattr("liftcore.raster.gpu.raster.Frame", crowded)
-    assert torch.equal(gpu_raster(splats, block=1 << 20).row_sums(camera, PARAMS), expected)
+    for first, second in zip(expected, top_two(gpu_raster(splats, block=1 << 20), camera), strict=True):
+        assert torch.equal(first, second)
     assert tries == [1 << 20, 1 << 19, 1 << 18]
 
 
@@ -105,8 +104,6 @@ def test_a_view_that_sees_nothing_gives_empty_products():
     raster = gpu_raster(splats)
     weights = raster.region_weights(away, random_regions(1), PARAMS, Weighting(1, top_k=1))
     assert [part.numel() for part in as_parts(weights)] == [0, 1, 0, 0, 0, 0, 2]
-    assert not raster.row_sums(away, CompositingParams()).any()
-    assert (raster.strongest_labels(away, torch.zeros(5, dtype=torch.int32), CompositingParams()) == -1).all()
     rows = raster.ray_rows(away, torch.zeros(2, 2, dtype=torch.int32), CompositingParams())
     assert rows.indptr.tolist() == [0, 0, 0]
 
@@ -131,11 +128,11 @@ def test_memory_that_runs_out_for_good_is_an_error_in_words(monkeypatch, error):
     raster = gpu_raster(random_splats(0, 4))
     monkeypatch.setattr("liftcore.raster.gpu.raster.Frame", full)
     with pytest.raises(Unavailable, match="projected splats and tile lists of a view") as raised:
-        raster.row_sums(random_camera(0), CompositingParams())
+        top_two(raster, random_camera(0))
     assert raised.value.got == str(error) and raised.value.hint
     monkeypatch.setattr("liftcore.raster.gpu.raster.Frame", lambda *_: broken())
     with pytest.raises(RuntimeError, match="illegal"):  # an error that is no lack of memory is not reported as one
-        raster.row_sums(random_camera(0), CompositingParams())
+        top_two(raster, random_camera(0))
 
 
 def broken() -> None:

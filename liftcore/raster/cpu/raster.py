@@ -25,9 +25,7 @@ from liftcore.raster.base import (
     RayRows,
     ViewRequest,
     ViewWeights,
-    check_labels,
     check_params,
-    check_rows,
     strided_places,
 )
 from liftcore.raster.cpu.composite import (
@@ -79,7 +77,6 @@ class CpuRaster:
 
     Args:
         splats: the scene.
-        threads: None uses the cores that this process may use. The result is bitwise identical for any number.
     """
 
     def __init__(self, splats: Splats, threads: int | None = None) -> None:
@@ -138,7 +135,6 @@ class CpuRaster:
 
     def render(self, camera: Camera, values: Tensor, params: CompositingParams) -> Tensor:
         """Return ``A X``: values [P, C] f32 -> [H, W, C] f32. See the protocol."""
-        check_rows(values, self.splats.count)
         frame, channels = self._frame(camera, every_pixel(params)), values.shape[1]
         image = np.zeros((camera.height, camera.width, channels), np.float32)
         for begin in range(0, channels, CHANNELS):
@@ -156,7 +152,6 @@ class CpuRaster:
 
     def strongest_labels(self, camera: Camera, labels: Tensor, params: CompositingParams) -> Tensor:
         """Return ``argmax(A onehot(labels))``: labels [P] i32 in -1..K - 1 -> [H, W] i32. See the protocol."""
-        check_labels(labels, self.splats.count)
         flat, count = np.ascontiguousarray(labels.to(torch.int32).numpy()), int(labels.max()) + 1
         image, frame = np.full((camera.height, camera.width), -1, np.int32), self._frame(camera, every_pixel(params))
         self._over_tiles(frame, partial(strongest_tiles, frame=frame, labels=flat, count=count, image=image))

@@ -1,9 +1,9 @@
 """The GPU backend: A by Triton kernels, bitwise identical in every run.
 
 Projection and tile lists are float64 tensor operations (``project``, ``tiles``), except for the tile columns of a
-splat, which a kernel computes. One program per tile composites its rays (``composite``), and a product loads the
-weights as a matrix (``weights``, ``render``). Sums over tiles are float64 in a fixed order. No two programs add to
-the same memory. On CPU tensors it runs in Triton's interpreter, for tests without a GPU.
+splat, which a kernel computes. One program per tile composites its rays (``composite``), and the product loads the
+weights as a matrix (``weights``). Sums over tiles are float64 in a fixed order. No two programs add to the same
+memory. The CPU makes pictures. On CPU tensors it runs in Triton's interpreter, for tests without a GPU.
 """
 
 import math
@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from contextvars import copy_context
-from functools import wraps
+from functools import cached_property, wraps
 from typing import Concatenate, ParamSpec, TypeVar
 
 import torch
@@ -22,16 +22,15 @@ from liftcore.raster.base import (
     RayRows,
     ViewRequest,
     ViewWeights,
-    check_labels,
     check_params,
-    check_rows,
     strided_places,
 )
 from liftcore.raster.cpu.project import activate_splats, view_of, with_opacities
-from liftcore.raster.gpu import render, weights
+from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.raster.gpu import weights
 from liftcore.raster.gpu.launching import check_device
 from liftcore.raster.gpu.project import DeviceScene, project, scene_on, with_opacity
-from liftcore.raster.gpu.render import ray_rows
+from liftcore.raster.gpu.rays import ray_rows
 from liftcore.raster.gpu.tiles import BLOCK, Frame
 from liftcore.raster.gpu.weights import DeviceReading
 from liftcore.runtime.device import indexed, out_of_memory
@@ -145,27 +144,21 @@ class GpuRaster:
         check_params(self.splats.kernel, camera, params)
         return DeviceReading(observation, camera, params, self.device)
 
-    @_within_memory
     def render(self, camera: Camera, values: Tensor, params: CompositingParams) -> Tensor:
-        """Return ``A X``: values [P, C] f32 -> [H, W, C] f32. See the protocol."""
-        check_rows(values, self.splats.count)
-        frame = self._frame(camera, every_pixel(params))
-        image = torch.empty(camera.height, camera.width, values.shape[1], dtype=torch.float32)
-        for begin in range(0, values.shape[1], render.WIDEST):
-            block = values[:, begin : begin + render.WIDEST].to(torch.float32).contiguous()
-            image[:, :, begin : begin + render.WIDEST] = render.render(frame, block)
-        return image
+        """Return ``A X``: values [P, C] f32 -> [H, W, C] f32, by the CPU. See the protocol."""
+        return self._pictures.render(camera, values, params)
 
     def row_sums(self, camera: Camera, params: CompositingParams) -> Tensor:
-        """Return ``A 1``: [H, W] f32."""
-        return self.render(camera, torch.ones(self.splats.count, 1, dtype=torch.float32), params)[:, :, 0]
+        """Return ``A 1``: [H, W] f32, by the CPU."""
+        return self._pictures.row_sums(camera, params)
 
-    @_within_memory
     def strongest_labels(self, camera: Camera, labels: Tensor, params: CompositingParams) -> Tensor:
-        """Return ``argmax(A onehot(labels))``: labels [P] i32 in -1..K - 1 -> [H, W] i32. See the protocol."""
-        check_labels(labels, self.splats.count)
-        frame = self._frame(camera, every_pixel(params))
-        return render.strongest_labels(frame, labels.to(torch.int32)).cpu()
+        """Return ``argmax(A onehot(labels))`` [H, W] i32, by the CPU. See the protocol."""
+        return self._pictures.strongest_labels(camera, labels, params)
+
+    @cached_property
+    def _pictures(self) -> CpuRaster:
+        return CpuRaster(self.splats)
 
     @_within_memory
     def ray_rows(self, camera: Camera, pixels: Tensor, params: CompositingParams) -> RayRows:

@@ -287,7 +287,3 @@ class Frame:
             for column in range(0, self.columns, UNIT)
         ]
         return [begin for begin in begins if first < begin < last] + [last]
-
-    def of_splats(self, values: Tensor, lists: TileLists) -> Tensor:
-        """Return the rows of projected splats, taken from ``values`` [P, ...], on the device."""
-        return values.to(self.device)[lists.ids.long()]
