@@ -1,7 +1,4 @@
-"""The image, the compose file and the proxy name files, settings, ports and limits as the service has them.
-
-No image is built here: there is no engine.
-"""
+"""The health check of the image tells a live server from a dead one; no image is built here."""
 
 from __future__ import annotations
 

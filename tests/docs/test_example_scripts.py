@@ -1,8 +1,9 @@
 """The scripts of ``examples/`` run, and do what they say."""
 
+import contextlib
+import io
 import json
 import runpy
-import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -25,9 +26,12 @@ pytestmark = pytest.mark.slow
 
 
 def run(script: str, *arguments: object) -> str:
-    """Return the output of an example."""
-    command = [sys.executable, str(ROOT / "examples" / script), *map(str, arguments)]
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    """Return the output of an example, which runs in this process, where its libraries are loaded."""
+    output = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(output):
+        patch.setattr(sys, "argv", [script, *map(str, arguments)])
+        runpy.run_path(str(ROOT / "examples" / script), run_name="__main__")
+    return output.getvalue()
 
 
 @pytest.fixture

@@ -328,7 +328,7 @@ CAMERA_BOMBS = [
     ("deep array", b"[" * 100_000, "parse"),
     ("deep object", b'{"a":' * 100_000, "parse"),
     ("5,000 digits", b"[" + b"1" * 5000 + b"]", "parse"),
-    ("a million numbers", b"[" + b"1," * 1_000_000 + b"1]", "list"),
+    ("many numbers", b"[" + b"1," * 100_000 + b"1]", "list"),
     (
         "zip of 600 MB",
         lambda: zip_of_zeros(("cameras.txt", MODEL["cameras.txt"]), "images.txt", 600),

@@ -181,27 +181,6 @@ def test_images_of_any_size_become_whole_patches_of_the_shorter_side(photos: Pat
         encode(photos, size=3)
 
 
-def test_batches_hold_one_size_and_change_nothing(photos: Path, encode: Encode) -> None:
-    for k in range(5):
-        width = 16 if k < 3 else 24
-        blob(width, 16, (2 * k, 0, 2 * k + 4, 5)).save(photos / f"{k}.png")
-    first, second = MeanColour(), MeanColour()
-    _, first_grids = encode(photos, first)
-    _, second_grids = encode(photos, second, batch=2)
-    assert (first.batches, second.batches) == ([1] * 5, [2, 1, 2])
-    assert first_grids.keys() == second_grids.keys() == set("01234")
-    assert all(torch.equal(first_grids[view], second_grids[view]) for view in first_grids)
-
-
-def test_cells_are_unit_vectors_unless_asked_otherwise(photos: Path, encode: Encode) -> None:
-    image = blob(16, 8, (8, 0, 16, 8))
-    image.save(photos / "a.png")
-    _, grids = encode(photos, normalised=True)
-    lengths = grids["a"].float().norm(dim=-1)
-    assert lengths[:, 0].max() == 0  # black has no direction
-    torch.testing.assert_close(lengths[:, -1], torch.ones(2), atol=1e-3, rtol=0)
-
-
 def test_what_float16_cannot_hold_is_float32_and_what_is_no_number_refused(
     photos: Path, encode: Encode, tmp_path: Path
 ) -> None:

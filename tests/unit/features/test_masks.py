@@ -70,18 +70,6 @@ def test_every_kind_of_masks_makes_the_same_regions(kind: str, tmp_path: Path) -
     assert view.codebook.tolist() == VECTORS.tolist()
 
 
-@pytest.mark.parametrize(
-    ("unlabelled", "dtype"),
-    [
-        (255, np.uint8),
-        (255, np.uint16),
-    ],
-)
-def test_pictures_with_another_value_for_none_number_masks_from_zero(unlabelled, dtype, tmp_path: Path) -> None:
-    save(tmp_path, {"a.npy": VECTORS, "a.png": np.where(LABELS < 0, unlabelled, LABELS).astype(dtype)})
-    assert mask_views(tmp_path, unlabelled)["a"].labels.tolist() == [LABELS.tolist()]
-
-
 def test_views_are_named_as_their_cameras_are_and_with_their_folders(tmp_path: Path) -> None:
     save(tmp_path, {f"{name}.npy": VECTORS for name in ("a.jpg", "frame.0001", "c", "camA/0")})
     save(tmp_path, {"a.jpg_masks.npy": MASKS, "camA/0_masks.npy": MASKS, "c.PNG": GREY})

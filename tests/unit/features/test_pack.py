@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from safetensors.torch import load_file, save_file
 from liftcore.errors import InvalidFeatures
 from liftcore.io.safetensors_file import write_tensors
 from liftcore.scene.cameras import Camera, Cameras
-from liftcore.values.pack import as_views, pair, read_features
+from liftcore.values.pack import as_views, pair, read_features, write_pack
 from liftcore.values.views import FeatureGrid, Regions, ViewFeatures
 
 MAP = np.arange(24, dtype=np.float32).reshape(3, 2, 4)  # [F, h, w]
@@ -53,6 +54,26 @@ def test_tensors_of_any_order_are_stored_in_row_order(tmp_path) -> None:
 
 
 CODEBOOK = torch.arange(12.0).reshape(4, 3)
+
+
+@pytest.mark.parametrize(
+    ("views", "message"),
+    [
+        ({}, "at least one view"),
+        ({"a": MAP}, r"view 'a': expected Regions or FeatureGrid, got ndarray; make FeatureGrid"),
+        ({"a": FeatureGrid(MAP), "b": FeatureGrid(MAP[..., :1])}, "the same channels"),
+    ],
+)
+def test_views_that_cannot_be_right_are_refused_and_not_written(views: Any, message: str, tmp_path: Path) -> None:
+    for source in (views, iter(views.items())):
+        with pytest.raises(InvalidFeatures, match=message):
+            as_views(source)
+    if "FeatureGrid" not in message:  # which its type excludes
+        with pytest.raises(InvalidFeatures, match=message):
+            write_pack(tmp_path / "pack", views, {})
+    with pytest.raises(InvalidFeatures, match="'a' twice"):
+        as_views(iter([("a", FeatureGrid(MAP)), ("a", FeatureGrid(MAP))]))
+    assert not list(tmp_path.iterdir())
 
 
 def labels(*values: int, dtype: torch.dtype = torch.int16) -> torch.Tensor:
@@ -122,19 +143,6 @@ def test_packs_that_do_not_fit_together_are_refused(tmp_path: Path) -> None:
         read_features()
     with pytest.raises(InvalidFeatures, match="No such file"):
         read_features(tmp_path / "nowhere")
-
-
-def test_paired_views_are_named_like_their_cameras_and_tell_their_own_names(tmp_path: Path) -> None:
-    tensors = {**regions(0, 9), "camB/b/grid": torch.ones(1, 2, 3), "c/grid": torch.ones(1, 1, 3)}
-    packs = read_features(saved(tmp_path / "pack", tensors))
-    paired, without = pair(packs, cameras("camA/a", "b", "camA/x"))
-    assert (paired.views, without) == (("b", "camA/a"), ["c"])
-    assert (paired.is_regions("camA/a"), paired.map_size("b"), list(paired.specs("b"))) == (True, (2, 1), ["grid"])
-    assert torch.equal(paired["b"].codebook, torch.ones(2, 3))
-    with pytest.raises(InvalidFeatures, match=r"view 'a' labels: .*the label 9"):
-        paired["camA/a"]
-    with pytest.raises(InvalidFeatures, match=r"views 'a', 'c', 'camB/b' and cameras 'x', 'y', none in common"):
-        pair(packs, cameras("x", "y"))
 
 
 DECOMPOSED, COMPOSED = "Ku\u0308che_0", "K\u00fcche_0"  # one name, decomposed and composed

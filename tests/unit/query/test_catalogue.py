@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,29 +10,13 @@ import pytest
 import torch
 
 from liftcore.errors import InvalidLift, NotFound
-from liftcore.query.catalogue import catalogue, table_csv
 from liftcore.query.result import LiftResult, load_lift
 from liftcore.query.scene import Scene
 from liftcore.values.lift_file import save_lift
 from liftcore.values.settings import LiftSettings
-from tests.tiny_scene import CHANNELS, SPLATS_A_CLUSTER, VIEWS, WORDS
+from tests.tiny_scene import CHANNELS, WORDS
 
 EYE = np.eye(3, CHANNELS, dtype=np.float32)
-
-
-def test_each_object_has_its_place_its_views_and_the_nearest_word(scene: Scene) -> None:
-    listing = catalogue(scene, WORDS, 3.0 * EYE)
-    assert [obj.id for obj in listing.objects] == [0, 1, 2] and listing.features.shape == (3, CHANNELS)
-    assert sorted(obj.share for obj in listing.objects)[::-1] == [obj.share for obj in listing.objects]
-    for obj in listing.objects:
-        cluster = round(obj.centre[0] / 1.2) + 1
-        assert (obj.name, obj.splats) == (WORDS[cluster], SPLATS_A_CLUSTER)
-        assert set(obj.views) == set(VIEWS) and obj.score == pytest.approx(1, abs=0.1)
-        means = scene.splats.means.numpy()[SPLATS_A_CLUSTER * cluster : SPLATS_A_CLUSTER * (cluster + 1)]
-        np.testing.assert_allclose(obj.box, [means.min(axis=0), means.max(axis=0)], atol=1e-6)
-    lines = list(csv.DictReader(io.StringIO(table_csv(listing).decode())))
-    assert [line["name"] for line in lines] == [obj.name for obj in listing.objects]
-    assert [int(line["splats"]) for line in lines] == [SPLATS_A_CLUSTER] * 3
 
 
 def test_a_draft_says_that_it_looked_for_no_objects_and_what_finds_them(scene: Scene, tmp_path: Path) -> None:

@@ -35,29 +35,6 @@ def means(scene: Scene, cluster: int) -> np.ndarray:
     return scene.splats.means.numpy()[cluster * SPLATS_A_CLUSTER : (cluster + 1) * SPLATS_A_CLUSTER]
 
 
-def test_clusters_that_are_apart_are_objects_with_their_boxes(scene: Scene) -> None:
-    answer = of(scene, 0, 2)
-    grouping = objects(scene, answer)
-    assert len(grouping.objects) == 2 and grouping.unassigned_splats == 0
-    total_weight = scene.total_weight
-    for number, obj in enumerate(grouping.objects):
-        rows = np.flatnonzero(grouping.numbers == number)
-        cluster = rows[0] // SPLATS_A_CLUSTER
-        assert rows.tolist() == list(range(cluster * SPLATS_A_CLUSTER, (cluster + 1) * SPLATS_A_CLUSTER))
-        assert obj.splats == SPLATS_A_CLUSTER
-        assert obj.share == pytest.approx(total_weight[rows].sum() / total_weight[answer.selected].sum())
-        assert obj.score == pytest.approx(np.average(answer.scores[rows], weights=total_weight[rows]))
-        low, high = means(scene, cluster).min(axis=0), means(scene, cluster).max(axis=0)
-        # Each of so few splats has a thousandth of the total weight or more, so the box holds nearly all of them.
-        assert (np.array(obj.box[0]) >= low).all() and (np.array(obj.box[1]) <= high).all()
-        assert np.array(obj.box) == pytest.approx(np.stack([low, high]), abs=0.3)
-        assert obj.centre == pytest.approx(np.mean(obj.box, axis=0))
-    assert grouping.objects[0].share >= grouping.objects[1].share
-    assert (grouping.numbers[SPLATS_A_CLUSTER : 2 * SPLATS_A_CLUSTER] == -1).all()
-    empty = objects(scene, of(scene))
-    assert (empty.objects, empty.unassigned_splats) == ((), 0) and (empty.numbers == -1).all()
-
-
 def test_distant_single_splats_are_unassigned_and_stretch_no_box(scene: Scene) -> None:
     without_outlier = objects(scene, of(scene, 0))
     with_outlier = objects(scene, of(scene, 0, rows=(2 * SPLATS_A_CLUSTER,)))

@@ -10,12 +10,16 @@ import torch
 
 from liftcore.errors import InvalidQuery
 from liftcore.query.ask import ask
+from liftcore.query.export import object_splats
 from liftcore.query.presence import References, references_of
+from liftcore.query.question import Query
 from liftcore.query.result import LiftResult
 from liftcore.query.scene import Scene
 from liftcore.query.segment import segment
+from liftcore.query.terms import SplatTerm
 from liftcore.text import LVIS_TABLE, CachingEncoder
 from liftcore.text.table import TableEncoder
+from tests.promises.tiny_files import photo_vectors, scene_with
 from tests.tiny_scene import SPLATS_A_CLUSTER
 
 COUNT = 3 * SPLATS_A_CLUSTER
@@ -27,24 +31,17 @@ def table() -> TableEncoder:
     return TableEncoder.open(LVIS_TABLE)
 
 
-@pytest.fixture
-def clip(scene: Scene, table: TableEncoder) -> Scene:
+@pytest.fixture(scope="module")
+def clip() -> Scene:
     """Three clusters as photos of a cat, a boat and a pizza: cosine .29 to their own words, .22 to others."""
-    rng = np.random.default_rng(0)
-    words = np.repeat(table.encode(PRESENT_WORDS), SPLATS_A_CLUSTER, axis=0)
-    gap, noise = rng.normal(size=512), rng.normal(size=(COUNT, 512))
-    gap -= (
-        table.embeddings.mean(axis=0)
-        * (gap @ table.embeddings.mean(axis=0))
-        / np.square(table.embeddings.mean(axis=0)).sum()
-    )
-    rows = (
-        0.28 * words + 0.9 * gap / np.linalg.norm(gap) + 0.25 * noise / np.linalg.norm(noise, axis=1, keepdims=True)
-    )
-    ones = torch.ones(COUNT)
-    values = {"total_weight": ones, "has_feature": ones > 0}
-    lifted = replace(scene.lift, features=torch.from_numpy(rows.astype(np.float32)), **values)
-    return Scene(lifted, scene.splats, scene.cameras)
+    return scene_with(photo_vectors([word for word in PRESENT_WORDS for _ in range(SPLATS_A_CLUSTER)], 0.25))
+
+
+def test_an_absent_word_leaves_an_example_beside_it_and_has_no_splats(clip: Scene, table: TableEncoder) -> None:
+    answer, by_example = (ask(clip, Query.of(terms), table) for terms in ((SplatTerm(0), "sofa"), (SplatTerm(0),)))
+    assert np.array_equal(answer.selected, by_example.selected) and answer.count > 0 and answer.present is None
+    with pytest.raises(InvalidQuery, match="absent=keep"):
+        object_splats(clip, ask(clip, "sofa", table))
 
 
 def test_references_that_mean_the_same_hide_nothing(clip: Scene, table: TableEncoder) -> None:

@@ -130,6 +130,7 @@ def test_pictures_have_a_limit(scene: Scene, monkeypatch: pytest.MonkeyPatch) ->
 def test_colours_follow_the_spherical_harmonics() -> None:
     camera = look_at("v", np.array([0.0, 0.0, -3.0]), 8, 8, 8.0)
     splats = random_splats(0, 5)
+    assert torch.equal(view_colours(replace(splats, sh=None), camera), torch.full((5, 3), 0.6))
     grey = Splats(splats.means, splats.quats, splats.log_scales, splats.opacity_logits, sh=torch.zeros(5, 16, 3))
     assert torch.allclose(view_colours(grey, camera), torch.tensor(0.5))
     assert splats.sh is not None
@@ -175,6 +176,7 @@ def test_groups_get_distinct_colours_at_every_run() -> None:
     assert principal_colours(np.random.rand(10, 2), np.ones(10)).shape == (10, 3)  # of fewer than three channels
     assert not principal_colours(np.random.rand(10, 4), np.zeros(10)).any()  # and without weight
     colours = cluster_colours(24).astype(int)
+    assert colours[:3].tolist() == [[230, 128, 161], [90, 237, 212], [64, 123, 197]]
     distances = np.abs(colours[:, None] - colours[None]).max(axis=2)[~np.eye(25, dtype=bool)]
     assert distances.min() >= 16 and tuple(colours[-1]) == NO_CLUSTER_COLOUR
 

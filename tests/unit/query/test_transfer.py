@@ -58,17 +58,3 @@ def test_a_scene_that_stays_with_new_splats_added_is_not_moved(lifted: tuple[Lif
     moved_lift = result.transferred(splats, copy)
     assert moved_lift.diagnostics["transfer"]["without_partner"] == 15
     assert torch.equal(moved_lift.features[1::4], result.features[1::4])
-
-
-def test_another_scene_is_refused(lifted: tuple[LiftResult, Splats]) -> None:
-    result, splats = lifted
-    generator = np.random.default_rng(9)
-    other = Splats(
-        torch.from_numpy(generator.normal(size=(60, 3)).astype("f4")) + 100,
-        splats.quats,
-        splats.log_scales,
-        splats.opacity_logits,
-        sh=torch.from_numpy(generator.normal(size=(60, 1, 3)).astype("f4")),
-    )
-    with pytest.raises(InvalidSplats, match="give the matrix"):
-        result.transferred(splats, other)

@@ -9,14 +9,10 @@ import pytest
 import torch
 
 from liftcore.evaluate.inspect import inspect_file
-from liftcore.lifting.files import lift_files, open_files
-from liftcore.lifting.pipeline import plan
 from liftcore.scene.cameras import Camera
 from liftcore.solve.diagnostics import shape_warnings
 from liftcore.values.pack import read_features, write_pack
-from liftcore.values.settings import LiftSettings
 from liftcore.values.views import FeatureGrid, ViewFeatures
-from tests.scenes import write_scene
 
 
 def shape_warnings_of(tmp_path: Path, observation: ViewFeatures, size: tuple[int, int]) -> list[str]:
@@ -53,16 +49,6 @@ def test_maps_that_may_be_crops_or_have_another_shape_give_a_warning(
     if (cells, size) in CROPS:
         assert "1 of 1 views have maps of another aspect than their images" in warning
         assert "stretched the photos, or did pad or crop them" in warning
-
-
-def test_the_lift_and_its_plan_warn_of_a_crop(tmp_path: Path) -> None:
-    splats, cameras, _ = write_scene(tmp_path, 3)
-    pack, settings = tmp_path / "crops.safetensors", LiftSettings.of(diagnostic_rays=10)
-    write_pack(pack, {"v0": grid(23, 31), "v1": grid(23, 23), "v2": grid(23, 23)}, {"encoder": "e"})
-    [planned_for] = plan(*open_files(splats, cameras, [pack], settings), settings).input_warnings
-    assert planned_for.startswith("2 of 3 views have maps of another aspect than their images (v1: 23x23 for 37x27)")
-    warnings = lift_files(splats, cameras, [pack], settings).metadata.diagnostics["warnings"]
-    assert warnings.count(planned_for) == 1
 
 
 def test_the_pack_warns_of_channels_that_come_first(tmp_path: Path) -> None:

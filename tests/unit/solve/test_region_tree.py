@@ -82,12 +82,6 @@ def test_objects_and_their_parts_are_nodes_with_a_third_of_the_masks_wrong(seed:
         assert nodes[node].sum() and not (nodes[node] & ~nodes[parents[node]]).any()
 
 
-def test_parts_that_half_of_the_views_show_are_found() -> None:
-    W, levels, _ = three_levels(0, wrong=0.1, parts_in=0.5)
-    objects = region_objects(W, levels, np.ones(SPLATS))
-    assert mean_iou(members(objects), PART) > 0.8
-
-
 def test_masks_of_a_part_and_of_what_lies_behind_it_hold_it_together() -> None:
     half = np.arange(SPLATS) < 10  # of the first part, at which three of eight views cut it
     cut, merged = np.where(half, 12, PART), np.where(PART == 0, 3, PART)  # part 3 is of another thing
