@@ -54,10 +54,10 @@ class Backend:
         return run
 
 
-CPU = Backend("cpu", lambda splats: CpuRaster(splats, threads=2), examples=20, seeds=30)
+CPU = Backend("cpu", lambda splats: CpuRaster(splats, threads=2), examples=30, seeds=30)
 GPU = Backend("gpu", gpu_raster, 20, 30)
 if not torch.cuda.is_available():  # small scenes for the interpreter
-    GPU = Backend("gpu", gpu_raster, examples=4, seeds=1, splats=24, size=(20, 18), rays=12)
+    GPU = Backend("gpu", gpu_raster, examples=6, seeds=1, splats=24, size=(20, 18), rays=12)
 # Where the lock has triton, to be without it is a failure.
 locked = (sys.platform, platform.machine()) == ("linux", "x86_64")
 needs_triton = pytest.mark.skipif(
