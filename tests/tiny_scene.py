@@ -20,7 +20,6 @@ WORDS = ("apple", "book", "lamp")
 CHANNELS = 8
 SPLATS_A_CLUSTER = 20
 WIDTH, HEIGHT, FOCAL, DISTANCE = 32, 24, 30.0, 4.0
-POSE = [[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]  # of "middle", in OpenCV's axes
 VIEWS = {"left": -0.1, "middle": 0.0, "right": 0.1}  # name -> the camera's x
 PROPERTIES = [
     *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),

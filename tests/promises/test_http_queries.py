@@ -12,9 +12,7 @@ import pytest
 
 from tests.tiny_scene import (
     CHANNELS,
-    FOCAL,
     HEIGHT,
-    POSE,
     SPLATS_A_CLUSTER,
     WIDTH,
     WORDS,
@@ -102,27 +100,6 @@ def test_vector_is_posted_and_so_is_all_that_belongs_to_it(client: httpx.Client,
         assert_problem(client.post("/query", json=body | {"like": [wrong]}), 422)
 
 
-@pytest.mark.parametrize(
-    "fields",
-    [
-        {"text": ["apple"]},
-        {"text": ["apple"], "negatives": ["book"], "threshold": 0.5},
-        {"text": ["apple"], "like": ["middle:26,12"], "top": 3, "view": "left"},
-        {"like": ["splat:1"], "unlike": ["splat:30"], "threshold": 0.25},
-        {"sets": ["object:0", "object:1"]},
-        {"text": ["zeppelin"]},
-        {"like": ["behind:1,1"]},
-    ],
-    ids=str,
-)
-def test_get_and_post_are_one_question(client: httpx.Client, lift: dict[str, Any], fields: dict[str, Any]) -> None:
-    fields = fields | {"lift": lift["id"]}
-    by_get, by_post = client.get("/query", params=fields), client.post("/query", json=fields)
-    assert by_get.status_code == by_post.status_code
-    documents = [reply.json() | {"request_id": None} for reply in (by_get, by_post)]
-    assert documents[0] == documents[1]
-
-
 def test_negatives_and_thresholds_change_the_selection(client: httpx.Client, lift: dict[str, Any]) -> None:
     pair = ask(client, lift, text="apple", like="middle:26,12", threshold=0.5)
     assert pair["count"] > 1.5 * SPLATS_A_CLUSTER
@@ -154,16 +131,6 @@ def test_nothing_selected_is_said_and_has_no_splats(client: httpx.Client, lift: 
     assert "object" not in answer["links"]
     problem = assert_problem(client.get("/query/splats", params=fields), 422)
     assert "threshold" in problem["hint"]
-
-
-def test_camera_of_a_body_sees_what_a_view_sees(client: httpx.Client, lift: dict[str, Any]) -> None:
-    camera = {"width": WIDTH, "height": HEIGHT, "fx": FOCAL, "viewmat": POSE}
-    body = {"lift": lift["id"], "text": ["lamp"]}
-    for path in ("/query/mask", "/query/attention"):
-        by_camera, by_view = (
-            client.post(path, json=body | view_reply) for view_reply in ({"camera": camera}, {"view": "middle"})
-        )
-        assert (picture(by_camera.content) == picture(by_view.content)).all()
 
 
 WRONG: dict[str, tuple[str, dict[str, Any], int, str]] = {
@@ -239,32 +206,6 @@ def test_table_of_an_order_has_the_words_of_its_lift(client: httpx.Client, order
     delete_lift(client, other["id"])
     if reply.status_code != 202:
         assert client.delete(f"/assets/{narrow}").status_code == 204
-
-
-def test_every_splat_has_its_word(client: httpx.Client, lift: dict[str, Any], table: str) -> None:
-    body = {"lift": lift["id"], "table": table, "view": "middle"}
-    answer = client.post("/query/segment", json=body).json()
-    values = {entry["word"]: entry["value"] for entry in answer["named_words"]}
-    assert set(values) == {"fruit", "novel", "light"}
-    labels = array(client.post("/query/segment/labels", json=body).content)
-    assert (labels.dtype, (labels == 0).sum()) == (np.int32, answer["none"])
-    for place, word in enumerate(("fruit", "novel", "light")):
-        rows = labels[place * SPLATS_A_CLUSTER : (place + 1) * SPLATS_A_CLUSTER]
-        assert set(rows.tolist()) - {0} == {values[word]}
-    label_map = picture(client.post("/query/segment/map", json=body).content)
-    assert label_map.shape == (HEIGHT, WIDTH)
-    assert [label_map[HEIGHT // 2, column] for column in COLUMNS.values()] == [values[word] for word in
-        ("fruit", "novel", "light")]  # fmt: skip
-    for wrong in ({"words": []}, {"words": ["lamp", "lamp"]}, {"words": ["zeppelin"]}):
-        assert_problem(client.post("/query/segment", json={"lift": lift["id"]} | wrong), 422)
-
-
-@pytest.mark.parametrize("word", WORDS)
-def test_example_is_named_by_its_nearest_words(client: httpx.Client, lift: dict[str, Any], word: str) -> None:
-    for example in (f"middle:{COLUMNS[word]},12", f"splat:{SPLATS_A_CLUSTER * PLACES[word]}"):
-        body = {"lift": lift["id"], "example": example, "top": 2}
-        best = client.post("/query/what", json=body).json()["words"]
-        assert best[0]["word"] == word and best[0]["score"] > best[1]["score"]
 
 
 def test_answer_from_the_cache_is_the_answer(client: httpx.Client, lift: dict[str, Any]) -> None:
