@@ -17,8 +17,7 @@ import liftcore as lc
 import numpy as np
 import pytest
 import torch
-from liftcore import evaluate, files
-from safetensors.numpy import load_file
+from liftcore import files
 from scipy.spatial.transform import Rotation
 
 from tests import tiny_scene
@@ -193,10 +192,6 @@ def test_pack_has_the_views_that_were_written(tmp_path: Path) -> None:
     assert list(copies) == ["a", "folder/b"] and isinstance(regions, lc.Regions) and isinstance(grid, lc.FeatureGrid)
     assert torch.equal(regions.labels, views["a"].labels) and torch.equal(regions.codebook, views["a"].codebook)
     assert torch.equal(grid.grid, views["folder/b"].grid)
-    lc.retag_pack(tmp_path / "pack.safetensors", tmp_path / "named.safetensors", {"text_space": "words"})
-    assert lc.read_features(tmp_path / "named.safetensors").text_space == "words"
-    before, after = (load_file(tmp_path / f"{name}.safetensors") for name in ("pack", "named"))
-    assert before.keys() == after.keys() and all(np.array_equal(before[name], after[name]) for name in before)
 
 
 MASKS = np.zeros((3, 6, 8), bool)
@@ -227,26 +222,6 @@ def test_masks_of_every_kind_become_regions_that_cover_them(kind: str, tmp_path:
     np.testing.assert_array_equal((view.labels[0] == largest).numpy(), masks[largest], "the largest comes first")
     from_masks = lc.Regions.from_masks(list(masks), VECTORS)
     assert torch.equal(from_masks.labels, view.labels)
-
-
-@pytest.mark.parametrize("layout", ["hwc", "chw"])
-def test_maps_of_either_layout_are_packed_as_grids(layout: Any, tmp_path: Path) -> None:
-    feature_map = np.random.default_rng(0).normal(size=(5, 7, CHANNELS)).astype(np.float32)
-    (tmp_path / "maps").mkdir()
-    stored = feature_map if layout == "hwc" else feature_map.transpose(2, 0, 1)
-    np.save(tmp_path / "maps" / "a.npy", stored)
-    lc.pack_folder(tmp_path / "maps", tmp_path / "pack.safetensors", "npy", layout=layout, progress=False)
-    view = lc.read_features(tmp_path / "pack.safetensors")["a"]
-    assert isinstance(view, lc.FeatureGrid)
-    np.testing.assert_array_equal(view.grid.numpy(), feature_map)
-
-
-def test_text_table_encodes_its_words_to_their_rows(tmp_path: Path) -> None:
-    rows = np.random.default_rng(0).normal(size=(3, 8)).astype(np.float32)
-    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-    (tmp_path / "table").write_bytes(tiny_scene.text_table(rows=rows))
-    encoder = lc.open_encoder(f"table:{tmp_path / 'table'}")
-    np.testing.assert_allclose(np.asarray(encoder.encode(["lamp", "apple"])), rows[[2, 0]], atol=1e-6)
 
 
 POSES = {  # name of the photo -> quaternion w x y z and translation, from the world to the camera
@@ -408,14 +383,3 @@ def test_colours_turn_with_their_splats() -> None:
     gradients = [-sh[:, [3, 1, 2]].numpy() * np.array([1, 1, -1])[:, None] for sh in (splats.sh, moved_splats.sh)]
     np.testing.assert_allclose(gradients[1], np.einsum("ij,njc->nic", rotation, gradients[0]), atol=1e-5)
     np.testing.assert_allclose(moved_splats.means.numpy(), splats.means.numpy() @ rotation.T, atol=1e-5)
-
-
-def test_inspected_files_are_of_the_kinds_that_were_written(tmp_path: Path) -> None:
-    scene = random_scene()
-    result = lc.lift(*scene.arguments(), preset="row-sum", progress=False)
-    result.save_scene(tmp_path, scene.splats, scene.cameras)
-    write_pack(tmp_path / "pack.safetensors", scene.views)
-    (tmp_path / "table.safetensors").write_bytes(tiny_scene.text_table())
-    kinds = {"splats.ply": "splats", "cameras.json": "cameras", "lift.safetensors": "lift"}
-    for name, kind in {**kinds, "pack.safetensors": "features", "table.safetensors": "table"}.items():
-        assert evaluate.inspect_file(tmp_path / name)["kind"] == kind
