@@ -100,17 +100,6 @@ def test_vector_is_posted_and_so_is_all_that_belongs_to_it(client: httpx.Client,
         assert_problem(client.post("/query", json=body | {"like": [wrong]}), 422)
 
 
-def test_negatives_and_thresholds_change_the_selection(client: httpx.Client, lift: dict[str, Any]) -> None:
-    pair = ask(client, lift, text="apple", like="middle:26,12", threshold=0.5)
-    assert pair["count"] > 1.5 * SPLATS_A_CLUSTER
-    assert is_of(ask(client, lift, text="apple", negatives="lamp", threshold=0.5), "apple")
-    counts = [ask(client, lift, text="lamp", threshold=value)["count"] for value in (-1, 0.5, 1.0)]
-    assert counts[0] == 60 and counts == sorted(counts, reverse=True)
-    for method in ("auto", "paper"):
-        assert ask(client, lift, text="lamp", threshold=method)["threshold"]["method"] == method
-    assert len(ask(client, lift, text="lamp", top=3)["top"]) == 3
-
-
 def test_newest_lift_answers_where_none_is_named(client: httpx.Client, order: dict[str, Any]) -> None:
     newest = lift_of(client, order | {"settings": {"objects": True}})
     answer = client.get("/query", params={"text": "lamp"}).json()
