@@ -158,7 +158,6 @@ def view_of(
     scene: Scene,
     claim: Callable[[np.ndarray], bool] = always,
     like: Scene | None = None,
-    of: Callable[[np.ndarray], np.ndarray] = np.asarray,
     **options: Any,
 ) -> Extreme:
     """An extreme whose weights are held to the oracle.
@@ -166,7 +165,7 @@ def view_of(
     Args:
         name: of the row. scene: the view, for a kernel.
         claim: what exact arithmetic says of A [H * W, P], of the oracle's and of the float32 raster's.
-        like: another view that has the same A, or the same as ``of`` gives of it.
+        like: another view that has the same A.
         options: kernels, bound and text of the Extreme.
     """
 
@@ -175,7 +174,7 @@ def view_of(
         got = compare(view.splats, view.camera, view.params)
         pair = got.A, got.got
         exact = exact_weights(like(kernel)) if like else None
-        is_equal = exact is None or all(float(np.abs(of(A) - exact).max()) < WEIGHTS for A in pair)
+        is_equal = exact is None or all(float(np.abs(A - exact).max()) < WEIGHTS for A in pair)
         holds = got.finite and is_equal and all(claim(A) for A in pair)
         return Outcome(got.error, messages_of(view.splats, view.camera), holds)
 

@@ -72,11 +72,6 @@ OPACITIES: tuple[Extreme, ...] = (
         bound=1e-12),
     view_of("every splat opaque (logits of 1e4)", at(MIDDLE * 6, logits=OPAQUE),
         lambda A: (A > 0.5).sum(axis=1).max() == 1 and A[CENTRE, 1:].max() <= 0.0099 + 1e-6),
-    view_of("forty opaque splats without a stop", at(MIDDLE * 40, logits=OPAQUE, params=ENDLESS),
-        lambda A: A.sum(axis=1).max() <= 1 + 1e-6),
-    view_of("the gain lambda at 0.01",
-        at(ROW, logits=[5.0, -5.0, 1.0, 0.0, -1.0], params=lc.CompositingParams(opacity_logit_scale=0.01)),
-        lambda A: 0.3 < A[:, 1].max() < 0.6),
 
     view_of("a cap of 0.9999999", at(MIDDLE * 3, logits=OPAQUE, params=replace(ENDLESS, alpha_cap=0.9999999)),
         lambda A: A[CENTRE, 0] > 0.999999),
@@ -107,8 +102,6 @@ SHAPES: tuple[Extreme, ...] = (
 
     view_of("dust under the mip filter's compensation", at(ROW, DUST, params=lc.CompositingParams(antialiased=True)),
         lambda A: A.max() == 0, kernels=GAUSSIAN, text="smaller than 1e-07 scene units"),
-    # A cylinder.
-
     # Weight on the ray through the middle only.
     view_of("DBS: b of +30", at(MIDDLE, -0.5, betas=30.0), lambda A: (A > 0).sum() == 1, kernels=BETA),
 )
@@ -166,10 +159,6 @@ PLACES: tuple[Extreme, ...] = (
     view_of("splats on the near plane, a rounding before it, at the camera and behind",
         at([(0.0, 0.0, z) for z in (ON_NEAR_PLANE, math.nextafter(0.01, 0), 0.0, -0.01, -5.0)], -4.0),
         lambda A: A[:, 0].max() > 0 and A[:, 1:].max() == 0),
-    view_of("a camera inside splats", at([(0.0, 0.0, 0.05), (0.02, 0.01, 0.3), (0.0, 0.0, 3.0)], [0.5, 0.0, -0.5]),
-        _visible),
-    view_of("two hundred identical splats", at(MIDDLE * 200, logits=-3.0),
-        lambda A: bool((np.diff(A[CENTRE, :150]) < 0).all())),
 
     Extreme("a million splats on one ray", _crowd(-5.0), kernels=FLOORED),
     Extreme("a million DBS splats of alpha 1e-6 on one ray", _crowd(math.log(1e-6)), kernels=BETA, bound=1e-4),
@@ -177,27 +166,9 @@ PLACES: tuple[Extreme, ...] = (
 # fmt: on
 
 
-def _rolled(angle: float) -> Scene:
-    """A camera that is turned about its axis."""
-    pose = np.eye(4)
-    c, s = math.cos(angle), math.sin(angle)
-    pose[:2, :2] = [[c, -s], [s, c]]
-    return at(ROW, -1.0, camera=_pinhole(15, 15, 16.0, (7.5, 7.5), pose))
-
-
-def _looking_back() -> lc.Camera:
-    """Beyond the splats, upside down."""
-    pose = np.diag([1.0, -1.0, -1.0, 1.0])
-    pose[2, 3] = 5.0
-    return _pinhole(16, 12, 16.0, (8.5, 6.5), pose)
-
-
 # fmt: off
 VIEWS: tuple[Extreme, ...] = (
-    *(
-        view_of(f"an image of {width} x {height}", at(ROW, -1.0, camera=camera_at_origin(width, height)), _visible)
-        for width, height in ((1, 1), (17, 33))
-    ),
+    view_of("an image of 1 x 1", at(ROW, -1.0, camera=camera_at_origin(1, 1)), _visible),
     view_of(f"an image of {MAX_SIDE} x 3, the widest allowed",
         at([(0.3 * k - 0.6, 0.0, 2.0) for k in range(5)],
             camera=_pinhole(MAX_SIDE, 3, 3_000.0, (MAX_SIDE / 2, 1.5), np.eye(4))),
@@ -209,16 +180,7 @@ VIEWS: tuple[Extreme, ...] = (
     view_of("a principal point 1e6 px outside the image",
         at([*ROW, (-2e6 / 16 + 1.0, 0.0, 2.0)], 0.5, camera=_pinhole(16, 12, 16.0, (1e6, 6.5), np.eye(4))),
         lambda A: A[:, 5].max() > 0.1, text="principal point far off the centre"),
-    view_of("a camera rolled by a right angle", _rolled(math.pi / 2), like=_rolled(0.0),
-        of=lambda A: np.rot90(A.reshape(15, 15, -1)).reshape(225, -1)),
 
-    # It meets the last splat first, and so alone.
-    view_of("a camera upside down, looking back", at(ROW, -1.0, camera=_looking_back()),
-        like=at(ROW[-1:], -1.0, camera=_looking_back()), of=lambda A: A[:, -1:]),
-    view_of("a view that sees nothing: all behind, or far aside", at([(0.0, 0.0, -2.0), (1e6, 0.0, 1.0)]),
-        lambda A: A.max() == 0),
-    # Faint dust on the middle of a pixel: its neighbours' alphas are below the floor.
-    view_of("a splat on one ray only", at(MIDDLE, -12.0, logits=-5.0), lambda A: (A > 0).sum() == 1, kernels=FLOORED),
 
 )
 # fmt: on
@@ -313,12 +275,6 @@ def checkerboard(
     return lc.Regions(labels, torch.tensor(vectors / np.abs(vectors).max() * scale).to(dtype))
 
 
-def _zero_row() -> lc.Regions:
-    observation = checkerboard(3)
-    observation.codebook[1] = 0
-    return observation
-
-
 def _labelled(labels: np.ndarray, rows: int) -> lc.Regions:
     """Labels [h, w] over random vectors."""
     vectors = np.random.default_rng(rows).uniform(-1, 1, (rows, 4))
@@ -327,12 +283,6 @@ def _labelled(labels: np.ndarray, rows: int) -> lc.Regions:
 
 def _region_a_pixel() -> lc.Regions:
     return _labelled(np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH), HEIGHT * WIDTH)
-
-
-def _one_pixel(label: int = 1, rows: int = 4) -> lc.Regions:
-    labels = np.full((HEIGHT, WIDTH), -1)
-    labels[6, 8] = label
-    return _labelled(labels, rows)
 
 
 def _cancelling() -> lc.Regions:
@@ -349,7 +299,7 @@ def _random_grid(rows: int, columns: int) -> lc.FeatureGrid:
 
 # fmt: off
 LENGTHS: tuple[Extreme, ...] = (
-    *(lift_of(f"F = {channels}", checkerboard(channels=channels)) for channels in (1, 33)),
+    lift_of("F = 1", checkerboard(channels=1)),
     lift_of("F = 8192", checkerboard(channels=8_192), kernels=GAUSSIAN),
     *(
         lift_of(
@@ -366,12 +316,10 @@ LENGTHS: tuple[Extreme, ...] = (
             (65_504.0, torch.float32, torch.float16),
             (70_000.0, torch.float32, torch.float32),
 
-            (1e-4, torch.float16, torch.float32),
             (1e-30, torch.float32, torch.float32),
         )
     ),
 
-    lift_of("a zero row in the codebook", _zero_row(), text="codebook rows are zero"),
     lift_of("a codebook of zeros", lc.Regions(checkerboard(3).labels, torch.zeros(3, 7)),
         lambda lift: not lift.features.any(), bound=0.0, text="codebook rows are zero"),
     lift_of("vectors that cancel: +1e4 and -9990 in turn", _cancelling()),
@@ -380,9 +328,6 @@ LENGTHS: tuple[Extreme, ...] = (
 
 # fmt: off
 MAPS: tuple[Extreme, ...] = (
-    lift_of("a mask of one pixel", _one_pixel()),
-    lift_of("one label on the whole image", _labelled(np.zeros((HEIGHT, WIDTH)), 1),
-        lambda lift: bool((lift.features[lift.has_feature] - lift.features[lift.has_feature][0]).abs().max() < 1e-6)),
 
     lift_of("a region a pixel", _region_a_pixel()),
     lift_of("labels of 32,766 and 32,767, the last of int16",
@@ -404,10 +349,7 @@ MAPS: tuple[Extreme, ...] = (
 
 
     lift_of("a grid finer than the pixels", _random_grid(50, 70)),
-    *(
-        lift_of(f"squared weights and a gain of {gain:g}", checkerboard(), settings={"power": 2, "gain": gain})
-        for gain in (0.01, 16.0)
-    ),
+    lift_of("squared weights and a gain of 16", checkerboard(), settings={"power": 2, "gain": 16.0}),
     lift_of("weights of 1e-20, squared (DBS)", checkerboard(), lambda lift: float(lift.total_weight[0]) < 1e-15,
         splats=splats_at([(0.0, 0.0, 0.0)], 0.0, logits=-46.0, kernel=Kernel.BETA), settings={"power": 2},
         text="where float32 loses digits", kernels=BETA),

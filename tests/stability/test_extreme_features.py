@@ -14,7 +14,7 @@ def lifted(views, splats=None, **settings):
     return run(views, splats or cloud(), **{"preset": "tikhonov", **settings})[0]
 
 
-@pytest.mark.parametrize("scale", [1e-30, 1e-7, 1e15])
+@pytest.mark.parametrize("scale", [1e-30, 1e15])
 def test_diagnostics_and_scores_are_the_same_at_any_length(scale):
     views = [{f"v{k}": checkerboard(5 + k, 40, size) for k in range(2)} for size in (1.0, scale)]
     first, second = (lifted(observations, preset="row-sum", reference_channels=4) for observations in views)
