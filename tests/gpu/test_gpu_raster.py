@@ -15,7 +15,6 @@ from liftcore.errors import Unavailable
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.gpu.tiles import Frame
 from liftcore.scene.compositing import CompositingParams, Weighting
-from liftcore.scene.splats import Kernel
 from liftcore.values.region_weights import RegionWeights
 from tests.backends import gpu_raster, needs_triton
 from tests.scenes import random_camera, random_grid, random_regions, random_splats
@@ -35,32 +34,25 @@ def as_parts(weights: RegionWeights) -> list[torch.Tensor]:
     return list(weights.tensors().values())
 
 
-def top_two(raster: GpuRaster, camera: Camera) -> list[torch.Tensor]:
-    """Return top-2 region weights, which take two passes, of a scene of 16 splats."""
-    choice = Weighting(1, top_k=2)
-    return as_parts(raster.region_weights(camera, random_grid(8), PARAMS, choice))
-
-
 def every_product(raster: GpuRaster, camera: Camera) -> list[torch.Tensor]:
-    """Return one of each product."""
+    """Return one of each product, of a scene of 16 splats; weights of the top two take two passes."""
     pixels = torch.tensor([[16, 35], [0, 0], [10, 20], [1, 0]], dtype=torch.int32)
     rows = raster.ray_rows(camera, pixels, PARAMS)
     return [
-        *top_two(raster, camera), *as_parts(raster.region_weights(camera, random_regions(8), PARAMS, Weighting(2))),
+        *as_parts(raster.region_weights(camera, random_grid(8), PARAMS, Weighting(1, top_k=2))),
+        *as_parts(raster.region_weights(camera, random_regions(8), PARAMS, Weighting(2))),
         rows.indptr, rows.splats, rows.weights,
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("kernel", [Kernel.GAUSSIAN_3D, Kernel.GAUSSIAN_2D])
-def test_no_bit_depends_on_the_size_of_blocks(monkeypatch, kernel):
+def test_no_bit_depends_on_the_size_of_blocks(monkeypatch):
     """Blocks of splats, bands of tile rows, runs of tiles and parts of sums, all as small as they go."""
-    splats, camera = random_splats(8, 16, kernel=kernel), random_camera(8, 17, 36)
-    products = every_product if kernel is Kernel.GAUSSIAN_3D else top_two
+    splats, camera = random_splats(8, 16), random_camera(8, 17, 36)
     monkeypatch.setattr("liftcore.raster.gpu.tiles.UNIT", 1)
     monkeypatch.setattr("liftcore.raster.gpu.weights.RUN", 3)
-    expected = products(gpu_raster(splats), camera)
+    expected = every_product(gpu_raster(splats), camera)
     tight = gpu_raster(splats, block=1)
-    for first, second in zip(expected, products(tight, camera), strict=True):
+    for first, second in zip(expected, every_product(tight, camera), strict=True):
         assert first.numel() and torch.equal(first, second)
     frame = tight._frame(camera, PARAMS)
     assert frame.bands == [(0, 1), (1, 2), (2, 3)]
@@ -70,7 +62,7 @@ def test_no_bit_depends_on_the_size_of_blocks(monkeypatch, kernel):
 def test_memory_that_runs_out_halves_the_block(monkeypatch):
     """On a GPU with less free memory than a block needs, smaller blocks give the same result."""
     splats, camera = random_splats(8, 24), random_camera(8, 20, 36)
-    expected = top_two(gpu_raster(splats), camera)
+    expected = every_product(gpu_raster(splats), camera)
     tries = []
 
     def crowded(*arguments: Any) -> Frame:
@@ -80,7 +72,7 @@ def test_memory_that_runs_out_halves_the_block(monkeypatch):
         return Frame(*arguments)
 
     monkeypatch.setattr("liftcore.raster.gpu.raster.Frame", crowded)
-    for first, second in zip(expected, top_two(gpu_raster(splats, block=1 << 20), camera), strict=True):
+    for first, second in zip(expected, every_product(gpu_raster(splats, block=1 << 20), camera), strict=True):
         assert torch.equal(first, second)
     assert tries == [1 << 20, 1 << 19, 1 << 18]
 
@@ -120,19 +112,18 @@ def test_more_levels_than_one_key_holds_are_distinguished():
     assert torch.allclose(actual.weight, expected.weight, rtol=1e-4)
 
 
-@pytest.mark.parametrize("error", [torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB."), FULL])
-def test_memory_that_runs_out_for_good_is_an_error_in_words(monkeypatch, error):
+def test_memory_that_runs_out_for_good_is_an_error_in_words(monkeypatch):
     def full(*_arguments: object) -> None:
-        raise error
+        raise FULL
 
     raster = gpu_raster(random_splats(0, 4))
     monkeypatch.setattr("liftcore.raster.gpu.raster.Frame", full)
     with pytest.raises(Unavailable, match="projected splats and tile lists of a view") as raised:
-        top_two(raster, random_camera(0))
-    assert raised.value.got == str(error) and raised.value.hint
+        every_product(raster, random_camera(0))
+    assert raised.value.got == str(FULL) and raised.value.hint
     monkeypatch.setattr("liftcore.raster.gpu.raster.Frame", lambda *_: broken())
     with pytest.raises(RuntimeError, match="illegal"):  # an error that is no lack of memory is not reported as one
-        top_two(raster, random_camera(0))
+        every_product(raster, random_camera(0))
 
 
 def broken() -> None:
