@@ -1,19 +1,14 @@
 """The service against its own OpenAPI document: schemathesis calls every operation over real sockets.
 
-    python -m tests.contract [--examples N] [--phases PHASE ...] [--keys without|with]
-
 The server is `splatlift serve` with a lift of the tiny scene.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
 import sys
-import tempfile
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -25,7 +20,6 @@ CHECKS = (
     "response_headers_conformance", "negative_data_rejection", "missing_required_header", "unsupported_method",
     "allow_header_conformance", "use_after_free", "ensure_resource_availability", "ignored_auth",
 )  # fmt: skip
-PHASES = ("examples", "coverage", "fuzzing", "stateful")
 # What breaks the schema by its length may break the limit of a body first.
 REFUSALS = """[checks.negative_data_rejection]
 expected-statuses = [400, 401, 403, 404, 405, 406, 409, 412, 413, 415, 422, 428, 429]
@@ -40,25 +34,20 @@ def filter_query(context, query):
 SECONDS = 1500.0  # that schemathesis may take; a busy machine needs more
 
 
-def failures_of(folder: Path, *, examples: int, phases: Sequence[str], keys: bool, seconds: float = SECONDS) -> str:
+def failures_of(folder: Path, *, examples: int, phases: Sequence[str]) -> str:
     """Return the failures that schemathesis reports; empty if there are none. The same seed makes the same calls.
 
     Args:
         folder: for the data of the server.
         examples: of each operation and phase.
-        phases: of schemathesis; those of `coverage` are as many as the schema has corners.
-        keys: True where the server has a key, which schemathesis sends.
-        seconds: that it may take.
+        phases: of schemathesis.
     """
     scene, table = make_scene(), folder / "table.safetensors"
     table.write_bytes(scene.table)
     with Server(folder / "data", encoder=f"table:{table}") as server:
-        headers = []
-        if keys:
-            options = ("--name", "contract", "--scopes", "read,write", "--json")
-            secret = json.loads(run_command("keys", "create", *options, data=server.data))["key"]
-            server.client.headers["Authorization"] = f"Bearer {secret}"
-            headers = ["--header", f"Authorization: Bearer {secret}"]
+        options = ("--name", "contract", "--scopes", "read,write", "--json")
+        secret = json.loads(run_command("keys", "create", *options, data=server.data))["key"]
+        server.client.headers["Authorization"] = f"Bearer {secret}"
         ids = [
             server.client.put(f"/assets/{kind}", content=getattr(scene, kind)).json()["id"]
             for kind in ("splats", "cameras", "features")
@@ -72,38 +61,13 @@ def failures_of(folder: Path, *, examples: int, phases: Sequence[str], keys: boo
             str(server.client.base_url.join("/openapi.json")),
             "--no-color", "--checks", ",".join(CHECKS), "--phases", ",".join(phases), "--max-examples", str(examples),
             "--seed", "1", "--generation-deterministic", "--continue-on-failure", "--no-shrink",
-            "--suppress-health-check", "all", "--warnings", "off", "--request-timeout", "300", *headers,
+            "--suppress-health-check", "all", "--warnings", "off", "--request-timeout", "300",
+            "--header", f"Authorization: Bearer {secret}",
         ]  # fmt: skip
         (folder / "schemathesis.toml").write_text(REFUSALS)
         (folder / "hooks.py").write_text(HOOKS)
         hooked = os.environ | {"SCHEMATHESIS_HOOKS": "hooks", "PYTHONPATH": str(folder)}
         process = subprocess.run(
-            command, cwd=folder, env=hooked, capture_output=True, text=True, timeout=seconds, check=False
+            command, cwd=folder, env=hooked, capture_output=True, text=True, timeout=SECONDS, check=False
         )
     return "" if process.returncode == 0 else f"{process.stdout}\n{process.stderr}"
-
-
-def main() -> int:
-    """The long form, without keys and with them; 1 when something does not conform."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--examples", type=int, default=30, help="of each operation and phase")
-    parser.add_argument("--phases", nargs="+", choices=PHASES, default=PHASES, help="of schemathesis")
-    parser.add_argument("--keys", nargs="+", choices=("without", "with"), default=("without", "with"))
-    parser.add_argument("--seconds", type=float, default=SECONDS, help="that either may take")
-    options = parser.parse_args()
-    wrong = False
-    for keys in options.keys:
-        with tempfile.TemporaryDirectory() as folder:
-            start = time.monotonic()
-            failures = failures_of(
-                Path(folder), examples=options.examples, phases=options.phases, keys=keys == "with",
-                seconds=options.seconds,
-            )  # fmt: skip
-        wrong = wrong or bool(failures)
-        head = f"--- {keys} keys, {time.monotonic() - start:.0f} s ---"
-        print(head, failures or "everything conforms", sep="\n", flush=True)
-    return int(wrong)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
