@@ -27,7 +27,7 @@ NOBODY = Owner("-")  # the id of no key: it owns nothing
 SCOPES = ("read", "write", "admin")  # that an operator gives; admin: both, on the records of all owners
 BEARER = re.compile(r"bearer +([A-Za-z0-9._~+/-]+=*)", re.ASCII | re.IGNORECASE)  # RFC 6750, 2.1
 # Routes without a key: they reveal nothing about anyone's data. The page asks for a key itself.
-OPEN = re.compile(r"GET /(web/.+|healthz|readyz|version|openapi\.json|docs(/[^/]+)?)?")
+OPEN = re.compile(r"GET /(web/.+|healthz|readyz|openapi\.json|docs(/[^/]+)?)?")
 READS = re.compile(r"(GET|HEAD) .*|POST /(query(/.*)?|render)")  # a question may have a body
 SHARED = re.compile(r"/key|/lifts(/[^/]+(/(?!shares(/|$)).*)?)?|/query(/.*)?|/render")  # for keys with shared lifts
 UPLOAD = re.compile(r"PUT /assets/.*|POST /lifts")  # whose limit is a setting

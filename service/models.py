@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, computed_field
 from pydantic_core import PydanticCustomError
 
-from liftcore import Answer, CoveringRegion, LiftSettings, Objects, Picture, Query, SceneObject, WorldFrame
+from liftcore import Answer, LiftSettings, Objects, Picture, Query, SceneObject, WorldFrame
 from liftcore.errors import InvalidSettings
 from liftcore.models import (
     NOTATIONS,
@@ -480,28 +480,14 @@ class ObjectsAnswer(SelectionSummary, Objects, OfLift):
     """The objects of an answer."""
 
 
-class CoveringRegions(OfLift):
-    """The regions that cover a pixel."""
-
-    view: str
-    regions: list[CoveringRegion] = Field(description="one a level at most, the smallest first")
-
-
 class NodesRequest(BaseModel):
-    """Nodes of a lift's tree to list, and words to name them."""
+    """Objects, or nodes of a tree, to list, and words to name them."""
 
     model_config = ConfigDict(extra="forbid")
     table: AssetId | None = Field(None, description="an uploaded text table: its words name the objects")
     encoder: EncoderName | None = Field(None, description="a text space with a table, the lift's own, or default")
     limit: int = Field(100, ge=1, le=PAGE, description="number of items to list")
     cursor: int = Field(0, ge=0, le=10**9, description="the `next` of the page before")
-
-
-class SceneObjectsRequest(NodesRequest):
-    """Objects to list, and words to name them."""
-
-    features: bool = Field(False, description="true: with the mean feature of each")
-    splat: int | None = Field(None, ge=0, le=10**9, description="only the object of this splat, by its row")
 
 
 class LiftTree(SceneTree, OfLift):
@@ -592,21 +578,6 @@ class Selection(OfLift):
         question = f"lift={self.lift}&sets=selection:{self.id}"
         outputs = {name: f"/query/{name}?{question}" for name in ("splats", "selection")}
         return {"self": path, "edits": f"{path}/edits", "query": f"/query?{question}", **outputs}
-
-
-class SelectionStep(BaseModel):
-    """A step of a selection's history."""
-
-    number: int
-    edit: dict[str, Any] = Field(description="the edit of the step before, without bits")
-    count: int = Field(description="splats after it")
-
-
-class SelectionDetail(Selection):
-    """A selection with its history."""
-
-    history: list[SelectionStep] = Field(description="also the steps that were undone")
-    bits: str | None = Field(description="base64 of a bit a splat, the first the lowest of its byte, if requested")
 
 
 class Selections(BaseModel):

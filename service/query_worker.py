@@ -102,7 +102,6 @@ class Answers:
             "askable": self._askable,
             "catalogue": self._catalogue,
             "tree": self._tree,
-            "regions": self._regions,
         }
         self._values: dict[str, Callable[[Request], dict[str, Any]]] = {
             "views": self._views,
@@ -255,14 +254,10 @@ class Answers:
         catalogue = self._named_objects(request)
         count = len(catalogue.objects)
         first, last = request["first"], request["first"] + request["count"]
-        if request["splat"] is not None:  # the object of that splat alone; none if it has no object
-            numbers, splat = self._scene(request).object, request["splat"]
-            number = int(numbers[splat]) if numbers is not None and splat < len(numbers) else -1
-            first, last = max(number, 0), number + 1
         labels = request["object_labels"]
         objects = [
             item.model_dump(mode="json") | {"hidden": False} | _object_label(labels.get(str(item.id)))
-            for item in catalogue.iterate_objects(first, last, features=request["means"])
+            for item in catalogue.objects[first:last]
         ]
         world = {"world": catalogue.world.model_dump(mode="json"), "unit": catalogue.world.unit}
         following = last if last < count else None
@@ -272,10 +267,6 @@ class Answers:
         tree, first, last = self._named_tree(request), request["first"], request["first"] + request["count"]
         page = tree.model_copy(update={"nodes": tree.nodes[first:last]})
         return page.model_dump(mode="json") | {"next": last if last < tree.count else None}
-
-    def _regions(self, request: Request) -> dict[str, Any]:
-        regions = self._scene(request).regions(request["view"], request["x"], request["y"])
-        return {"regions": [region.model_dump(mode="json") for region in regions]}
 
     # Values for the HTTP process
 
@@ -299,7 +290,7 @@ class Answers:
         selection = _select(scene, EDITED, request["before"]).edit(edit, answer)
         box = None if selection.box is None else {"low": selection.box.low, "high": selection.box.high}
         bits = selection.bits.hex()
-        return {"edit": edit.to_json(), "count": int(selection.splats.sum()), "box": finite(box), "bits": bits}
+        return {"count": int(selection.splats.sum()), "box": finite(box), "bits": bits}
 
     def _count_objects(self, request: Request) -> dict[str, Any]:
         views = self._scene(request).object_views
@@ -315,8 +306,6 @@ class Answers:
             return self._export(request)
         if operation == "colours":
             return scene.blocks_of(scene.colours(request["what"]))
-        if operation == "region_mask":
-            return scene.blocks_of(scene.region_mask(request["view"], request["level"], request["region"]), "mask")
         if operation in WORD_FILES:
             return scene.blocks_of(self._segmentation(request), WORD_FILES[operation], view=view)
         if "query" in request:

@@ -12,7 +12,7 @@ from typing import Any
 
 from liftcore.errors import NotFound
 from service.errors import Conflict, InvalidRequest, VersionMismatch
-from service.models import ObjectLabel, Selection, SelectionDetail, SelectionStep
+from service.models import ObjectLabel, Selection
 from service.store import Owner, Store
 
 MOST_SELECTIONS, MOST_STEPS = 200, 100  # of a lift, of a selection's history
@@ -26,9 +26,8 @@ CURRENT = (
 
 @dataclass(frozen=True)
 class SplatSet:
-    """Splats of a selection after an edit, and the edit."""
+    """Splats of a selection after an edit."""
 
-    edit: dict[str, Any]
     count: int
     box: dict[str, Any] | None
     bits: bytes  # zlib of a bit for each splat, the lowest bit of a byte first
@@ -49,13 +48,6 @@ def get_selection(store: Store, lift: str, selection: str, versions: frozenset[i
         expected, hint = "the version that was seen", "GET it again"
         raise VersionMismatch("selection", expected=expected, got="a newer one", hint=hint)
     return Selection(**rows[0])
-
-
-def with_history(store: Store, selection: Selection, bits: str | None = None) -> SelectionDetail:
-    """Return a selection with the steps of its history, also those that were undone."""
-    select = "SELECT number, edit, count FROM steps WHERE selection = :id ORDER BY number"
-    steps = [SelectionStep(**row) for row in store.rows(select, id=selection.id)]
-    return SelectionDetail(**dict(selection), history=steps, bits=bits)
 
 
 def bits_of_selection(store: Store, selection: Selection) -> bytes:
@@ -117,8 +109,8 @@ def delete_selection(store: Store, lift: str, selection: str, versions: frozense
 
 def _add_step(connection: sqlite3.Connection, selection: str, number: int, splats: SplatSet) -> None:
     box = None if splats.box is None else json.dumps(splats.box)
-    row = (selection, number, json.dumps(splats.edit), splats.count, box, splats.bits)
-    connection.execute("INSERT INTO steps VALUES (?, ?, ?, ?, ?, ?)", row)
+    row = (selection, number, splats.count, box, splats.bits)
+    connection.execute("INSERT INTO steps VALUES (?, ?, ?, ?, ?)", row)
 
 
 def _update(connection: sqlite3.Connection, selection: str, **columns: Any) -> None:

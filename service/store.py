@@ -28,7 +28,7 @@ from service.errors import REQUEST_ID, Busy, Conflict, KeyReused, Misconfigured,
 from service.models import FINAL_STATES, Asset, Job, Key, Lift
 
 DATABASE = "service.sqlite"
-VERSION = 20  # SQLite's user_version
+VERSION = 21  # SQLite's user_version
 SCHEMA = """
 CREATE TABLE IF NOT EXISTS assets (
     id TEXT, owner TEXT, kind TEXT NOT NULL, bytes INTEGER NOT NULL, file TEXT NOT NULL,
@@ -60,7 +60,7 @@ CREATE TABLE IF NOT EXISTS selections (
 CREATE INDEX IF NOT EXISTS selections_of_lift ON selections (lift);
 CREATE TABLE IF NOT EXISTS steps (
     selection TEXT NOT NULL REFERENCES selections (id) ON DELETE CASCADE, number INTEGER NOT NULL,
-    edit TEXT NOT NULL, count INTEGER NOT NULL, box TEXT, bits BLOB NOT NULL, PRIMARY KEY (selection, number)) STRICT;
+    count INTEGER NOT NULL, box TEXT, bits BLOB NOT NULL, PRIMARY KEY (selection, number)) STRICT;
 CREATE TABLE IF NOT EXISTS objects (
     lift TEXT NOT NULL REFERENCES lifts (id) ON DELETE CASCADE, id INTEGER NOT NULL, name TEXT,
     hidden INTEGER NOT NULL DEFAULT 0, PRIMARY KEY (lift, id)) STRICT;
@@ -70,7 +70,7 @@ BUSY_SECONDS = 10.0  # that a write waits for another process
 RESERVE_BYTES = 1 << 20  # of a file that is given free on a full disk: a delete writes before it makes room
 JSON_COLUMNS = frozenset(
     ("counts", "warnings", "features", "settings", "parameters", "plan", "progress", "problem", "world", "metadata",
-     "document", "lifts", "edit", "box")
+     "document", "lifts", "box")
 )  # fmt: skip
 # Whose records count: those of others are absent. A key with shared lifts sees these, too.
 VISIBLE = "(:admin OR owner = :owner OR id IN (SELECT value FROM json_each(:lifts)))"

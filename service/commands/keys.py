@@ -20,7 +20,6 @@ from service.settings import read_settings
 from service.store import create_key, list_keys, open_keys, revoke_key
 
 UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
-LAST_MOMENT = datetime(9999, 12, 31, tzinfo=UTC).timestamp()
 
 
 def add_arguments(parser: Parser, shared: Parser) -> None:
@@ -30,7 +29,7 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
     create.add_argument("--name", required=True, metavar="NAME", help="its owner or purpose")
     create.add_argument("--scopes", metavar="SCOPES", help="its rights: read,write; or admin, for all owners' data")
     create.add_argument("--lifts", metavar="IDS", help="in place of scopes: lifts that it may read and query")
-    create.add_argument("--expires", metavar="WHEN", help="after 30d, 12h or 90m, or at a date (UTC); else never")
+    create.add_argument("--expires", metavar="DURATION", help="such as 30d, 12h or 90m; else never")
     listing = actions.add_parser("list", parents=[shared], help="all keys, without their secrets")
     revoke = actions.add_parser("revoke", parents=[shared], help="end a key and its shares; its results stay")
     revoke.add_argument("key", metavar="ID", help="as keys list shows it")
@@ -56,7 +55,7 @@ def run(options: argparse.Namespace) -> int:
             if unknown := set(lifts) - known_lifts:
                 hint = "GET /lifts lists them"
                 raise NotFound("--lifts", expected="ids of lifts", got=sorted(unknown)[0][:80], hint=hint)
-            expires = None if options.expires is None else _moment(options.expires)
+            expires = None if options.expires is None else _end_of(options.expires)
             scopes = "shared" if lifts else _scopes(options.scopes or "")
             key, secret = create_key(connection, _name(options.name), scopes, expires, lifts)
             _print(options, {**key.model_dump(), "key": secret}, secret)
@@ -84,21 +83,13 @@ def _scopes(text: str) -> str:
     return " ".join(sorted(set(names)))
 
 
-def _moment(text: str) -> float:
-    """Parse a duration from now, such as 30d, or a date; return seconds since 1970."""
-    now, match = time.time(), re.fullmatch(r"(\d{1,6})([smhd])", text.strip(), re.ASCII)
-    try:
-        if match is not None:
-            moment = now + int(match[1]) * UNITS[match[2]]
-        else:
-            date = datetime.fromisoformat(text.strip())
-            moment = (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
-    except ValueError:
-        moment = 0.0
-    if not now < moment <= LAST_MOMENT:
-        expected = "a duration such as 30d, 12h or 90m, or a date (UTC) to come such as 2030-12-31"
-        raise InvalidRequest("--expires", expected=expected, got=repr(text)[:80])
-    return moment
+def _end_of(duration: str) -> float:
+    """Return the end of a duration from now, such as 30d: seconds since 1970."""
+    match = re.fullmatch(r"([1-9]\d{0,5})([smhd])", duration.strip(), re.ASCII)
+    if match is None:
+        expected = "a duration such as 30d, 12h or 90m"
+        raise InvalidRequest("--expires", expected=expected, got=repr(duration)[:80])
+    return time.time() + int(match[1]) * UNITS[match[2]]
 
 
 def _line(key: Key) -> str:

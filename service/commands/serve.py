@@ -1,4 +1,4 @@
-"""``splatlift serve`` and ``python -m service``: run the service on this machine."""
+"""``splatlift serve``: run the service on this machine."""
 
 from __future__ import annotations
 
@@ -72,13 +72,11 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--port", type=int, help="the port to bind; 0 picks a free one")
     parser.add_argument("--data", type=Path, metavar="DIR", help="the directory for the database and all files")
     parser.add_argument("--encoder", metavar="SPEC", help="the default text encoder: lvis, table:FILE, ...")
-    of_space = "the text encoder of a text space; may be given several times"
-    parser.add_argument("--text-space", action="append", dest="text_spaces", metavar="NAME=SPEC", help=of_space)
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the service until it is stopped."""
-    settings = settings_of(options)
+    settings = read_settings(**{name: getattr(options, name) for name in ("host", "port", "data", "encoder")})
     require_keys(settings)
     require_encoder_files(settings)
 
@@ -117,16 +115,6 @@ def server_of(app: FastAPI, settings: ServiceSettings, announce: Callable[[str],
         proxy_headers=bool(settings.forwarded_allow), forwarded_allow_ips=settings.forwarded_allow,
     )  # fmt: skip
     return AnnouncingServer(config, app, announce)
-
-
-def settings_of(options: argparse.Namespace) -> ServiceSettings:
-    """Return the settings: of the command line, else of the environment, else the defaults."""
-    pairs = [text.partition("=") for text in options.text_spaces or ()]
-    for name, _, spec in pairs:
-        if not (name and spec):
-            raise Misconfigured("--text-space", expected="NAME=SPEC", got=repr(f"{name}={spec}"))
-    values = {name: getattr(options, name) for name in ("host", "port", "data", "encoder")}
-    return read_settings(**values, text_spaces={name: spec for name, _, spec in pairs} or None)
 
 
 @contextmanager

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import anyio
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Request, Response
 from fastapi import Path as PathParameter
 
-from service.errors import InvalidRequest, TooLarge, UnreadableBody, UnsupportedMedia
+from service.errors import TooLarge, UnreadableBody, UnsupportedMedia
 from service.models import Asset, AssetKind
 from service.routes import BINARY, Caller, Deps, Parts, add_list, content_of, file_answer
 
@@ -29,9 +29,13 @@ UPLOAD: dict[str, Any] = {
         }
     },
 }
+REFUSED_HEADERS = {
+    "Content-Encoding": ("(?!identity$).+", UnsupportedMedia),
+    "Content-Type": ("multipart/.*", UnsupportedMedia),
+    "Content-Range": (".+", UnreadableBody),  # RFC 9110, 14.5: whoever takes no parts of PUT refuses them
+}
 # OpenAPI takes two templates of the same paths as one path given twice, so the parameter has one name.
 Kind = Annotated[AssetKind, PathParameter(alias="asset", description="its kind")]
-Sha256 = Annotated[str | None, Query(pattern="^[0-9a-fA-F]{64}$", description="of the content; checked if given")]
 REPEATED: dict[int | str, dict[str, Any]] = {200: {"model": Asset, "description": "It was here already"}}
 
 router = APIRouter(tags=["assets"])
@@ -39,15 +43,13 @@ add_list(router, "assets", Asset, Asset.model_validate)
 
 
 @router.put("/assets/{asset}", status_code=201, responses=REPEATED, **UPLOAD)
-async def put_asset(
-    kind: Kind, request: Request, response: Response, deps: Deps, owner: Caller, sha256: Sha256 = None
-) -> Asset:
+async def put_asset(kind: Kind, request: Request, response: Response, deps: Deps, owner: Caller) -> Asset:
     """Upload a file. The service checks it whole.
 
     It is splats (any format but checkpoints), cameras (JSON, or a zip of a COLMAP model or of several files), a
     feature pack, masks, a text table, or photos (a zip of JPEG and PNG files that are named like the views).
     """
-    async with receive_upload(request, deps, sha256) as (draft, digest):
+    async with receive_upload(request, deps) as (draft, digest):
         asset = await in_thread(deps, deps.store.find_asset, owner, f"sha256:{digest}")
         if asset is not None and asset.kind == kind and asset.file.exists():
             response.status_code = 200
@@ -64,7 +66,7 @@ async def in_thread(deps: Parts, call: Any, *arguments: Any) -> Any:
 
 
 @asynccontextmanager
-async def receive_upload(request: Request, deps: Parts, sha256: str | None) -> AsyncIterator[tuple[Path, str]]:
+async def receive_upload(request: Request, deps: Parts) -> AsyncIterator[tuple[Path, str]]:
     """Receive a body into a draft; yield that and its sha256 in hex. The draft is removed at the end of the block."""
     require_file(request)
     limit, digest, count, batch = deps.settings.upload_bytes, hashlib.sha256(), 0, bytearray()
@@ -87,9 +89,6 @@ async def receive_upload(request: Request, deps: Parts, sha256: str | None) -> A
                 await in_thread(deps, write, bytes(batch))
                 batch.clear()
         await in_thread(deps, write, bytes(batch))
-        if sha256 is not None and digest.hexdigest() != sha256.lower():
-            hint = "upload the file again"
-            raise InvalidRequest("sha256", expected=sha256, got=digest.hexdigest(), hint=hint)
         yield draft, digest.hexdigest()
     finally:
         with anyio.CancelScope(shield=True):  # removing gigabytes takes long
@@ -98,17 +97,11 @@ async def receive_upload(request: Request, deps: Parts, sha256: str | None) -> A
 
 def require_file(request: Request) -> None:
     """Require that a body is a plain and whole file: neither compressed, nor a part of a form or of a file."""
-    encodings = ", ".join(request.headers.getlist("content-encoding")).strip()
-    media = request.headers.get("content-type", "")
-    if encodings.lower() not in ("", "identity"):
-        expected, hint = "a body that is not compressed", "send it as it is; .spz and .sog are compressed already"
-        raise UnsupportedMedia("Content-Encoding", expected=expected, got=encodings[:40], hint=hint)
-    if re.match(r"\s*multipart/", media, re.IGNORECASE):
-        hint = "send it with curl -T FILE or --data-binary @FILE, as application/octet-stream"
-        raise UnsupportedMedia("Content-Type", expected="the file itself as the body", got=media[:80], hint=hint)
-    if part := request.headers.get("content-range"):  # RFC 9110, 14.5: whoever takes no parts of PUT refuses them
-        hint = "send the file in one request, without Content-Range"
-        raise UnreadableBody("Content-Range", expected="a whole file", got=part[:80], hint=hint)
+    for name, (refused, error) in REFUSED_HEADERS.items():
+        value = ", ".join(request.headers.getlist(name)).strip()
+        if re.fullmatch(refused, value, re.IGNORECASE | re.DOTALL):
+            hint = "send it in one request, with curl -T FILE; .spz and .sog are compressed already"
+            raise error(name, expected="the file itself, plain and whole, as the body", got=value[:80], hint=hint)
 
 
 async def check_upload(deps: Parts, kind: str, draft: Path, cameras: Asset | None = None) -> dict[str, Any]:

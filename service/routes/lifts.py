@@ -29,8 +29,8 @@ from service.routes import (
     file_answer,
     unchanged,
 )
-from service.routes.assets import UPLOAD, Sha256, check_upload, in_thread, receive_upload
-from service.routes.queries import NO_ENCODER, NPY, PNG, labels_of, respond, scene_request, with_encoder, with_packs
+from service.routes.assets import UPLOAD, check_upload, in_thread, receive_upload
+from service.routes.queries import NO_ENCODER, NPY, PNG, labels_of, respond, scene_request, with_encoder
 from service.settings import encoder_label
 from service.store import SERVICE, Owner
 
@@ -59,7 +59,6 @@ async def create_lift(
     response: Response,
     deps: Deps,
     owner: Caller,
-    sha256: Sha256 = None,
     cameras: LiftCameras = None,
 ) -> Lift:
     """Upload a lift file of the command line. It is checked whole.
@@ -67,7 +66,7 @@ async def create_lift(
     Its splats and its file of cameras must be assets (404 names the missing one), its feature packs only for examples
     by region. ``cameras`` names other cameras with the same poses, such as a zip of the folder that was lifted with.
     """
-    async with receive_upload(request, deps, sha256) as (draft, digest):
+    async with receive_upload(request, deps) as (draft, digest):
         lift = await in_thread(deps, results.find_lift_file, deps.store, owner, digest)
         if lift is not None:
             response.status_code = 200
@@ -85,12 +84,6 @@ async def create_lift(
 def change_lift(lift: str, change: models.LiftChange, deps: Deps, owner: Caller) -> Lift:
     """Set a lift's name, the photos of its views, or its world frame; absent fields stay."""
     return results.change_lift(deps.store, owner, lift, change.model_dump(mode="json", exclude_unset=True))
-
-
-@router.delete("/lifts/{lift}", status_code=204)
-def delete_lift(lift: str, deps: Deps, owner: Caller) -> None:
-    """Delete a lift, its selections and its job; the assets stay."""
-    deps.store.delete_job(owner, deps.store.lift(owner, lift).id, with_result=True)
 
 
 @router.get("/lifts/{lift}")
@@ -195,38 +188,14 @@ def list_views(lift: str, deps: Deps, owner: Caller, limit: Limit = models.PAGE,
     return models.Views(views=views, next=value["next"])
 
 
-@router.get("/lifts/{lift}/regions", response_model=models.CoveringRegions)
-def list_regions(
-    lift: str, view: View, x: Number, y: Number, request: Request, deps: Deps, owner: Caller
-) -> Response:
-    """List the regions of the lift's packs at a pixel (x from the left, y from the top) of a view's photo.
-
-    Each is an example for queries.
-    """
-    record = deps.store.lift(owner, lift)
-    work = with_packs(scene_request("regions", record, deps), record, deps, "lift")
-    work |= {"view": view, "x": x, "y": y, "head": {"lift": record.id, "view": view}}
-    return respond(request, deps, work)
-
-
-@router.get("/lifts/{lift}/regions/mask", responses=content_of(PNG), response_class=Response)
-def get_region_mask(
-    lift: str, view: View, level: Number, region: Number, request: Request, deps: Deps, owner: Caller
-) -> Response:
-    """Draw the pixels of a view's photo that one region covers: a PNG, white inside."""
-    record = deps.store.lift(owner, lift)
-    work = with_packs(scene_request("region_mask", record, deps), record, deps, "lift")
-    return respond(request, deps, work | {"view": view, "level": level, "region": region}, PNG)
-
-
 @router.get("/lifts/{lift}/objects", response_model=models.SceneObjects)
 def list_objects(
-    lift: str, request: Request, deps: Deps, owner: Caller, options: Annotated[models.SceneObjectsRequest, Query()]
+    lift: str, request: Request, deps: Deps, owner: Caller, options: Annotated[models.NodesRequest, Query()]
 ) -> Response:
     """List the objects of the scene, found by masks when it was lifted; a vocabulary names them."""
     record = deps.store.lift(owner, lift)
-    fields = {"means": options.features, "splat": options.splat, "object_labels": labels_of(record, deps)}
-    return respond(request, deps, _nodes("catalogue", record, deps, owner, options) | fields)
+    work = _nodes("catalogue", record, deps, owner, options) | {"object_labels": labels_of(record, deps)}
+    return respond(request, deps, work)
 
 
 @router.get("/lifts/{lift}/tree", response_model=models.LiftTree)

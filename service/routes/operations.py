@@ -23,7 +23,6 @@ from prometheus_client import generate_latest
 from starlette.datastructures import Headers
 from starlette.types import Scope
 
-from liftcore import __version__
 from liftcore.files import page_table
 from liftcore.models import page_fields
 from service.errors import Busy
@@ -118,12 +117,6 @@ def readyz(deps: Deps) -> Status:
         if not is_alive:
             raise Busy("server", expected="processes that live", got=f"{name} has ended; a new one starts")
     return Status(status="ready")
-
-
-@router.get("/version", include_in_schema=False)
-async def version() -> dict[str, str]:
-    """Get the version of splatlift."""
-    return {"version": __version__}
 
 
 @router.get("/metrics", response_class=Response, responses={200: {"content": {METRICS_TYPE: {}}}})

@@ -6,13 +6,13 @@ import re
 import zlib
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Header, Query, Response
+from fastapi import APIRouter, Header, Response
 from fastapi import Path as PathParameter
 
 from liftcore.errors import NotFound
 from service import models, selections
 from service.errors import InvalidRequest
-from service.models import Lift, Selection, SelectionDetail
+from service.models import Lift, Selection
 from service.routes import Caller, Deps, Parts, cache_headers
 from service.routes.queries import NO_ENCODER, bits_text, query_request, scene_request
 from service.selections import SplatSet
@@ -25,7 +25,6 @@ SelectionId = Annotated[
 ObjectId = Annotated[
     int, PathParameter(alias="object", ge=0, le=10**9, description="the id of an object of the lift")
 ]
-WithBits = Annotated[bool, Query(description="with its splats, a bit for each of the lift's")]
 IfMatch = Annotated[
     str | None,
     Header(alias="If-Match", max_length=1000, description="the ETag of the version that is to be changed; else 412"),
@@ -44,47 +43,43 @@ def list_selections(lift: str, deps: Deps, owner: Caller) -> models.Selections:
 @router.post("/lifts/{lift}/selections", status_code=201)
 def create_selection(
     lift: str, parameters: models.NewSelection, response: Response, deps: Deps, owner: Caller
-) -> SelectionDetail:
+) -> Selection:
     """Begin a selection, with the splats of an edit or with none. Questions name it as `sets=selection:ID`."""
     record = deps.store.lift(owner, lift)
     splats = _edit(parameters.edit, record, deps, owner, bytes(-(-record.count // 8)))
     selection = selections.create_selection(deps.store, owner, record.id, parameters.name, splats)
     response.headers["Location"] = f"/lifts/{record.id}/selections/{selection.id}"
-    return _answer(selection, response, deps)
+    return _answer(selection, response)
 
 
 @router.get(PATH)
-def get_selection(
-    lift: str, selection: SelectionId, response: Response, deps: Deps, owner: Caller, bits: WithBits = False
-) -> SelectionDetail:
-    """Get one selection: its content, and the steps of its history."""
-    record = selections.get_selection(deps.store, deps.store.lift(owner, lift).id, selection)
-    text = bits_text(selections.bits_of_selection(deps.store, record)) if bits else None
-    return _answer(record, response, deps, text)
+def get_selection(lift: str, selection: SelectionId, response: Response, deps: Deps, owner: Caller) -> Selection:
+    """Get one selection. Its splats are those of its question, `links.selection`."""
+    return _answer(selections.get_selection(deps.store, deps.store.lift(owner, lift).id, selection), response)
 
 
 @router.post(f"{PATH}/edits")
 def edit_selection(
     lift: str, selection: SelectionId, edit: models.EditRequest, response: Response, deps: Deps, owner: Caller,
     match: IfMatch = None,
-) -> SelectionDetail:  # fmt: skip
+) -> Selection:  # fmt: skip
     """Add, take away, grow, shrink or set: a step of its history, which PATCH goes back."""
     record = deps.store.lift(owner, lift)
     before = selections.get_selection(deps.store, record.id, selection, _versions(match))
     splats = _edit(edit, record, deps, owner, selections.bits_of_selection(deps.store, before))
     # The change is of the version that was read: one stored meanwhile is not overwritten.
-    return _answer(selections.extend_selection(deps.store, before, splats), response, deps)
+    return _answer(selections.extend_selection(deps.store, before, splats), response)
 
 
 @router.patch(PATH)
 def change_selection(
     lift: str, selection: SelectionId, change: models.SelectionChange, response: Response, deps: Deps, owner: Caller,
     match: IfMatch = None,
-) -> SelectionDetail:  # fmt: skip
+) -> Selection:  # fmt: skip
     """Give it another name, or go to another step of its history: undo and redo."""
     changes, record = change.model_dump(exclude_unset=True, exclude_none=True), deps.store.lift(owner, lift)
     after = selections.change_selection(deps.store, record.id, selection, changes, _versions(match))
-    return _answer(after, response, deps)
+    return _answer(after, response)
 
 
 @router.delete(PATH, status_code=204)
@@ -109,7 +104,7 @@ def change_object_label(
 def _edit(edit: models.EditRequest | None, lift: Lift, deps: Parts, owner: Owner, before: bytes) -> SplatSet:
     """Apply an edit to a selection in the query process; without an edit, return it as it is."""
     if edit is None:
-        return SplatSet({"operation": "set"}, 0, None, zlib.compress(before))
+        return SplatSet(0, None, zlib.compress(before))
     if edit.query is None:
         work = scene_request("edit", lift, deps) | NO_ENCODER
     elif edit.query.lift not in (None, lift.id):
@@ -119,7 +114,7 @@ def _edit(edit: models.EditRequest | None, lift: Lift, deps: Parts, owner: Owner
     document: dict[str, Any] = edit.model_dump(mode="json", exclude={"query"}, exclude_none=True)
     document |= {"query": work["query"]} if "query" in work else {}
     value = deps.queries.call(work | {"edit": document, "before": bits_text(before)})["value"]
-    return SplatSet(value["edit"], value["count"], value["box"], zlib.compress(bytes.fromhex(value["bits"])))
+    return SplatSet(value["count"], value["box"], zlib.compress(bytes.fromhex(value["bits"])))
 
 
 def _versions(match: str | None) -> frozenset[int] | None:
@@ -129,6 +124,6 @@ def _versions(match: str | None) -> frozenset[int] | None:
     return frozenset(int(digits) for digits in re.findall(r'"(\d{1,15})"', match))
 
 
-def _answer(selection: Selection, response: Response, deps: Parts, bits: str | None = None) -> SelectionDetail:
+def _answer(selection: Selection, response: Response) -> Selection:
     response.headers.update(cache_headers(f'"{selection.version}"'))
-    return selections.with_history(deps.store, selection, bits)
+    return selection

@@ -54,7 +54,7 @@ def lift_of(client: Any, order: dict[str, Any]) -> dict[str, Any]:
 
 def delete_lift(client: Any, lift: str) -> None:
     """Delete the lift of an id."""
-    reply = client.delete(f"/lifts/{lift}")
+    reply = client.delete(f"/jobs/{lift}", params={"with_lift": True})
     assert reply.status_code == 204, reply.text
 
 

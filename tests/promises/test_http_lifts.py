@@ -154,5 +154,5 @@ def test_deleted_lift_is_gone_with_all_that_is_of_it(
     for name, link in other["links"].items():
         assert_problem(client.get(link + "apple" * (name == "query")), 404)
     assert_problem(client.get(selection), 404)
-    assert_problem(client.delete(f"/lifts/{other['id']}"), 404)
+    assert_problem(client.delete(f"/jobs/{other['id']}"), 404)
     assert client.get(lift["links"]["features"]).status_code == 200

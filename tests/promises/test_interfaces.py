@@ -340,14 +340,6 @@ def test_nearest_words_of_an_example_are_the_same(interfaces: Interfaces, exampl
     assert expected[0]["word"] == {"splat:0": "apple"}.get(example, "book")
 
 
-def test_regions_at_a_pixel_are_the_same(interfaces: Interfaces) -> None:
-    expected = [document_of(region) for region in interfaces.scene.regions("left", 20, 12)]
-    assert interfaces.of_lift("regions", view="left", x=20, y=12).json()["regions"] == expected
-    (region,) = expected
-    reply = interfaces.of_lift("regions/mask", view="left", level=region["level"], region=region["region"])
-    assert np.array_equal(pixels_of(reply.content) > 0, interfaces.scene.region_mask("left", 0, region["region"]))
-
-
 @pytest.mark.parametrize(
     ("source", "suffix"),
     [("tree", ".ply"), ("tree", ".json"), ("answer", ".glb"), ("labels", ".json"), ("labels", ".ply")],
