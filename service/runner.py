@@ -103,10 +103,8 @@ class Runner:
 
         def take(message: Message) -> None:
             try:
-                if "plan" in message:
-                    store.note(job.id, "plan", message["plan"])
-                else:
-                    store.note(job.id, "progress", pace.progress(message["progress"]))
+                for kind, data in message.items():
+                    store.note(job.id, kind, pace.progress(data) if kind == "progress" else data)
             except TRANSIENT_ERRORS as error:  # the next one will be stored
                 log.warning("the progress of job %s cannot be stored: %s", job.id, error)
 
@@ -126,7 +124,6 @@ class Runner:
         order |= {
             "task": job.kind, "kind": job.kind, "scratch": str(scratch), "output": str(draft), "work": work,
             "parameters": job.parameters, "threads": settings.job_threads,
-            "checkpoint_seconds": settings.checkpoint_seconds,
         }  # fmt: skip
         last, reason, _ = self._children.run(order, self._settings.job_seconds, take, why_end)
         if last is not None and "result" in last:

@@ -49,9 +49,6 @@ class ServiceSettings(BaseSettings):
         None, ge=1, description="threads of a job; not set = the cores shared out among the parallel jobs"
     )
     job_seconds: float = Field(86_400, gt=0, description="wall time that one attempt at a job may take")
-    checkpoint_seconds: float = Field(
-        2, ge=0, description="work that a killed lift may have to do again, beside at most five views"
-    )
     engine: Literal["local", "ray"] | None = Field(
         None, description="engine of lifts in blocks, of bounded memory: local or ray; not set = in memory"
     )

@@ -8,13 +8,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import subprocess
 import sys
 import tempfile
 import threading
 import webbrowser
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,12 +19,12 @@ from safetensors import SafetensorError, safe_open
 
 from liftcore.cli import Parser
 from liftcore.errors import InvalidInput, InvalidLift, Unavailable
-from liftcore.text import BUILT_IN, NO_WORDS, OWN_WORDS
+from liftcore.text import BUILT_IN
 from service.commands.serve import serve
-from service.errors import Fault, Misconfigured
-from service.process import Children, arm, end_with_parent
+from service.errors import Fault
+from service.process import Child, Children, end_with_parent
 from service.results import add_lift
-from service.settings import ServiceSettings, read_settings, require_encoder_files
+from service.settings import ServiceSettings, read_settings
 from service.store import SERVICE, Store
 
 if TYPE_CHECKING:
@@ -36,7 +33,6 @@ if TYPE_CHECKING:
     from liftcore import Camera, LiftResult, Splats
 
 LAST_PORT = 65_535
-ENDING_SECONDS = 10.0  # for a server that was interrupted to end
 
 
 def add_arguments(parser: Parser) -> None:
@@ -59,37 +55,20 @@ def show(
     if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port <= LAST_PORT:
         expected = f"a whole number in 0..{LAST_PORT}, 0 for a free one"
         raise InvalidInput("port", expected=expected, got=repr(port)[:80])
-    lifeline, server_end = os.pipe()
     with tempfile.TemporaryDirectory(prefix="splatlift-show-", ignore_cleanup_errors=True) as folder:
         path = lift.save_scene(Path(folder), splats, cameras)
-        command = [
-            sys.executable,
-            "-m",
-            "service.commands.view",
-            str(path),
-            str(port),
-            str(int(browser)),
-            str(lifeline),
-        ]
-        with subprocess.Popen(
-            command, stdout=subprocess.PIPE, text=True, pass_fds=[lifeline], start_new_session=True
-        ) as server:
-            arm(lifeline, server.pid)
-            os.close(lifeline)
-            assert server.stdout is not None
-            try:
-                for line in server.stdout:
-                    print(line, end="", flush=True)  # flushed for the cell of a notebook
-            except KeyboardInterrupt:
-                server.terminate()
-                with suppress(subprocess.TimeoutExpired):
-                    server.wait(ENDING_SECONDS)
-                server.kill()
-                return
-            finally:
-                os.close(server_end)
-    if server.returncode:
-        got = f"one that ended with status {server.returncode}; what it said stands above"
+        server = Child("service.commands.view", str(path), str(port), str(int(browser)), TMPDIR=folder)
+        try:
+            for line in server.output:
+                print(line.decode(), end="", flush=True)  # flushed for the cell of a notebook
+            status = server.end()
+        except KeyboardInterrupt:
+            status = 0
+        finally:
+            server.end()
+            server.close()
+    if status:
+        got = f"one that ended with status {status}; what it said stands above"
         raise Unavailable("the page", expected="a server that starts", got=got)
 
 
@@ -160,16 +139,11 @@ def settings_of(folder: Path, port: int, text_space: str) -> ServiceSettings:
     Spaces of encoders that ship, and those that the environment names, are answered as by any server.
     """
     settings = read_settings(data=folder, host="127.0.0.1", port=port, disk_floor_bytes=0)
-    if text_space in ("", NO_WORDS, OWN_WORDS, *BUILT_IN.values(), *settings.text_spaces):
-        return settings
-    extended = settings.model_copy(update={"text_spaces": {**settings.text_spaces, text_space: text_space}})
-    try:
-        require_encoder_files(extended)
-    except Misconfigured:
-        return settings
-    return extended
+    if text_space.startswith("open_clip:") and text_space not in (*BUILT_IN.values(), *settings.text_spaces):
+        return settings.model_copy(update={"text_spaces": {**settings.text_spaces, text_space: text_space}})
+    return settings
 
 
 if __name__ == "__main__":
-    end_with_parent(int(sys.argv[4]))
-    show_file(Path(sys.argv[1]), int(sys.argv[2]), browser=sys.argv[3] == "1")
+    end_with_parent(int(sys.argv[1]))
+    show_file(Path(sys.argv[2]), int(sys.argv[3]), browser=sys.argv[4] == "1")
