@@ -11,7 +11,7 @@ from typing import Any
 
 import httpx
 import pytest
-from playwright.sync_api import sync_playwright
+from playwright.sync_api import BrowserContext, sync_playwright
 
 from service.app import create_app
 from service.commands.serve import bind, server_of
@@ -20,7 +20,7 @@ from service.store import Store
 from tests.server import until, wait_for_end
 from tests.tiny_scene import make_scene
 
-from .browser import PATIENCE_SECONDS, Browser, Chromium, launch
+from .browser import PATIENCE_SECONDS, Browser, Chromium, launch, profile
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,13 @@ def chromium() -> Iterator[Chromium]:
         yield chromium
 
 
+@pytest.fixture(scope="module")
+def context(chromium: Chromium) -> Iterator[BrowserContext]:
+    with profile(chromium) as context:
+        yield context
+
+
 @pytest.fixture
-def browser(chromium: Chromium) -> Iterator[Browser]:
-    with Browser.open_window(chromium) as browser:
+def browser(context: BrowserContext) -> Iterator[Browser]:
+    with Browser.open_window(context) as browser:
         yield browser

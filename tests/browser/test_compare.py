@@ -29,7 +29,7 @@ def test_two_words_are_seen_beside_each_other_with_one_camera(page: Browser) -> 
     page.press(COMPARE)
     page.until(SHARED)
     ask(page, "apple")
-    assert "lamp" in text_of(page, "#beside-said") and "apple" in text_of(page, "#right-said")
+    assert "lamp" in text_of(page, "#beside-said") and "apple" in text_of(page, "#chips")
     right, left = (columns(page, AMBER, canvas=canvas) for canvas in ("#scene", "#beside"))
     assert max(right) < 50 < min(left)  # the apple is left of the lamp
     before = page.value(PLACES)
@@ -58,7 +58,7 @@ def test_link_opens_both_sides_and_back_leaves_one(page: Browser) -> None:
     for event in ("input", "change"):
         page.value(f"document.querySelector('#cut').dispatchEvent(new Event('{event}'))")
     page.until(f"location.search.includes('threshold') && {BOTH_SETTLED}")
-    sides = "['#beside-said', '#right-said'].map(side => document.querySelector(side).textContent)"
+    sides = "['#beside-said', '#chips'].map(side => document.querySelector(side).textContent)"
     left, right = page.value(sides)
     assert left != right and "lamp" in left and "lamp" in right
     address = page.value("location.href")

@@ -4,7 +4,6 @@ import { fetchAnswer, heatOf, questionLabel, linkedQuestions, paintedQuestions }
 import { byId, formatCount, el, notify } from "./dom.js";
 import { fetchBytes, problemText } from "./service.js";
 
-const HINT = "Now query another word or move the slider. The left side stays as it is.";
 const RIGHT_PARAMETERS = ["beside", "camera", "show", "view", "what"]; // that the left side leaves out
 
 export class Comparison {
@@ -75,12 +74,6 @@ export class Comparison {
       button.textContent = this.link ? "End the comparison" : "Compare";
       button.setAttribute("aria-pressed", String(Boolean(this.link)));
     }
-  }
-
-  // Write the questions of the right side below it.
-  describeRight(questions) {
-    if (!this.link || !this.lift) return;
-    byId("right-said").replaceChildren(...(String(leftOf(this.currentLink())) === String(this.link) ? [el("span", {}, HINT)] : summary(questions)));
   }
 }
 

@@ -2,15 +2,14 @@
 import { byId, copyText, el, notify, plural } from "./dom.js";
 import { questionLabel } from "./query.js";
 import { queryString } from "./question.js";
-import { storedKey, download, downloadBlob, problemText } from "./service.js";
+import { storedKey, download, problemText } from "./service.js";
 
 const MAX_EXPORTS = 16; // questions of a file
 
 export class ExportPanel {
-  constructor({ query, layers, labels, objects, takePicture }) {
-    Object.assign(this, { query, layers, labels, objects, takePicture });
+  constructor({ query, layers, labels, objects }) {
+    Object.assign(this, { query, layers, labels, objects });
     for (const button of document.querySelectorAll("[data-take]")) button.addEventListener("click", () => this.saveFile(button.dataset.take));
-    byId("shot").addEventListener("click", async () => downloadBlob(await this.takePicture(), "splatlift.png"));
     for (const [id, ofObjects] of [["take-everything", false], ["take-objects", true]]) byId(id).addEventListener("click", () => this.saveLabels(ofObjects));
     byId("copy-link").addEventListener("click", () => copyText(location.href));
     for (const name of ["curl", "python"]) byId(`copy-${name}`).addEventListener("click", () => copyText(byId(name).textContent));
@@ -19,8 +18,8 @@ export class ExportPanel {
   address(kind) {
     const question = this.query.current;
     const view = this.layers.view?.name;
-    const path = { scores: "/query/scores", mask: "/query/mask", object: "/query/splats", coloured: "/query/splats", boxes: "/query/objects" }[kind];
-    const options = { mask: { view }, object: { what: "object" }, coloured: { what: "scores" } }[kind] || {};
+    const path = { scores: "/query/scores", mask: "/query/mask", object: "/query/splats", boxes: "/query/objects" }[kind];
+    const options = { mask: { view }, object: { what: "object" } }[kind] || {};
     return `${path}?${this.query.requestParameters(question, options)}`;
   }
 
@@ -33,7 +32,6 @@ export class ExportPanel {
     if (listedObjects.length > MAX_EXPORTS && this.objects.selections.length) notify(`A file has at most ${MAX_EXPORTS} objects of an edited list: it has the first ${MAX_EXPORTS}.`);
     const encoder = lift.text_space === "none" ? {} : { encoder: lift.text_space };
     const body = { lift: lift.id, format, ...(ofObjects && this.objects.selections.length ? { of: "questions", questions: listedObjects.slice(0, MAX_EXPORTS).map(item => ({ lift: lift.id, ...item, name: item.name.slice(0, 100) })) } : ofObjects ? { of: "objects", ...encoder } : labelBody) };
-    if (format === "masks" && (listedObjects.length <= MAX_EXPORTS || !ofObjects)) notify("Masks of all views take some time.");
     try {
       await download("/query/export", "labels", body).catch(problem => (problem.argument === "encoder" ? download("/query/export", "labels", { lift: lift.id, format, of: "objects" }) : Promise.reject(problem)));
       const hidden = this.objects.items.filter(object => object.hidden).length;
@@ -51,7 +49,7 @@ export class ExportPanel {
       legend: ["/query/segment/picture", this.labelBody(view), `legend-${view}.png`],
     }[kind] || [];
     const title = this.query.current ? questionLabel(this.query.current) : "scene";
-    const name = fileName || { scores: `${title}-scores.npy`, mask: `${title}-${this.layers.view?.name}.png`, object: `${title}.ply`, coloured: `${title}-scores.ply`, boxes: `${title}-boxes.json` }[kind];
+    const name = fileName || { scores: `${title}-scores.npy`, mask: `${title}-${this.layers.view?.name}.png`, object: `${title}.ply`, boxes: `${title}-boxes.json` }[kind];
     try {
       await download(path || this.address(kind), name.replaceAll(/[/\\:*?"<>|]/g, "-"), body, true);
     } catch (problem) {
@@ -86,22 +84,11 @@ export class ExportPanel {
     const body = this.query.requestBody(question);
     const terms = [...queryString(body)].map(([name, value]) => ` \\\n  --data-urlencode ${shellQuote(`${name}=${value}`)}`).join("");
     byId("curl").textContent = `curl -fsSG${key} ${address()}${terms}`;
-    byId("python").textContent = runsLocally(question) ? fileSnippet(body, question.answer.encoder)
-      : httpSnippet("", JSON.stringify(body, null, 1), ['print(answer["count"], answer["reason"], answer["threshold"])']);
+    byId("python").textContent = httpSnippet("", JSON.stringify(body, null, 1), ['print(answer["count"], answer["reason"], answer["threshold"])']);
   }
 }
 
-// True if the encoder opens on any machine by its name; `prompts` are the words of the lift.
-const runsLocally = ({ text, like, unlike, answer }) => text.length && !like.length && !unlike.length && ["lvis", "prompts"].includes(answer.encoder);
 const address = kind => new URL(kind ? `query/${kind}` : "query", document.baseURI); // also behind a proxy's prefix
-
-// Python code for a question to a lift file.
-function fileSnippet({ lift, ...fields }, encoder) {
-  const query = `lc.Query(${Object.entries(fields).map(([name, value]) => `${name}=${JSON.stringify(value)}`).join(", ")})`;
-  const encoderOption = encoder === "prompts" ? "" : `, encoder="${encoder}"`;
-  return ["import liftcore as lc", "", `scene = lc.Scene("lift-${lift}.safetensors")`, `answer = scene.ask(${query}${encoderOption})`,
-    "print(answer.count, answer.reason, answer.threshold.explanation)"].join("\n");
-}
 
 // Python code for a request to the service: its kind, its body as JSON, and lines that print the answer.
 function httpSnippet(kind, body, printLines) {

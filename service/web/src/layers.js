@@ -24,7 +24,6 @@ export class LayerPanel {
     for (const input of document.querySelectorAll("input[name=layer]")) input.addEventListener("change", () => this.setLayer(input.value));
     for (const input of document.querySelectorAll("input[name=mode]")) input.addEventListener("change", () => this.setMode(input.value));
     byId("cover").addEventListener("input", () => { this.blend(); this.onChange(); });
-    byId("veil").addEventListener("input", () => this.blend());
     byId("view").addEventListener("change", () => this.goToView(byId("view").value));
     byId("view-before").addEventListener("click", () => this.stepView(-1));
     byId("view-after").addEventListener("click", () => this.stepView(1));
@@ -38,7 +37,6 @@ export class LayerPanel {
     return document.querySelector("input[name=layer]:checked").value;
   }
 
-  // Load the views of a lift: the first page now, the others in the background.
   async setLift(lift, viewName) {
     this.lift = lift;
     this.colourCache.clear();
@@ -49,24 +47,15 @@ export class LayerPanel {
     byId("layer-cluster").hidden = !clusters;
     byId("layer-confidence").hidden = !lift.settings?.robust;
     byId("layer-photo").hidden = !lift.photos;
-    const { views, next } = await fetchJson(`/lifts/${lift.id}/views?limit=${PAGE_SIZE}`);
-    this.views = views.filter(({ lifted }) => lifted);
-    this.listViews(viewName);
-    if (next !== null) this.loadMoreViews(lift, next);
-  }
-
-  async loadMoreViews(lift, next) {
-    try {
-      while (next !== null) {
-        const page = await fetchJson(`/lifts/${lift.id}/views?limit=${PAGE_SIZE}&cursor=${next}`);
-        if (lift !== this.lift) return;
-        this.views.push(...page.views.filter(({ lifted }) => lifted));
-        next = page.next;
-      }
-      this.listViews(this.view?.name);
-    } catch (problem) {
-      notify(problemText(problem), true);
+    const views = [];
+    for (let next = 0; next !== null;) {
+      const page = await fetchJson(`/lifts/${lift.id}/views?limit=${PAGE_SIZE}&cursor=${next}`);
+      views.push(...page.views.filter(({ lifted }) => lifted));
+      ({ next } = page);
     }
+    if (lift !== this.lift) return;
+    this.views = views;
+    this.listViews(viewName);
   }
 
   listViews(viewName) {
@@ -177,7 +166,6 @@ export class LayerPanel {
 
   blend() {
     byId("over").style.opacity = Number(byId("cover").value) / 100;
-    byId("mask").style.opacity = Number(byId("veil").value) / 100;
   }
 
   // Mark the examples in this view.

@@ -1,4 +1,4 @@
-// The list of lifts, with names and buttons to open and delete them.
+// The list of lifts, with buttons to open and delete them.
 import { ago, byId, formatCount, el, notify, confirmButton } from "./dom.js";
 import { patch, remove, problemText } from "./service.js";
 
@@ -14,13 +14,9 @@ export class LiftList {
   }
 
   render(lifts, openId) {
-    const snapshot = JSON.stringify([lifts.map(({ id, name }) => [id, name]), openId]);
-    if (snapshot === this.snapshot) return; // a name that is being typed stays
-    this.snapshot = snapshot;
     byId("lifts-head").hidden = !lifts.length;
     byId("lifts").replaceChildren(...lifts.map(lift => el("li", { className: lift.id === openId ? "now" : "" },
-      el("input", { type: "text", className: "name", value: lift.name || "", maxLength: 100, placeholder: "Name", "aria-label": `Name of the lift of ${ago(lift.created)}`,
-        on: { change: event => this.renameLift(lift, event.target.value.trim()) } }),
+      el("span", { className: "name" }, liftTitle(lift)),
       el("span", { className: "state" }, `${formatCount(lift.count)} splats \u00b7 ${lift.view_count} views \u00b7 ${textSpaceLabel(lift)} \u00b7 ${ago(lift.created)}`),
       el("span", { className: "actions" },
         lift.id === openId ? el("span", { className: "quiet" }, "Open") : el("button", { type: "button", on: { click: () => this.onOpen(lift.id) } }, "Open"),

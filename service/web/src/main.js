@@ -33,25 +33,24 @@ const query = new QueryPanel({ onChange: onQueryChange, ownNames: () => objects.
 const layers = new LayerPanel({
   onChange: () => { repaint(); link(); },
   flyToView: view => viewer?.goToView(view),
-  onExample: (term, less) => useExample(term, less),
-  onPlace: (term, shift, alt) => clickExample(term, null, shift, alt),
+  onExample: (term, less) => query.askExample(term, less),
+  onPlace: (term, shift, alt) => clickExample(term, shift, alt),
   fallback: !webgl(),
 });
 const labels = new LabelPanel({
   onChange: onQueryChange,
   centresOf: (values, maxValue) => viewer?.mesh ? viewer.centres(values, maxValue) : [],
   onShow: () => query.reset(true),
-  findSimilar: term => { showTab("ask"); query.askExample(term, false); },
 });
 let hiddenSplats = null; // of objects that are hidden
 const objects = new ObjectList({
   namesByTerm,
   onHide: splats => { hiddenSplats = splats; if (viewer?.mesh) viewer.hide(splats); },
-  selectedSets: () => query.current?.sets || [],
-  selectSets: sets => query.askSets(sets),
+  selectedSets: () => query.sets,
+  selectSets: (sets, word) => query.askSets(sets, word),
   flyToBox: (box, view) => (layers.mode === "view" ? layers.goToView(view) : viewer?.toBox(box, layers.views.find(({ name }) => name === view))),
 });
-const exporter = new ExportPanel({ query, layers, labels, objects, takePicture: screenPicture });
+const exporter = new ExportPanel({ query, layers, labels, objects });
 const uploads = new UploadPanel({
   onOpen: id => open(id, true), onDelete: () => refreshLifts(), openLiftId: () => lift?.id ?? null, onRaise: () => showTab("bring"), showFile,
 });
@@ -60,7 +59,7 @@ const comparison = new Comparison({
   createViewer: createPlainViewer,
   hiddenSplats: () => hiddenSplats,
   currentLink: () => String(linkParameters()),
-  onChange: () => { comparison.describeRight(query.questions); link(); },
+  onChange: link,
 });
 const lifts = new LiftList({
   onOpen: id => open(id, true),
@@ -90,7 +89,6 @@ function onQueryChange() {
   repaint();
   if (!sliderTimer) link();
   exporter.render();
-  comparison.describeRight(query.questions);
   const state = query.current?.answer ? `${query.requestParameters(query.current)}` : labels.isShown ? JSON.stringify([labels.vocabulary, ...labels.selectedValues]) : "";
   clearTimeout(viewTimer);
   if (state !== paintedState) viewTimer = setTimeout(() => { paintedState = state; layers.drawView(); }, 150); // the slider moves often
@@ -215,7 +213,6 @@ function showTab(name) {
     byId(`panel-${button.id.slice(4)}`).hidden = !isSelected;
   }
   if (name === "bring") { uploads.refresh(); refreshLifts().catch(problem => problem.status !== 401 && notify(problemText(problem), true)); }
-  if (name === "name") labels.listTables().catch(problem => notify(problemText(problem), true));
   if (name === "take") exporter.render();
   repaint();
 }
@@ -322,7 +319,8 @@ function setLift(newLift) {
   hiddenSplats = null;
   query.setLift(newLift);
   comparison.setLift(newLift);
-  for (const panel of [objects, labels]) panel.setLift(newLift).catch(problem => notify(problemText(problem), true));
+  labels.setLift(newLift);
+  objects.setLift(newLift).catch(problem => notify(problemText(problem), true));
 }
 
 // Place the camera of the link or of the first view, and show a rendered picture until the splats are drawn.
@@ -456,19 +454,14 @@ function listenToPointer(canvas, target) {
   canvas.addEventListener("keydown", event => handleKey(event, target));
 }
 
-const clickSplat = (hit, shift, alt) => (hit ? clickExample(`splat:${hit.splat}`, hit.at, shift, alt) : notify("There is no splat at this point."));
+const clickSplat = (hit, shift, alt) => (hit ? clickExample(`splat:${hit.splat}`, shift, alt) : notify("There is no splat at this point."));
 
 // A click selects the object there, the next one its part, down to the smallest; one more, or Alt, asks for similar
 // splats. Shift selects several objects, or adds a negative example.
-async function clickExample(term, point, shift, alt = false) {
-  const isExample = alt || !byId("panel-name").hidden || (shift && query.current && !query.current.sets.length);
+async function clickExample(term, shift, alt = false) {
+  const isExample = alt || (shift && query.current && !query.sets.length);
   if (!isExample && await objects.selectAt(term, shift)) return undefined;
-  return useExample(term, shift && !query.current?.sets.length, point);
-}
-
-// Use a place as an example; with the panel Label, find its words.
-function useExample(term, less, point = null) {
-  return byId("panel-name").hidden ? query.askExample(term, less) : labels.labelPlace(term, point);
+  return query.askExample(term, shift && !query.sets.length);
 }
 
 function handleKey(event, target) {
@@ -480,18 +473,6 @@ function handleKey(event, target) {
   else if (event.key === "Enter") clickSplat(target.pick(byId("scene").clientWidth / 2, byId("scene").clientHeight / 2), event.shiftKey);
   else return;
   event.preventDefault();
-}
-
-// A picture of the view as it is shown.
-async function screenPicture() {
-  const pictures = layers.mode !== "view" && viewer ? [await viewer.completeCanvas()] : [byId("render"), byId("over"), byId("mask")].filter(picture => !picture.hidden);
-  const canvas = Object.assign(document.createElement("canvas"), { width: pictures[0].naturalWidth ?? pictures[0].width, height: pictures[0].naturalHeight ?? pictures[0].height });
-  const context = canvas.getContext("2d");
-  for (const picture of pictures) {
-    context.globalAlpha = Number(picture.style.opacity || 1);
-    context.drawImage(picture, 0, 0, canvas.width, canvas.height);
-  }
-  return new Promise(resolve => canvas.toBlob(resolve, "image/png"));
 }
 
 // Undo and redo edits of the selection, else questions.
@@ -510,7 +491,7 @@ addEventListener("keydown", event => {
     return;
   }
   const action = {
-    "/": () => byId("words").focus(), "[": () => layers.stepView(-1), "]": () => layers.stepView(1), n: () => query.stepObject(1), p: () => query.stepObject(-1),
+    "/": () => byId("words").focus(), "[": () => layers.stepView(-1), "]": () => layers.stepView(1),
     h: () => byId("hide").click(), b: () => byId("show-boxes").click(), m: () => byId("heat").click(), r: () => layers.view && viewer?.goToView(layers.view),
     "?": () => byId("help").showModal(), Escape: () => { labels.hideLabels(); query.reset(true); },
   }[event.key];

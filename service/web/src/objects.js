@@ -5,10 +5,11 @@ import { fetchBytes, fetchJson, patch, readNpy, remove, problemText } from "./se
 
 const MAX_OBJECTS = 100; // objects of the list
 const MAX_NODES = 1000; // objects and parts of the tree
+const SAME_SHARE = 0.8; // of the splats of an object or its word: with more in both, the word answers for the object
 const BACKGROUND_SHARE = 0.5; // of the scene's splats: an object with more of them is background
 
 export class ObjectList {
-  // selectSets(terms), selectedSets(): the sets of the current question. flyToBox(box, view): move the camera; the view
+  // selectSets(terms, word), selectedSets(): the sets of the current question; the word answers for them, if there is one. flyToBox(box, view): move the camera; the view
   // shows most of the box. namesByTerm: a Map of names of objects and selections. onHide(splats): hidden splats changed.
   constructor({ selectSets, selectedSets, flyToBox, namesByTerm, onHide }) {
     Object.assign(this, { selectSets, selectedSets, flyToBox, namesByTerm, onHide, items: [], selections: [], nodes: new Map(), openNodes: new Set() });
@@ -152,9 +153,24 @@ export class ObjectList {
       ...this.items.filter(object => !object.hidden && !this.isBackground(object)).map(object => ({ sets: [term(object)], name: object.title }))];
   }
 
-  toggleSet(set, extend) {
+  async toggleSet(set, extend) {
     const sets = extend ? this.selectedSets().filter(term => /^(object|selection):/.test(term)) : [];
-    this.selectSets(sets.includes(set) ? sets.filter(term => term !== set) : [...sets, set]);
+    const newSets = sets.includes(set) ? sets.filter(term => term !== set) : [...sets, set];
+    this.selectSets(newSets, newSets.length === 1 ? await this.wordOf(newSets[0]) : null);
+  }
+
+  // The word of an object if it selects about the same splats: edges of masks leave strays in objects. Else null.
+  async wordOf(set) {
+    const { items, lift } = this;
+    const object = items.find(item => term(item) === set);
+    if (!object || object.score === null || items.filter(({ name }) => name === object.name).length > 1) return null;
+    try {
+      const fields = [{ sets: set }, { text: object.name }].map(field => queryString({ lift: lift.id, ...field }));
+      const [own, ofWord] = (await Promise.all(fields.map(field => fetchBytes(`/query/selection?${field}`)))).map(readNpy);
+      const both = own.filter((isSelected, splat) => isSelected && ofWord[splat]).length;
+      const either = own.filter((isSelected, splat) => isSelected || ofWord[splat]).length;
+      return both > SAME_SHARE * either ? object.name : null;
+    } catch { return null; }
   }
 
   // Select the object at an example; if it is selected, its part there, and so on down to the smallest. False if there is

@@ -14,17 +14,14 @@ export class QueryPanel {
   // onChange(): colours, boxes or the link must be updated. flyToBox(box): move the camera. ownNames(): names that people
   // gave to objects.
   constructor({ onChange, flyToBox, ownNames }) {
-    Object.assign(this, { onChange, flyToBox, ownNames, questions: [], activeIndex: 0, objectIndex: -1, negatives: [], showsHeat: false, requestNumber: 0, lift: null });
+    Object.assign(this, { onChange, flyToBox, ownNames, questions: [], activeIndex: 0, objectIndex: -1, negatives: [], requestNumber: 0, lift: null });
     byId("query").addEventListener("submit", event => { event.preventDefault(); this.fromForm(); });
     this.completions = new Completions(async text => ({ words: [...this.ownNames().filter(({ word }) => word.toLowerCase().startsWith(text.toLowerCase())).map(({ word }) => ({ word, typed: word })), ...(await this.suggestWords(text)).words] }));
     byId("but").addEventListener("input", () => { this.negativesTyped = true; });
     byId("clear").addEventListener("click", () => this.reset(true));
-    byId("heat").addEventListener("change", () => { this.showsHeat = byId("heat").checked; this.onChange(); });
-    byId("previous").addEventListener("click", () => this.stepObject(-1));
-    byId("next").addEventListener("click", () => this.stepObject(1));
+    byId("heat").addEventListener("change", () => this.onChange());
     byId("cut").addEventListener("input", () => this.setThreshold(Number(byId("cut").value)));
     byId("auto").addEventListener("click", () => this.useAutoThreshold());
-    byId("nearest").addEventListener("click", () => this.showClosest());
     new ResizeObserver(() => this.drawBars()).observe(byId("histogram"));
   }
 
@@ -66,7 +63,7 @@ export class QueryPanel {
 
   // Ask a word in place of a question's text, or as the only question.
   askWord(word, question = null) {
-    if (question) Object.assign(question, { text: [word], threshold: "auto" });
+    if (question) Object.assign(question, { text: [word], wordOf: undefined, threshold: "auto" });
     else this.questions = [newQuestion({ text: [word] }, 0)];
     byId("words").value = this.questions.flatMap(({ text }) => text).join(", ");
     this.activeIndex = Math.max(0, this.questions.indexOf(question));
@@ -110,11 +107,16 @@ export class QueryPanel {
     return this.ask(this.current);
   }
 
-  // Show objects or selections as they are.
-  askSets(sets) {
+  // The sets of the current question, or the one that its word answers for.
+  get sets() {
+    return this.current?.wordOf ?? this.current?.sets ?? [];
+  }
+
+  // Show objects or selections, by the word that answers for them, if there is one.
+  askSets(sets, word = null) {
     byId("words").value = byId("but").value = "";
     if (!sets.length) return this.reset(true);
-    this.questions = [newQuestion({ sets }, 0)];
+    this.questions = [newQuestion(word ? { text: [word], wordOf: sets } : { sets }, 0)];
     this.activeIndex = 0;
     return this.ask();
   }
@@ -126,14 +128,14 @@ export class QueryPanel {
     const questions = linkedQuestions(parameters);
     if (!questions.length) return undefined;
     this.questions = questions;
-    byId("heat").checked = this.showsHeat = parameters.get("layer") === "attention" || parameters.has("heat");
+    byId("heat").checked = parameters.has("heat");
     return this.ask();
   }
 
   link(parameters) {
     const negatives = this.questions.length ? this.negatives : []; // all questions have the same ones
     for (const [name, value] of queryString({ ...linkFields(this.questions), negatives })) parameters.append(name, value);
-    if (this.showsHeat) parameters.set("heat", "1");
+    if (byId("heat").checked) parameters.set("heat", "1");
   }
 
   // The body of a request for a question.
@@ -152,7 +154,7 @@ export class QueryPanel {
     const isPending = question => !question.answer && !question.problem; // its reply will be dropped
     const pending = only ? this.questions.filter(question => question === only || isPending(question)) : this.questions;
     if (pending.length === this.questions.length) this.negatives = splitWords(byId("but").value); // other answers were made without them
-    for (const question of pending) Object.assign(question, { answer: null, objects: [], problem: null, showsClosest: false });
+    for (const question of pending) Object.assign(question, { answer: null, objects: [], problem: null });
     this.objectIndex = -1;
     byId("stage").classList.add("asking");
     this.render();
@@ -177,7 +179,6 @@ export class QueryPanel {
       if (turn !== this.requestNumber) return;
       Object.assign(question, state);
       if (question.threshold === "auto") question.auto = state.answer.threshold.value;
-      else if (question.auto === undefined) question.auto = await this.autoThreshold(question);
     } catch (problem) {
       if (turn !== this.requestNumber) return;
       question.problem = problem;
@@ -187,10 +188,6 @@ export class QueryPanel {
       if (!question.text.length && !question.like.length) this.questions = this.questions.filter(entry => entry !== question);
       this.activeIndex = Math.max(0, Math.min(this.activeIndex, this.questions.length - 1));
     }
-  }
-
-  async autoThreshold(question) {
-    return (await fetchJson(`/query?${this.requestParameters({ ...question, threshold: "auto" }, { top: 0 })}`)).threshold.value;
   }
 
   // Load the selected objects of a question, with their boxes.
@@ -220,7 +217,6 @@ export class QueryPanel {
     if (!question?.answer) return;
     question.cut = question.threshold = value;
     question.paintedScores = question.scores;
-    question.showsClosest = true;
     question.count = countFrom(question.scores, value);
     question.objects = [];
     this.objectIndex = -1;
@@ -230,33 +226,10 @@ export class QueryPanel {
     this.objectsTimer = setTimeout(() => this.loadObjects(question), OBJECTS_DELAY);
   }
 
-  // Show the nearest splats of a question that selected none: the best hundredth of one that is absent.
-  showClosest() {
-    const { current: question } = this;
-    question.showsClosest = true;
-    if (question.answer.present === false) {
-      question.cut = question.threshold = question.answer.statistics.q99;
-      question.paintedScores = question.scores;
-      question.count = countFrom(question.scores, question.cut);
-    }
-    this.render();
-    this.onChange();
-    this.loadObjects(question);
-  }
-
   useAutoThreshold() {
     if (!this.current?.answer || this.current.threshold === "auto") return;
     this.current.threshold = "auto";
     this.ask(this.current);
-  }
-
-  stepObject(offset) {
-    const objects = this.current?.objects || [];
-    if (!objects.length) return;
-    this.objectIndex = (this.objectIndex + offset + objects.length + (this.objectIndex < 0 && offset < 0 ? 1 : 0)) % objects.length;
-    this.render();
-    this.onChange();
-    this.flyToBox(objects[this.objectIndex].box);
   }
 
   // The questions that the viewer paints, each with its threshold.
@@ -265,7 +238,7 @@ export class QueryPanel {
   }
 
   heatScores() {
-    return this.showsHeat ? heatOf(this.current) : null;
+    return byId("heat").checked ? heatOf(this.current) : null;
   }
 
   boxes() {
@@ -353,9 +326,8 @@ export class QueryPanel {
     byId("answer").classList.toggle("unsure", isUncertain(question));
     byId("slider-value").textContent = answer && Number.isFinite(question.cut) ? question.cut.toFixed(3) : "";
     byId("auto").disabled = !answer || question.threshold === "auto";
-    byId("nearest").hidden = !answer || isPainted(question) || question.sets.length > 0;
     if (!answer) {
-      byId("answer").textContent = question.problem ? (question.problem.nearest ? `\u201c${question.text.join(", ")}\u201d is not in the list of words of this scene.` : problemText(question.problem)) : "Searching\u2026";
+      byId("answer").textContent = question.problem ? (question.problem.nearest ? "" : problemText(question.problem)) : "Searching\u2026";
       byId("why").textContent = "";
     } else if (question.sets.length && !question.count) {
       byId("answer").textContent = "Nothing is selected.";
@@ -381,9 +353,7 @@ export class QueryPanel {
   listObjects() {
     const { current: question } = this;
     const objects = question.objects || [];
-    byId("stepping").hidden = !objects.length || (question.sets.length === 1 && objects.length === 1);
-    byId("which").textContent = this.objectIndex < 0 ? plural(objects.length, "object") : `${this.objectIndex + 1} of ${objects.length}`;
-    byId("objects").replaceChildren(...(question.sets.length ? [] : objects).map((object, index) => el("li", {},
+    byId("objects").replaceChildren(...(question.sets.length === 1 ? [] : objects).map((object, index) => el("li", {},
       el("button", { type: "button", className: "object", "aria-pressed": String(index === this.objectIndex), on: { click: () => this.selectObject(question, index) } },
         el("b", {}, String(index + 1)), el("span", {}, plural(object.splats, "splat"), el("small", {}, boxSize(object.box))),
         el("span", { className: "score", title: "mean score" }, object.score.toFixed(2))))));
@@ -428,7 +398,7 @@ export const heatOf = question => (question?.answer ? { scores: question.scores,
 
 const newQuestion = (terms, index) => ({ ...defaultFields(), objects: [], ...terms, colour: COLOURS[index % COLOURS.length] });
 const splitWords = text => text.split(",").map(word => word.trim()).filter(Boolean);
-const isPainted = question => question.showsClosest || question.threshold !== "auto" || (question.answer.clear && question.answer.present !== false);
+const isPainted = question => question.threshold !== "auto" || (question.answer.clear && question.answer.present !== false);
 const describeTerm = term => term.replace(/^splat:/, "splat ").replace(/^(.*):(box|stroke):[\d,\s]+$/, "a $2 of $1");
 export const namesByTerm = new Map(); // names of objects and selections by their terms
 export const questionLabel = question => question.text.join(", ") || question.sets.map(set => namesByTerm.get(set) || set.replace(/^object:(\d+)$/, (_, number) => `object ${Number(number) + 1}`).replace(/^selection:.*/, "a selection")).join(", ") || (question.like.length > 1 ? `like ${question.like.length} examples` : `like ${describeTerm(question.like[0] || "")}`);
@@ -459,10 +429,8 @@ function adviceLines(question, panel) {
 }
 
 // The reason for the selection, in the service's words.
-function thresholdReason({ answer, threshold, showsClosest, sets }) {
+function thresholdReason({ answer, threshold, sets }) {
   if (sets.length) return "";
   if (typeof threshold === "number") return "You set this threshold. The dashes mark the automatic one.";
-  const isUnsure = answer.present === false || (answer.present === null && answer.presence !== null);
-  if (isUnsure || (!answer.clear && showsClosest)) return `${answer.reason}${showsClosest ? " These splats are the nearest." : ""}`;
-  return answer.threshold.explanation;
+  return answer.present === null && answer.presence !== null ? answer.reason : answer.threshold.explanation;
 }

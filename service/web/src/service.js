@@ -153,7 +153,7 @@ export async function download(path, fallback, body, useFallback = false) {
   downloadBlob(await reply.blob(), fileName && !useFallback ? fileName[1] : fallback);
 }
 
-export function downloadBlob(blob, name) {
+function downloadBlob(blob, name) {
   const anchor = document.createElement("a");
   anchor.href = URL.createObjectURL(blob);
   anchor.download = name;

@@ -5,7 +5,6 @@ import { textSpaceLabel } from "./lifts.js";
 import { download, fetchBytes, events, fetchJson, fetchPicture, patch, post, remove, upload, problemText } from "./service.js";
 
 const PAGE_SIZE = 20; // of each list
-const MAX_LIFTS = 100; // that are searched for one with the settings of a run
 const REFRESH_INTERVAL = 15_000; // ms between updates of the lists while the panel is open
 const PLAN_DELAY = 400; // ms from the last change to the request of a plan
 const SINGLE_KINDS = ["splats", "cameras", "photos", "table"]; // of which the last good file counts
@@ -23,7 +22,7 @@ export class UploadPanel {
   // onRaise(): show this panel. showFile(file): draw splats before they are lifted.
   constructor({ onOpen, onDelete, openLiftId, onRaise, showFile }) {
     Object.assign(this, { onOpen, onDelete, openLiftId, onRaise, showFile, files: [], followedJobs: new Map(), jobs: [] });
-    this.chart = new Chart({ onOpen, onOrder: (job, name) => this.followOrder(job, { name }) });
+    this.chart = new Chart({ onOrder: (job, name) => this.followOrder(job, { name }) });
     const allowDrop = event => { if ([...event.dataTransfer.types].includes("Files")) event.preventDefault(); };
     addEventListener("dragover", event => { allowDrop(event); document.body.classList.add("dragging"); });
     addEventListener("dragleave", event => { if (!event.relatedTarget) document.body.classList.remove("dragging"); });
@@ -262,7 +261,6 @@ export class UploadPanel {
     try {
       for await (const { event, data } of events(`/jobs/${job.id}/events`, end.signal)) {
         if (event === "progress") { job.progress = data; step?.(data); }
-        if (event === "plan") job.plan = data;
         if (event === "state") Object.assign(job, data);
         this.showJobs();
       }
@@ -311,7 +309,6 @@ export class UploadPanel {
       parts.push(el("progress", { max: step.total || 1, value: step.completed, "aria-label": name }),
         el("span", { className: "state" }, `${name}${step.total > 1 ? `: ${formatCount(step.completed)} of ${formatCount(step.total)} ${step.unit}` : ""}${step.eta_s ? `, ${Math.ceil(step.eta_s)} s left` : ""}`));
     }
-    if (job.plan && !FINAL_STATES.includes(job.state)) parts.push(el("ul", { className: "plan" }, ...planItems(job.plan)));
     if (job.problem) parts.push(el("span", { className: "state bad" }, problemText(job.problem)));
     if (FINAL_STATES.includes(job.state) && job.ended) parts.push(el("span", { className: "state" }, `${job.started ? `took ${(job.ended - job.started).toFixed(1)} s, ` : ""}${ago(job.ended)}`));
     const actions = el("span", { className: "actions" });
@@ -358,11 +355,11 @@ function summarize({ kind, counts = {} }) {
   return parts.join(", ");
 }
 
-// A comparison of settings: the service's chart, and its runs; a click opens the lift of one.
+// A comparison of settings: the service's chart, and its runs; a click lifts by the settings of one.
 class Chart {
-  // onOpen(id): open a lift. onOrder(job, name): follow the job of a new one.
-  constructor({ onOpen, onOrder }) {
-    Object.assign(this, { onOpen, onOrder });
+  // onOrder(job, name): follow the job of a lift.
+  constructor({ onOrder }) {
+    Object.assign(this, { onOrder });
     byId("chart-picture").addEventListener("click", () => download(`/tradeoffs/${this.tradeoff.id}/chart`, "speed-against-accuracy.png", undefined, true).catch(problem => notify(problemText(problem), true)));
   }
 
@@ -380,15 +377,11 @@ class Chart {
     byId("chart").showModal();
   }
 
-  // Open the lift of a run's settings, or order one of the same files.
+  // Order a lift by a run's settings of the same files.
   async openRun(run) {
     const { splats, cameras, features } = this.tradeoff;
     try {
-      const { lifts } = await fetchJson(`/lifts?limit=${MAX_LIFTS}`);
-      const hasSettings = lift => Object.keys(run.settings).every(name => JSON.stringify(lift.settings[name]) === JSON.stringify(run.settings[name]));
-      const existing = lifts.find(lift => lift.splats === splats && lift.cameras === cameras && String(lift.features) === String(features) && hasSettings(lift));
       byId("chart").close();
-      if (existing) return await this.onOpen(existing.id);
       notify(`Lifting with \u201c${run.name}\u201d. The lift opens when it is finished.`);
       return await this.onOrder(await post("/lift", { splats, cameras, features, settings: run.settings }), run.name);
     } catch (problem) {

@@ -422,7 +422,7 @@ export class Viewer {
     return [...this.camera.position.toArray(), ...this.controls.target.toArray()];
   }
 
-  // Pick the splat nearest to where the ray of a canvas position hits the splats: {splat, point, at}, or null.
+  // Pick the splat nearest to where the ray of a canvas position hits the splats: {splat, point}, or null.
   pick(x, y) {
     if (!this.mesh) return null;
     this.mesh.context.numSplats.value = this.count; // also while fewer are drawn
@@ -445,7 +445,7 @@ export class Viewer {
         nearest = index;
       }
     }
-    return nearest < 0 ? null : { splat: this.rowOf(nearest), point: hit.point, at: this.toWorld(hit.point.toArray()) };
+    return nearest < 0 ? null : { splat: this.rowOf(nearest), point: hit.point };
   }
 
   // The centres of the splats of each value: medians, which ignore outliers. values: one for each row of the lift.
@@ -484,13 +484,6 @@ export class Viewer {
       this.boxes.add(line);
     }
     this.draw();
-  }
-
-  // Wait until all splats are drawn, and return the canvas.
-  async completeCanvas() {
-    while (this.mesh && !this.settled) await new Promise(later => setTimeout(later, 50));
-    this.renderer.render(this.scene, this.camera);
-    return this.canvas;
   }
 }
 
