@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import liftcore as lc
 import numpy as np
@@ -106,3 +108,73 @@ def test_size_of_a_turned_photo_is_as_it_is_stored(tmp_path: Path) -> None:
         (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 50.0, "frames": [frame], **centre}))
         camera = lc.read_cameras(tmp_path / "transforms.json")["a"]
         assert (camera.width, camera.height) == size
+
+
+def coco(counts: str) -> bytes:
+    """Return a data set of COCO with a mask of 2 x 3 pixels by its run lengths."""
+    mask = {"image_id": 1, "category_id": 1, "segmentation": {"size": [2, 3], "counts": counts}}
+    images = [{"id": 1, "file_name": "é.png", "height": 2, "width": 3}]
+    return json.dumps({"images": images, "annotations": [mask], "categories": [{"id": 1, "name": "mug"}]}).encode()
+
+
+def npy(array: np.ndarray) -> bytes:
+    content = io.BytesIO()
+    np.save(content, array)
+    return content.getvalue()
+
+
+MAP = np.arange(60, dtype=np.float32).reshape(5, 3, 4)  # [F, h, w]
+VECTORS, MASKS = np.eye(2, dtype=np.float32), np.eye(2, dtype=bool)[:, None].repeat(2, axis=1)  # [M, F], [M, h, w]
+ODD_FORMS: dict[str, tuple[dict[str, bytes], dict[str, bytes], dict[str, Any]]] = {  # plain files, odd files, options
+    "run lengths as Python's text of bytes": (
+        {"m.json": coco("123")}, {"m.json": coco("b'123'")}, {"kind": "prompts"},
+    ),
+    "map in a batch of one": (
+        {"é.npy": npy(MAP)}, {"é.npy": npy(MAP[None])}, {"kind": "npy", "layout": "chw"},
+    ),
+    "name in another form of Unicode": (
+        {"é.npy": npy(MAP)}, {"e\u0301.npy": npy(MAP)}, {"kind": "npy", "layout": "chw"},
+    ),
+    "masks as SAM's predictor gives them": (
+        {"é.npy": npy(VECTORS), "é_masks.npy": npy(MASKS)},
+        {"é.npy": npy(VECTORS), "é_masks.npy": npy(MASKS[:, None])}, {"kind": "masks"},
+    ),
+    "files of an operating system": (
+        {"é.npy": npy(MAP)},
+        {"é.npy": npy(MAP), "._é.npy": b"x", "Thumbs.db": b"x"}, {"kind": "npy", "layout": "chw"},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("form", ODD_FORMS)
+def test_an_odd_form_makes_the_pack_of_the_plain_one(form: str, tmp_path: Path) -> None:
+    *contents, options = ODD_FORMS[form]
+    views = []
+    for number, files in enumerate(contents):
+        folder, pack = tmp_path / str(number), tmp_path / f"{number}.safetensors"
+        folder.mkdir()
+        for name, content in files.items():
+            (folder / name).write_bytes(content)
+        lc.pack_folder(folder, pack, progress=False, **options)
+        views.append(lc.read_features(pack)["é"])
+    plain, odd = views
+    assert plain.codebook.equal(odd.codebook)
+    assert isinstance(plain, lc.FeatureGrid) or plain.labels.equal(odd.labels)
+
+
+def test_a_frame_in_which_nothing_was_found_has_no_label(tmp_path: Path) -> None:
+    for name, count in (("a", 2), ("b", 0)):
+        (tmp_path / f"{name}.npy").write_bytes(npy(VECTORS[:count]))
+        (tmp_path / f"{name}_masks.npy").write_bytes(npy(MASKS[:count]))
+    lc.pack_folder(tmp_path, tmp_path / "out.safetensors", "masks", progress=False)
+    views: Any = lc.read_features(tmp_path / "out.safetensors")
+    assert (views["a"].labels >= 0).any() and (views["b"].labels == -1).all()
+
+
+def test_remarks_of_a_ply_are_kept_and_not_understood(tmp_path: Path) -> None:
+    plain, remarks = ply(splat_rows()), b"comment d\xe9j\xe0 vu, element vertex 3\nobj_info end of 7\nelement"
+    (tmp_path / "s.ply").write_bytes(plain.replace(b"element", remarks, 1))
+    splats = lc.read_splats(tmp_path / "s.ply")
+    lc.write_splats(tmp_path / "copy.ply", splats)
+    assert (tmp_path / "copy.ply").read_bytes() == (tmp_path / "s.ply").read_bytes()
+    assert splats.means.equal(torch.from_numpy(splat_rows()[:, :3])) and not splats.warnings
