@@ -85,7 +85,8 @@ def reading(source: object, error: type[SplatliftError], expected: str, hint: st
     except SplatliftError:
         raise
     except OSError as fault:
-        raise error(str(source), expected=expected, got=str(fault.strerror or fault)[:120], hint=hint) from None
+        got = f"a file that does not open ({fault.strerror or fault})"[:160]
+        raise error(str(source), expected=expected, got=got, hint=hint) from None
     except (ValueError, TypeError, LookupError, OverflowError, RecursionError, EOFError, SyntaxError) as fault:
         seen, separator, got = str(fault).partition(", got ")
         got, _, remedy = got.partition("; ") if separator else (seen, "", "")

@@ -2,15 +2,15 @@
 
 from liftcore.features.encoders.encode import read_image as read_image
 from liftcore.io.cameras import camera_files as camera_files
+from liftcore.io.files import check_output as check_output
 from liftcore.io.files import is_zip as is_zip
 from liftcore.io.files import visible_files as visible_files
 from liftcore.io.files import whole_file as whole_file
+from liftcore.io.files import writing as writing
 from liftcore.io.json_file import finite as finite
 from liftcore.io.kinds import identify as identify
 from liftcore.io.kinds import page_table as page_table
 from liftcore.io.kinds import wrong_kind as wrong_kind
-from liftcore.io.outputs import check_output as check_output
-from liftcore.io.outputs import writing as writing
 from liftcore.io.photo_zip import PhotoIndexes as PhotoIndexes
 from liftcore.io.photo_zip import in_camera_orientation as in_camera_orientation
 from liftcore.io.safetensors_file import with_metadata as with_metadata

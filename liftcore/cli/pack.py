@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 OPTIONS = (
-    "layout", "map_fit", "unlabelled", "encoder", "photos", "device", "names", "folders", "unannotated",
+    "layout", "map_fit", "unlabelled", "encoder", "photos", "device", "names", "unannotated",
     "encoder_name", "text_space", "normalised",
 )  # options of `pack_folder`  # fmt: skip
 NAMES = {
@@ -41,7 +41,6 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
     masks.add_argument("--device", default="cpu", metavar="NAME", help="of the model, as torch names it")
     prompts = formats.add_parser("prompts", parents=[shared], help="masks by phrase: PHRASE/VIEW.png or JSON")
     prompts.add_argument("--names", type=Path, metavar="FILE", help='of values, JSON: {"1": "red mug"}')
-    prompts.add_argument("--folders", choices=("phrases", "views"), default="phrases", help="of PNGs")
     prompts.add_argument("--unlabelled", type=_grey, metavar="VALUE", help=unlabelled)
     unannotated = "images: left out, or without phrases"
     prompts.add_argument("--unannotated", choices=("skip", "negative"), default="skip", help=unannotated)

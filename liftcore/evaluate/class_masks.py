@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from liftcore.errors import InvalidMasks
+from liftcore.errors import InvalidMasks, reading
 from liftcore.io.safetensors_file import check_header
 from liftcore.scene.views import composed
 from liftcore.values.pack import U8_NO_LABEL
@@ -64,7 +64,8 @@ def _masks(path: Path, classes: int | None) -> Iterator[tuple[str, Tensor, int]]
     """Iterate over views in order, with their mask [h, w] i64 and its highest number."""
     from safetensors import SafetensorError, safe_open
 
-    check_header(path, str(path), InvalidMasks, expected=EXPECTED)
+    with reading(path, InvalidMasks, EXPECTED):
+        check_header(path)
     try:
         with safe_open(str(path), framework="pt") as handle:
             for name in sorted(name for name in tuple(handle.keys()) if name.endswith("/mask")):

@@ -15,7 +15,7 @@ import numpy as np
 
 from liftcore.errors import InvalidFeatures, reading
 from liftcore.io.files import visible_files
-from liftcore.io.npy import ARRAYS, TENSORS, open_npy, read_floats
+from liftcore.io.npy import ARRAYS, TENSORS, open_array, read_floats
 from liftcore.scene.views import composed, without_image_suffix
 from liftcore.values.fit import Fit
 from liftcore.values.views import FeatureGrid, Regions, ViewFeatures
@@ -110,7 +110,7 @@ def langsplat_views(folder: Path) -> ViewFolder[Regions]:
 
     def read(view: str) -> Regions:
         codebook = read_floats(codebooks[view], "M, F")
-        ids = whole_numbers(open_npy(labels[view]))
+        ids = whole_numbers(open_array(labels[view]))
         return Regions(ids, codebook, context=f"view {view!r}")
 
     return ViewFolder(labels, read, codebooks.values())
@@ -155,11 +155,7 @@ def npy_files(folder: Path, *suffixes: str) -> list[Path]:
 def files_by_view(
     paths: Iterable[Path], folder: Path, *suffixes: str, noun: str = "file", hint: str = ""
 ) -> dict[str, Path]:
-    """Return view name -> file. A view name is the file's without the first matching suffix and an image suffix.
-
-    Args:
-        noun: for the files, in errors. hint: of errors.
-    """
+    """Return view name -> file. A view name is the file's without the first matching suffix and an image suffix."""
     by_view: dict[str, Path] = {}
     for path in paths:
         inner = path.relative_to(folder).as_posix()

@@ -147,11 +147,7 @@ def mask_records(content: Any) -> list[Any]:
 
 
 def read_mask(segmentation: Any, size: tuple[int, int] | None) -> StoredMask | None:
-    """Read run lengths or polygons; None if there is neither.
-
-    Args:
-        size: (h, w) of the image, needed for polygons; None: unknown.
-    """
+    """Read run lengths or polygons; None if there is neither."""
     if segmentation is None or segmentation == []:
         return None
     if isinstance(segmentation, list):

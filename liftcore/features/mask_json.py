@@ -68,11 +68,7 @@ class MaskDocument:
 
 
 def read_mask_document(path: Path, *, unannotated_negative: bool = False) -> MaskDocument:
-    """Read a JSON document of masks by phrase.
-
-    Args:
-        unannotated_negative: images without an annotation show none of the document's phrases.
-    """
+    """Read a JSON document of masks by phrase."""
     document = MaskDocument(path, [])
     with reading(path, InvalidFeatures, "COCO's JSON, or records with masks and phrases", AS_COCO):
         content = read_mask_json(path)

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack, get_args
 from liftcore.errors import InvalidInput
 from liftcore.features.folders import Layout, ViewFolder, array_views, folders_of, langsplat_views
 from liftcore.features.masks import mask_files, mask_views
-from liftcore.features.prompts import Folders, Unannotated, prompt_views
-from liftcore.io.files import whole_file
-from liftcore.io.outputs import check_output, writing
+from liftcore.features.prompts import Unannotated, prompt_views
+from liftcore.io.files import check_output, whole_file, writing
 from liftcore.io.photos import orientation_warnings
 from liftcore.io.safetensors_file import with_metadata
 from liftcore.runtime.arguments import as_path, check_choice, check_text, one_of
@@ -30,12 +29,11 @@ OPTIONS = {  # of each kind of files
     "langsplat": (),
     "npy": ("layout", "map_fit"),
     "masks": ("unlabelled", "encoder", "photos", "device"),
-    "prompts": ("unlabelled", "names", "folders", "unannotated"),
+    "prompts": ("unlabelled", "names", "unannotated"),
 }
 CHOICES = {
     "layout": get_args(Layout),
     "map_fit": FITS,
-    "folders": get_args(Folders),
     "unannotated": get_args(Unannotated),
 }
 LANGSPLAT_LEVELS = ("default", "s", "m", "l")  # SAM's masks, then subparts, parts and wholes
@@ -58,8 +56,7 @@ class PackOptions(TypedDict, total=False):
     device: str
     """of ``encoder``, as torch names it"""
     names: Path | str | None
-    """of ``prompts``, as for `liftcore.features.prompts.prompt_views`, as are ``folders`` and ``unannotated``"""
-    folders: Folders
+    """of ``prompts``, as for `liftcore.features.prompts.prompt_views`, as is ``unannotated``"""
     unannotated: Unannotated
 
 
@@ -156,7 +153,6 @@ def _prompt_views(folder: Path, options: PackOptions) -> tuple[ViewFolder[Any], 
     prompts = prompt_views(
         folder,
         None if names is None else as_path(names, "names"),
-        options.get("folders", "phrases"),
         unlabelled=options.get("unlabelled"),
         unannotated=options.get("unannotated", "skip"),
     )

@@ -7,8 +7,8 @@ table, so a lift of it can be queried by these words without an encoder.
 
 A folder contains, with sub-folders if names of views have some (``camA/000``), one of:
 
-* binary pictures, ``PHRASE/VIEW.png`` or, by ``folders="views"``, ``VIEW/PHRASE.png``; ``_`` stands for a space.
-  They are PNGs, or arrays [h, w] in ``.npy`` or ``.npz``;
+* binary pictures, ``PHRASE/VIEW.png``; ``_`` stands for a space. They are PNGs, or arrays [h, w] in ``.npy`` or
+  ``.npz``;
 * JSON: data sets of COCO, or Grounded SAM 2's records and tracking (`liftcore.features.mask_json`);
 * label pictures ``VIEW.png`` with the names of their values: in a JSON, or in the picture's text ``legend``, as
   ``splatlift segment --labels`` writes it.
@@ -66,7 +66,6 @@ BEYOND = (
 )
 MASK_DATA = "mask_data"  # folder of Grounded SAM 2's tracking, next to json_data
 
-Folders = Literal["phrases", "views"]
 Unannotated = Literal["skip", "negative"]
 Masks = Iterable[tuple[str | None, np.ndarray]]  # of a file: [h, w] bool by phrase, or by VOID for unlabelled pixels
 
@@ -130,7 +129,6 @@ class Prompts:
 def prompt_views(
     folder: Path,
     names: Path | None = None,
-    folders: Folders = "phrases",
     *,
     unlabelled: int | None = None,
     unannotated: Unannotated = "skip",
@@ -138,8 +136,7 @@ def prompt_views(
     """Open the regions of a folder of masks by phrase (see the module). Each view is read at every access.
 
     Args:
-        folder: of the masks. folders: names of the sub-folders of binary pictures, phrases or views.
-        names: of label pictures, JSON from values to names.
+        folder: of the masks. names: of label pictures, JSON from values to names.
         unlabelled: value of unlabelled pixels in pictures (255).
         unannotated: images of a data set without an annotation: ``skip`` them, or ``negative``, they show no phrase.
     """
@@ -163,7 +160,7 @@ def prompt_views(
     elif pictures or any(len(path.relative_to(folder).parts) > 1 for path in arrays):
         for path in pictures or arrays:
             with reading(path, InvalidFeatures, "a mask [h, w]"):
-                _add_binary(index, path, path.relative_to(folder), folders, unlabelled)
+                _add_binary(index, path, path.relative_to(folder), unlabelled)
         warnings += _inverted_masks(index)
     else:
         suffix, count = Counter(path.suffix.lower() for path in files).most_common(1)[0] if files else ("", 0)
@@ -277,11 +274,10 @@ def _plane(values: np.ndarray) -> np.ndarray:
     return plane
 
 
-def _add_binary(index: _MaskIndex, path: Path, inner: Path, folders: Folders, unlabelled: int | None) -> None:
-    parts = PurePosixPath(inner.with_suffix("").as_posix()).parts
-    if len(parts) < 2:
+def _add_binary(index: _MaskIndex, path: Path, inner: Path, unlabelled: int | None) -> None:
+    phrase, *inside = PurePosixPath(inner.with_suffix("").as_posix()).parts
+    if not inside:
         raise ValueError(f"{LAYOUTS}, got a picture outside of folders of phrases, without names")
-    phrase, inside = (parts[0], parts[1:]) if folders == "phrases" else (parts[-1], parts[:-1])
     name = without_image_suffix("/".join(inside))
     index.view(name, path)
     index.name(name, phrase)

@@ -15,18 +15,28 @@ from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
+from typing import Any
 
-from liftcore.errors import InvalidCameras, Unavailable
+from liftcore.errors import InvalidCameras, Unavailable, reading
 from liftcore.io.colmap import MODEL_FILES, has_model, is_whole, model_files, read_colmap, read_image_names
 from liftcore.io.files import BROKEN_ZIP, first_bytes, is_system_file, is_zip, open_regular, open_zip
-from liftcore.io.inria import parse_inria
-from liftcore.io.json_file import read_json
+from liftcore.io.json_file import FORMATS as JSON_FORMATS
+from liftcore.io.json_file import entry, matrix, number, pixels, read_json
 from liftcore.io.kinds import wrong_kind
 from liftcore.io.photos import PhotosBeside
 from liftcore.io.transforms import FRAME_FILE, cameras_in_frame, is_export, parse_export, parse_transforms, read_frame
 from liftcore.runtime.arguments import as_path
 from liftcore.runtime.folders import scratch_folder
-from liftcore.scene.cameras import Cameras, cameras_from
+from liftcore.scene.cameras import (
+    Camera,
+    Cameras,
+    InvalidPose,
+    cameras_from,
+    check_count,
+    read_views,
+    viewmat_of,
+)
+from liftcore.scene.views import view_names
 
 TRANSFORMS, TRAINED_ON = "transforms.json", "transforms_train.json"
 JSON_FILES = (TRANSFORMS, "cameras.json", TRAINED_ON)
@@ -90,7 +100,7 @@ class CameraSource:
             if is_export(document):
                 return parse_export(document, source, read_json(self.data) if self.data else None, photos)
             if isinstance(document, list):
-                return parse_inria(document, source)
+                return _parse_inria(document, source)
             return parse_transforms(document, source, photos)
 
 
@@ -246,6 +256,29 @@ def _scene_of(model: PurePosixPath) -> PurePosixPath:
         ):
             return PurePosixPath(*parts[: len(parts) - len(names)])
     return model
+
+
+def _parse_inria(document: list[Any], source: str) -> Cameras:
+    """Parse the cameras.json of Inria's trainer, which puts the principal point at the image's centre."""
+    with reading(source, InvalidCameras, JSON_FORMATS):
+        if document and not (isinstance(document[0], dict) and "img_name" in document[0]):
+            keys = f"objects with {', '.join(list(document[0])[:5])}" if isinstance(document[0], dict) else ""
+            raise ValueError(f"{JSON_FORMATS}, got a list of {keys or type(document[0]).__name__}")
+        check_count(len(document), source)
+        names = view_names([str(entry(record, "img_name")) for record in document])
+
+    def cameras(name: str, record: dict[str, Any]) -> list[Camera]:
+        with reading(f"{source} camera {name!r}", InvalidCameras, "a camera"):
+            width, height = (pixels(entry(record, key), key) for key in ("width", "height"))
+            fx, fy = (number(entry(record, key), key) for key in ("fx", "fy"))
+        with reading(f"{source} camera {name!r}", InvalidPose, "a pose"):
+            rotation = matrix(entry(record, "rotation"), (3,), 3, "rotation")
+            (position,) = matrix([entry(record, "position")], (1,), 3, "position")
+        pose = viewmat_of(rotation, position)
+        return [Camera.pinhole(name, width, height, fx, fy, width / 2, height / 2, viewmat=pose)]
+
+    views, warnings = read_views(zip(names, document, strict=True), cameras)
+    return Cameras(views, warnings=warnings)
 
 
 # ---- zips

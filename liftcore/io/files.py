@@ -1,4 +1,4 @@
-"""Atomic writes of files, files of the operating system beside others, and pointers of Git LFS."""
+"""Atomic writes of files, checks of outputs, files of the operating system beside others, and Git LFS."""
 
 import errno
 import lzma
@@ -9,13 +9,14 @@ import struct
 import sys
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path, PurePath
 from typing import IO
 
 from liftcore.errors import InvalidCameras, InvalidInput, Unavailable
+from liftcore.runtime.arguments import as_list, as_path, check_choice
 
 LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 # Errors that zipfile and its decompressors raise for a damaged file.
@@ -33,6 +34,17 @@ _END = struct.Struct("<4s4H2LH")  # of a zip: its list's size is the sixth field
 _END64_LOCATOR = struct.Struct("<4sLQL")
 _END64 = struct.Struct("<4sQ2H2L4Q")
 LFS_HINT = "run 'git lfs pull' in the repository where it lies"
+OUTPUT_TYPES = {  # name, suffixes, and a word of the kind or name of a file that is replaced; "": of no known kind
+    "splats": ("splats", (".ply", ".splat", ".spz", ".glb", ".usdc", ".usdz"), "splats"),
+    "ply": ("a PLY", (".ply",), "splats"),
+    "png": ("a picture", (".png",), "a picture"),
+    "npy": ("an array", (".npy",), "a NumPy array"),
+    "lift": ("a lift", (".safetensors",), "lift"),
+    "pack": ("a feature pack", (".safetensors",), "features"),
+    "csv": ("a table", (".csv",), ""),
+    "json": ("JSON", (".json",), "JSON"),
+}
+CONVERT_PLY = "write a .ply, and convert it: npx @playcanvas/splat-transform IN.ply OUT"
 
 
 def first_bytes(head: bytes) -> str:
@@ -142,3 +154,59 @@ def _replace(draft: Path, path: Path) -> None:
         expected = "a file that no program has open"
         hint = "close the lift or the program that reads it, or take another path"
         raise Unavailable(str(path), expected=expected, got=error.strerror or str(error), hint=hint) from error
+
+
+# ---- outputs, checked before the work, so that no hour of it is lost to a misspelt name
+
+
+def check_output(path: Path | str, inputs: Path | str | Iterable[Path | str], kind: str) -> Path | str:
+    """Check that an output can be written, and is no folder, none of the inputs and no file of another kind.
+
+    Args:
+        path: as the user gave it. inputs: files, and folders of cameras, that are read for it. kind: what goes there,
+            one of OUTPUT_TYPES.
+    """
+    from liftcore.io.kinds import identify
+
+    check_choice("kind", kind, OUTPUT_TYPES)
+    path = as_path(path, "output")
+    label, suffixes, word = OUTPUT_TYPES[kind]
+    with writing(path):
+        if path.is_dir():
+            raise InvalidInput("output", expected="a file to write", got=f"the folder {path}")
+        if path.exists() and any(map(path.samefile, _files_of(map(Path, as_list(inputs))))):
+            raise InvalidInput("output", expected="another file than the inputs", got=str(path))
+        name = path.name.lower()
+        if not name.endswith(suffixes) or name.endswith(".compressed.ply"):
+            expected = f"a name of {label}, ending in {' or '.join(suffixes)}"
+            raise InvalidInput(
+                "output", expected=expected, got=str(path), hint=CONVERT_PLY if ".ply" in suffixes else ""
+            )
+        if path.is_file() and path.stat().st_size:
+            present = identify(path)
+            if word not in (present.kind or present.name) or (not word and present.recognised):
+                expected, got = f"a new file, or one of {label} to replace", f"{path}, which is {present.name}"
+                hint = "name another file, or remove that one first"
+                raise InvalidInput("output", expected=expected, got=got, hint=hint)
+        folder = next(parent for parent in path.absolute().parents if os.path.lexists(parent))
+        if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
+            raise InvalidInput("output", expected="a folder that can be written", got=str(folder))
+    return path
+
+
+def _files_of(inputs: Iterable[Path]) -> list[Path]:
+    """Return the existing files of inputs; of a folder of cameras those that are read."""
+    from liftcore.io.cameras import camera_source
+
+    files = (file for source in inputs for file in (camera_source(source).files if source.is_dir() else [source]))
+    return [file for file in files if file.exists()]
+
+
+@contextmanager
+def writing(path: Path | str) -> Iterator[None]:
+    """Name the output in errors of the operating system: a full disk, a folder without permission."""
+    try:
+        yield
+    except OSError as error:
+        got = f"{path} ({error.strerror or error})"
+        raise InvalidInput("output", expected="a file that can be written", got=got) from None

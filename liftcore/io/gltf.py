@@ -11,13 +11,11 @@ Labels are feature ids (``EXT_mesh_features``): ``_FEATURE_ID_0`` is the instanc
 none. ``asset.extras`` has the document that describes them. Other columns of splats are attributes with an underscore
 before their name.
 
-Only the file itself is read: a .glb, or a .gltf with its buffers in data URIs.
+Only the file itself is read, a .glb with its buffer in it.
 """
 
 from __future__ import annotations
 
-import base64
-import binascii
 import json
 import re
 import struct
@@ -57,7 +55,7 @@ SRGB = "srgb_rec709_display"
 
 
 def read_gltf(path: Path, *, colour: bool = True) -> Fields:
-    """Read the fields of all splats in a ``.glb`` or ``.gltf``, node by node, in the frame of PLYs and cameras.
+    """Read the fields of all splats in a ``.glb``, node by node, in the frame of PLYs and cameras.
 
     Feature ids come as ``instance_id`` and ``class_id`` with 0 for none, other attributes with an underscore by their
     names, in lower case.
@@ -81,22 +79,16 @@ class _Asset:
         with open_regular(path) as handle:
             head = handle.read(20)
         self.size = path.stat().st_size
-        if head[:4] == MAGIC:
-            if len(head) < 20 or head[16:20] != JSON_CHUNK or struct.unpack_from("<I", head, 4)[0] != 2:
-                raise _broken("a glTF 2.0 file that begins with JSON", repr(head[4:20]))
-            length = struct.unpack_from("<I", head, 12)[0]
-            if length > min(MAX_JSON_BYTES, self.size - 20):
-                raise _broken(f"at most {MAX_JSON_BYTES} bytes of JSON in the file", str(length))
-            content = np.memmap(path, np.uint8, "r")
-            text, offset = content[20 : 20 + length].tobytes(), 20 + length
-            self.binary = content[:0]
-            if offset + 8 <= self.size and content[offset + 4 : offset + 8].tobytes() == BINARY_CHUNK:
-                (binary_length,) = struct.unpack("<I", content[offset : offset + 4].tobytes())
-                self.binary = content[offset + 8 : offset + 8 + binary_length]
-        else:
-            if self.size > MAX_JSON_BYTES:
-                raise _broken(f"at most {MAX_JSON_BYTES} bytes of JSON", str(self.size), "make a .glb of it")
-            text, self.binary = path.read_bytes(), np.empty(0, np.uint8)
+        if len(head) < 20 or head[16:20] != JSON_CHUNK or struct.unpack_from("<I", head, 4)[0] != 2:
+            raise _broken("a glTF 2.0 file that begins with JSON", repr(head[4:20]))
+        length = struct.unpack_from("<I", head, 12)[0]
+        if length > min(MAX_JSON_BYTES, self.size - 20):
+            raise _broken(f"at most {MAX_JSON_BYTES} bytes of JSON in the file", str(length))
+        content, offset = np.memmap(path, np.uint8, "r"), 20 + length
+        text, self.binary = content[20:offset].tobytes(), content[:0]
+        if offset + 8 <= self.size and content[offset + 4 : offset + 8].tobytes() == BINARY_CHUNK:
+            (binary_length,) = struct.unpack("<I", content[offset : offset + 4].tobytes())
+            self.binary = content[offset + 8 : offset + 8 + binary_length]
         try:
             self.json: Any = json.loads(text)
         except (ValueError, RecursionError) as error:
@@ -109,7 +101,6 @@ class _Asset:
         if unsupported:
             got = f"one that requires {unsupported[0][:80]}"
             raise _broken("a file without other required extensions", got, _hint_of(unsupported[0]))
-        self._buffers: dict[int, np.ndarray] = {}
         asset = self.json.get("asset")
         extras = asset.get("extras") if isinstance(asset, dict) else None
         self.world = world_of(extras[WORLD]) if isinstance(extras, dict) and WORLD in extras else METRES
@@ -286,26 +277,19 @@ class _Asset:
         """Return the bytes [n] u8 of a buffer view."""
         view = self._at(self._list(self.json, "bufferViews"), place, "buffer view")
         first, size, buffer = view.get("byteOffset", 0), view.get("byteLength"), view.get("buffer")
-        content = self._buffer(buffer)
-        if type(first) is not int or type(size) is not int or first < 0 or size < 0 or first + size > len(content):
-            raise _broken("a buffer view that lies in the file", f"{size!r} bytes from {first!r}"[:60])
-        return content[first : first + size]
-
-    def _buffer(self, place: Any) -> np.ndarray:
-        buffer = self._at(self._list(self.json, "buffers"), place, "buffer")
-        uri = buffer.get("uri")
-        if uri is None and place == 0:
-            return self.binary
-        if not isinstance(uri, str) or not uri.startswith("data:") or ";base64," not in uri[:200]:
+        uri = self._at(self._list(self.json, "buffers"), buffer, "buffer").get("uri")
+        if buffer != 0 or uri is not None:
             got = f"a buffer in {str(uri)[:60]!r}"
             raise _broken("buffers within the file", got, "make one .glb of it, with its buffers")
-        if place not in self._buffers:
-            try:
-                content = base64.b64decode(uri.partition(";base64,")[2], validate=True)
-            except (binascii.Error, ValueError) as error:
-                raise _broken("base64 as a buffer", str(error)[:60]) from None
-            self._buffers[place] = np.frombuffer(content, np.uint8)
-        return self._buffers[place]
+        if (
+            type(first) is not int
+            or type(size) is not int
+            or first < 0
+            or size < 0
+            or first + size > len(self.binary)
+        ):
+            raise _broken("a buffer view that lies in the file", f"{size!r} bytes from {first!r}"[:60])
+        return self.binary[first : first + size]
 
     def _count(self, primitive: dict[str, Any]) -> int:
         attributes = primitive.get("attributes")

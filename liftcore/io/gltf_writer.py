@@ -47,9 +47,6 @@ def gltf_blocks(splats: Splats, document: Mapping[str, Any] | None = None) -> It
     """Yield the bytes of a ``.glb`` of any splats (`gaussian_rows`), with their extras and the labels' document.
 
     Harmonics above degree 3 are left out; 2DGS and DBS become the nearest Gaussians, as ``asset.extras`` records.
-
-    Args:
-        splats: P. document: of `liftcore.io.labels`; None: splats without labels.
     """
     binary, columns = _Binary(), stored_columns(splats)
     sets = [name for name in IDS if name in columns]

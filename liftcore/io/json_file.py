@@ -1,4 +1,4 @@
-"""JSON: camera files read under a limit, checked values with their place in errors, and finite output."""
+"""JSON: camera files read under a limit, checked values, and finite output."""
 
 import json
 import math
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from liftcore.errors import InvalidCameras
+from liftcore.errors import InvalidCameras, reading
 from liftcore.io.files import open_regular, refuse_pointer
 
 MAX_JSON_BYTES = 64 * 1024 * 1024
@@ -17,54 +17,52 @@ FORMATS = "an object with 'frames' (nerfstudio) or a list of cameras with 'img_n
 
 def read_json(path: Path) -> Any:
     """Read the document in a JSON file of at most 64 MiB."""
-    try:
+    with reading(path, InvalidCameras, "a camera file"):
         with open_regular(path) as handle:
             content = handle.read(MAX_JSON_BYTES + 1)
         if len(content) > MAX_JSON_BYTES:
-            raise InvalidCameras(str(path), expected=f"JSON of at most {MAX_JSON_BYTES} bytes", got="a larger file")
+            raise ValueError(f"JSON of at most {MAX_JSON_BYTES} bytes, got a larger file")
         refuse_pointer(str(path), content)
-        return json.loads(content)
-    except OSError as error:
-        got = f"one that does not open ({error.strerror})"
-        raise InvalidCameras(str(path), expected="a camera file", got=got) from None
-    except (ValueError, RecursionError) as error:
-        got = f"a file that does not parse ({str(error)[:120]})"
-        raise InvalidCameras(str(path), expected="cameras as JSON", got=got) from None
+    with reading(path, InvalidCameras, "cameras as JSON"):
+        try:
+            return json.loads(content)
+        except (ValueError, RecursionError) as error:
+            raise ValueError(f"cameras as JSON, got a file that does not parse ({str(error)[:120]})") from None
 
 
-def entry(record: Any, key: str, source: str) -> Any:
+def entry(record: Any, key: str) -> Any:
     """Return the value of a required key."""
     if not isinstance(record, dict) or key not in record:
         got = "an object without it" if isinstance(record, dict) else type(record).__name__
-        raise InvalidCameras(source, expected=f"an object with {key!r}", got=got)
+        raise ValueError(f"an object with {key!r}, got {got}")
     return record[key]
 
 
-def number(value: Any, source: str) -> float:
+def number(value: Any, name: str) -> float:
     """Check that a value is a finite number, and return it as float."""
     try:
         if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
             return float(value)
     except OverflowError:
         pass  # an integer beyond every float is refused as infinity is
-    raise InvalidCameras(source, expected="a finite number", got=repr(value)[:60])
+    raise ValueError(f"a finite number as {name}, got {repr(value)[:60]}")
 
 
-def pixels(value: Any, source: str) -> int:
+def pixels(value: Any, name: str) -> int:
     """Check that a value is a whole number of pixels; 990.0 counts as 990."""
-    count = number(value, source)
+    count = number(value, name)
     if count != int(count):
-        raise InvalidCameras(source, expected="a whole number of pixels", got=repr(value)[:60])
+        raise ValueError(f"a whole number of pixels as {name}, got {repr(value)[:60]}")
     return int(count)
 
 
-def matrix(value: Any, rows: tuple[int, ...], columns: int, source: str) -> np.ndarray:
+def matrix(value: Any, rows: tuple[int, ...], columns: int, name: str) -> np.ndarray:
     """Convert nested lists to a matrix [r, columns] f64, r being one of ``rows``."""
     shaped = isinstance(value, list) and len(value) in rows
     if not shaped or not all(isinstance(row, list) and len(row) == columns for row in value):
         shapes = " or ".join(f"{count}x{columns}" for count in rows)
-        raise InvalidCameras(source, expected=f"a {shapes} matrix as nested lists", got=repr(value)[:60])
-    return np.array([[number(cell, source) for cell in row] for row in value])
+        raise ValueError(f"a {shapes} matrix of nested lists as {name}, got {repr(value)[:60]}")
+    return np.array([[number(cell, name) for cell in row] for row in value])
 
 
 def finite(value: Any) -> Any:

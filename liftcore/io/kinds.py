@@ -74,7 +74,7 @@ class SplatFormat(StrEnum):
     SPLAT = ".splat"
     SPZ = ".spz"
     SOG = ".sog"
-    GLTF = ".glb"  # or .gltf, with KHR_gaussian_splatting
+    GLTF = ".glb"  # with KHR_gaussian_splatting
     CHECKPOINT = "checkpoint"  # of gsplat or nerfstudio: a pickle, if only of tensors
 
 
@@ -89,7 +89,7 @@ SUFFIX = {
 }
 PICKLED = (".pt", ".pth", ".ckpt", ".pkl")
 LOD_META = "lod-meta.json"  # of a streamed SOG
-SPLATS_SENT = (".ply", ".splat", ".spz", ".sog", ".glb", ".gltf")  # over HTTP, where no pickle is opened
+SPLATS_SENT = (".ply", ".splat", ".spz", ".sog", ".glb")  # over HTTP, where no pickle is opened
 
 
 @dataclass(frozen=True)
@@ -406,7 +406,8 @@ def _object_rules(document: dict[str, Any], path: Path) -> Iterator[FileKind | N
     yield frame if keys >= {"transform", "scale"} else None
     is_gltf = "asset" in keys and keys & {"buffers", "accessors", "scenes", "meshes"}
     has_splats = "KHR_gaussian_splatting" in str(document.get("extensionsUsed", ""))
-    yield (_splats_as(SplatFormat.GLTF) if has_splats else _GLTF) if is_gltf else None
+    single = replace(_GLTF, name="a .gltf, whose splats lie beside it", hint="make one .glb of it")
+    yield (single if has_splats else _GLTF) if is_gltf else None
     yield _TILES if keys >= {"root", "geometricError"} else None
     hint = "'splatlift pack prompts' makes a feature pack of its folder"
     yield FileKind(None, "masks as JSON (COCO)", hint) if keys >= {"annotations", "images"} else None

@@ -7,7 +7,7 @@ from typing import IO, TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from liftcore.errors import InvalidFeatures
+from liftcore.errors import InvalidFeatures, reading
 from liftcore.io.files import BROKEN_ZIP, open_regular, open_zip
 
 if TYPE_CHECKING:
@@ -22,34 +22,37 @@ BFLOAT16 = np.dtype("V2")  # NumPy has no bfloat16, and reads it as this
 MOST_UNZIPPED_BYTES = 1 << 32  # of the array of a .npz
 ARRAYS, TENSORS = (".npy", ".npz"), (".pt", ".pth")
 HINT = "save plain arrays with numpy.save"
+TENSOR_HINT = "save it alone, torch.save(tensor, name), or as .npy: numpy.save(name, tensor.cpu().numpy())"
 Values = TypeVar("Values", np.ndarray, "Tensor")
 
 
 def open_array(path: Path, kinds: str = NUMBERS) -> np.ndarray:
-    """Open the array of a ``.npy`` file, the only one of a ``.npz``, or the tensor of a ``.pt`` or ``.pth`` file."""
-    if path.suffix.lower() in TENSORS:
-        return _read_tensor(path, kinds)
-    return _read_npz(path, kinds) if path.suffix.lower() == ".npz" else open_npy(path, kinds)
+    """Open the array of a ``.npy`` file, the only one of a ``.npz``, or the tensor of a ``.pt`` or ``.pth`` file.
+
+    Its dtype is one of ``kinds``, in NumPy's letters. A ``.npy`` file is mapped.
+    """
+    suffix = path.suffix.lower()
+    read = _tensor if suffix in TENSORS else _zipped if suffix == ".npz" else _mapped
+    with reading(path, InvalidFeatures, "an array of numbers", TENSOR_HINT if suffix in TENSORS else HINT):
+        try:
+            return read(path, kinds)
+        except (*BROKEN_ZIP, *PARSE_ERRORS) as error:
+            if isinstance(error, OSError) or ", got " in str(error):
+                raise
+            raise ValueError(f"a {suffix} file, got one that does not parse ({str(error)[:120]})") from None
 
 
-def open_npy(path: Path, kinds: str = NUMBERS) -> np.ndarray:
-    """Map a ``.npy`` file whose dtype is one of ``kinds``, in NumPy's letters."""
-    try:
-        with open_regular(path) as handle:
-            size = handle.seek(0, 2)
-            handle.seek(0)
-            dtype = _check_header(handle, size, path, kinds)
-            is_empty = handle.tell() == size  # which cannot be mapped
-        array = np.load(path, mmap_mode=None if is_empty else "r", allow_pickle=False)
-        return _widened(array) if dtype == BFLOAT16 else array
-    except OSError as error:
-        got = f"one that does not open ({error.strerror})"
-        raise InvalidFeatures(str(path), expected="a .npy file", got=got) from None
-    except PARSE_ERRORS as error:
-        raise _unparsed(path, "a .npy file", error) from None
+def _mapped(path: Path, kinds: str) -> np.ndarray:
+    with open_regular(path) as handle:
+        size = handle.seek(0, 2)
+        handle.seek(0)
+        dtype = _check_header(handle, size, kinds)
+        is_empty = handle.tell() == size  # which cannot be mapped
+    array = np.load(path, mmap_mode=None if is_empty else "r", allow_pickle=False)
+    return _widened(array) if dtype == BFLOAT16 else array
 
 
-def _check_header(handle: IO[bytes], size: int, path: Path, kinds: str) -> np.dtype[Any]:
+def _check_header(handle: IO[bytes], size: int, kinds: str) -> np.dtype[Any]:
     """Check the header of a file of ``size`` bytes, leave the handle at the data, and return the dtype."""
     version = np.lib.format.read_magic(handle)
     if version not in READERS:
@@ -57,10 +60,9 @@ def _check_header(handle: IO[bytes], size: int, path: Path, kinds: str) -> np.dt
     shape, _, dtype = READERS[version](handle)
     if dtype.hasobject or (dtype.kind not in kinds and not (dtype == BFLOAT16 and "f" in kinds)):
         got = "Python objects, which may run code" if dtype.hasobject else str(dtype)
-        raise InvalidFeatures(str(path), expected="an array of numbers", got=got, hint=HINT)
+        raise ValueError(f"an array of numbers, got {got}")
     if any(side < 0 for side in shape) or handle.tell() + math.prod(shape) * dtype.itemsize != size:
-        expected = f"{dtype} {list(shape)} as its header says"
-        raise InvalidFeatures(str(path), expected=expected, got=f"a file of {size} bytes", hint=HINT)
+        raise ValueError(f"{dtype} {list(shape)} as its header says, got a file of {size} bytes")
     return dtype
 
 
@@ -69,55 +71,43 @@ def _widened(stored: np.ndarray) -> np.ndarray:
     return (stored.view(np.uint16).astype(np.uint32) << 16).view(np.float32)
 
 
-def _unparsed(path: Path, expected: str, error: BaseException) -> InvalidFeatures:
-    got = f"one that does not parse ({str(error)[:120]})"
-    return InvalidFeatures(str(path), expected=expected, got=got, hint=HINT)
+def _zipped(path: Path, kinds: str) -> np.ndarray:
+    with open_zip(path) as archive:
+        members = archive.infolist()
+        if len(members) != 1:
+            file_names = ", ".join(repr(member.filename[:40]) for member in members[:3])
+            raise ValueError(f"a .npz file of one array, got {len(members)}: {file_names}")
+        if members[0].file_size > MOST_UNZIPPED_BYTES:
+            raise ValueError(f"at most {MOST_UNZIPPED_BYTES} bytes, got {members[0].file_size} bytes")
+        with archive.open(members[0]) as handle:
+            dtype = _check_header(handle, members[0].file_size, kinds)
+        with archive.open(members[0]) as handle:
+            array = np.lib.format.read_array(handle, allow_pickle=False)
+        return _widened(array) if dtype == BFLOAT16 else array
 
 
-def _read_npz(path: Path, kinds: str) -> np.ndarray:
-    expected = "a .npz file of one array"
-    try:
-        with open_zip(path) as archive:
-            members = archive.infolist()
-            if len(members) != 1:
-                file_names = ", ".join(repr(member.filename[:40]) for member in members[:3])
-                raise InvalidFeatures(str(path), expected=expected, got=f"{len(members)}: {file_names}")
-            if members[0].file_size > MOST_UNZIPPED_BYTES:
-                got = f"{members[0].file_size} bytes"
-                raise InvalidFeatures(str(path), expected=f"at most {MOST_UNZIPPED_BYTES} bytes", got=got)
-            with archive.open(members[0]) as handle:
-                dtype = _check_header(handle, members[0].file_size, path, kinds)
-            with archive.open(members[0]) as handle:
-                array = np.lib.format.read_array(handle, allow_pickle=False)
-            return _widened(array) if dtype == BFLOAT16 else array
-    except (*BROKEN_ZIP, *PARSE_ERRORS) as error:
-        raise _unparsed(path, expected, error) from None
-
-
-def _read_tensor(path: Path, kinds: str) -> np.ndarray:
+def _tensor(path: Path, kinds: str) -> np.ndarray:
     import torch
 
-    expected = "a file of one tensor"
-    hint = "save it alone, torch.save(tensor, name), or as .npy: numpy.save(name, tensor.cpu().numpy())"
+    with open_regular(path):
+        pass
     try:
-        with open_regular(path):
-            pass
         tensor = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except Exception as error:  # unpickling raises errors of many types
         got = f"one that holds more than tensors, or is damaged ({str(error).splitlines()[0][:100]})"
-        raise InvalidFeatures(str(path), expected=expected, got=got, hint=hint) from None
+        raise ValueError(f"a file of one tensor, got {got}".replace("; ", ", ")) from None
     if not isinstance(tensor, torch.Tensor):
-        raise InvalidFeatures(str(path), expected=expected, got=type(tensor).__name__, hint=hint)
+        raise ValueError(f"a file of one tensor, got {type(tensor).__name__}")
     if tensor.layout != torch.strided or tensor.is_quantized or tensor.device.type != "cpu":
-        raise InvalidFeatures(str(path), expected=expected, got=f"a tensor of {tensor.layout}", hint=hint)
+        raise ValueError(f"a file of one tensor, got a tensor of {tensor.layout}")
     # A tensor may repeat a few numbers of the file without end.
     if tensor.untyped_storage().nbytes() < tensor.numel() * tensor.element_size() or not tensor.numel():
         got = f"{list(tensor.shape)} of {tensor.untyped_storage().nbytes()} bytes"
-        raise InvalidFeatures(str(path), expected="a tensor with all of its numbers", got=got, hint=hint)
+        raise ValueError(f"a tensor with all of its numbers, got {got}")
     tensor = tensor.detach().resolve_conj().resolve_neg()
     array = (tensor.float() if tensor.dtype == torch.bfloat16 else tensor).numpy()
     if array.dtype.kind not in kinds:
-        raise InvalidFeatures(str(path), expected="an array of numbers", got=str(tensor.dtype), hint=hint)
+        raise ValueError(f"an array of numbers, got {tensor.dtype}")
     return array
 
 

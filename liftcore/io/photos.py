@@ -70,11 +70,7 @@ class PhotoHeader(NamedTuple):
 
 
 def orientation_warnings(readings: Mapping[str, Reading], counterparts: str) -> list[str]:
-    """Return warnings of how photos with an EXIF orientation were read.
-
-    Args:
-        readings: of all photos, by view. counterparts: values of the same pixels: their cameras, or masks.
-    """
+    """Return warnings of how photos with an EXIF orientation were read."""
     advice = {
         Reading.STORED: "were read as stored, without the turn that their EXIF asks for: "
         f"{counterparts} must be of the stored pixels too, as those of COLMAP are",

@@ -17,9 +17,8 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from liftcore.errors import InvalidInput
 from liftcore.io.files import first_bytes, open_regular, whole_file
-from liftcore.runtime.mapping import map_anonymous
+from liftcore.runtime.memory import map_anonymous
 
 DTYPES = {
     "F64": np.float64, "F32": np.float32, "F16": np.float16, "I64": np.int64, "I32": np.int32, "I16": np.int16,
@@ -50,52 +49,34 @@ MAX_HEADER_BYTES = 32 * 1024 * 1024
 _START = 9  # bytes: the header's length, and the brace that it begins with
 
 
-def check_header(path: Path, name: str, fault: type[InvalidInput], *, expected: str, hint: str = "") -> None:
-    """Refuse files that are no safetensors, headers of absurd length, and those with a name twice.
-
-    Args:
-        path: the file.
-        name: of the file, in errors.
-        fault: type of the error.
-        expected: description of a valid file.
-        hint: command that writes one.
-    """
-    try:
-        with open_regular(path) as handle:
-            start = handle.read(_START)
-    except OSError as error:
-        got = "a folder" if path.is_dir() else f"a file that does not open ({error.strerror})"
-        raise fault(name, expected=expected, got=got, hint=hint) from None
-    length = struct.unpack("<Q", start[:8])[0] if len(start) == _START else 0
-    # A header may be as long as such a signature reads as a number: 640 bytes are b"\x80\x02". Then it is JSON.
-    signed = start[:2] in (b"PK", b"\x80\x02") and not (start[8:] == b"{" and length <= MAX_HEADER_BYTES)
-    if signed or path.suffix.lower() in (".pt", ".pth", ".pkl"):
-        raise fault(
-            name,
-            expected=expected,
-            got="a Python pickle or a zip, which may run code when it is opened",
-            hint="save its arrays as .npy files ('splatlift pack npy' makes packs of those), or as safetensors",
-        )
-    if len(start) < _START or start[8:] != b"{":
-        got = f"a file that begins with {first_bytes(start)}" if start else "an empty file"
-        raise fault(name, expected=expected, got=got, hint=hint)
-    if length > MAX_HEADER_BYTES:
-        raise fault(name, expected=f"a header of at most {MAX_HEADER_BYTES} bytes", got=f"{length} bytes")
-    _check_names(path, name, fault, length)
-
-
-def _check_names(path: Path, name: str, fault: type[InvalidInput], length: int) -> None:
-    """Refuse headers with a name twice, which readers resolve differently; safetensors refuses bad JSON."""
-
-    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        members = dict(pairs)
-        if len(members) < len(pairs):
-            raise fault(name, expected="a header that says each name once", got="one twice")
-        return members
-
-    with path.open("rb") as handle, suppress(ValueError, RecursionError):
+def check_header(path: Path) -> None:
+    """Refuse files that are no safetensors, headers of absurd length, and those with a name twice; a ValueError."""
+    with open_regular(path) as handle:
+        start = handle.read(_START)
+        length = struct.unpack("<Q", start[:8])[0] if len(start) == _START else 0
+        # A header may be as long as such a signature reads as a number: 640 bytes are b"\x80\x02". Then it is JSON.
+        signed = start[:2] in (b"PK", b"\x80\x02") and not (start[8:] == b"{" and length <= MAX_HEADER_BYTES)
+        if signed or path.suffix.lower() in (".pt", ".pth", ".pkl"):
+            hint = "save its arrays as .npy files ('splatlift pack npy' makes packs of those), or as safetensors"
+            got = "a Python pickle or a zip, which may run code when it is opened"
+            raise ValueError(f"a safetensors file, got {got}; {hint}")
+        if len(start) < _START or start[8:] != b"{":
+            got = f"a file that begins with {first_bytes(start)}" if start else "an empty file"
+            raise ValueError(f"a safetensors file, got {got}")
+        if length > MAX_HEADER_BYTES:
+            raise ValueError(f"a header of at most {MAX_HEADER_BYTES} bytes, got {length} bytes")
         handle.seek(8)
-        json.loads(handle.read(length), object_pairs_hook=once)
+        names: list[str] = []
+        with suppress(ValueError, RecursionError):  # safetensors refuses bad JSON
+            json.loads(handle.read(length), object_pairs_hook=lambda pairs: names.extend(_twice(pairs)))
+    if names:  # readers differ in which of the two they take
+        raise ValueError(f"a header that says each name once, got {names[0][:80]!r} twice")
+
+
+def _twice(pairs: list[tuple[str, Any]]) -> list[str]:
+    """Return the names that an object has twice."""
+    names = [name for name, _ in pairs]
+    return [name for name in names if names.count(name) > 1] if len({*names}) < len(names) else []
 
 
 def write_tensors(path: Path, tensors: "Mapping[str, Tensor]", metadata: Mapping[str, str]) -> None:
@@ -154,10 +135,13 @@ def map_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
 
     The mapping is private: what a caller writes into an array stays in memory.
     """
-    from safetensors import safe_open
+    from safetensors import SafetensorError, safe_open
 
-    with safe_open(str(path), framework="np") as handle:  # which validates the header
-        metadata = handle.metadata() or {}
+    try:
+        with safe_open(str(path), framework="np") as handle:  # which validates the header
+            metadata = handle.metadata() or {}
+    except SafetensorError as error:
+        raise ValueError(str(error)[:160]) from None
     with path.open("rb") as file:
         start = 8 + int.from_bytes(file.read(8), "little")
         header = json.loads(file.read(start - 8))

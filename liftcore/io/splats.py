@@ -19,7 +19,7 @@ from liftcore.errors import InvalidSplats, reading
 from liftcore.io import ply
 from liftcore.io.checkpoint import read_checkpoint
 from liftcore.io.compressed_ply import read_compressed_ply
-from liftcore.io.files import whole_file
+from liftcore.io.files import CONVERT_PLY, whole_file
 from liftcore.io.gltf import read_gltf
 from liftcore.io.gltf_writer import gltf_blocks
 from liftcore.io.kinds import CONVERT, SplatFormat, identify, wrong_kind
@@ -171,9 +171,8 @@ def blocks_as(splats: Splats, suffix: str) -> Iterator[bytes]:
 def _writer_of(suffix: str, argument: str) -> Callable[[Splats, Document | None], Iterator[bytes]]:
     """Return the writer of files with this suffix."""
     if suffix not in _WRITERS:
-        hint = "write a .ply, and convert it: npx @playcanvas/splat-transform IN.ply OUT"
         expected = f"one of {', '.join(_WRITERS)}"
-        raise InvalidSplats(argument, expected=expected, got=repr(suffix)[:40], hint=hint)
+        raise InvalidSplats(argument, expected=expected, got=repr(suffix)[:40], hint=CONVERT_PLY)
     return _WRITERS[suffix]
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from liftcore.errors import InvalidCameras, InvalidInput
+from liftcore.errors import InvalidCameras, InvalidInput, reading
 from liftcore.io.colmap import PANORAMA, PINHOLES, Intrinsics, distortion_of
 from liftcore.io.json_file import FORMATS, entry, matrix, number, pixels, read_json
 from liftcore.io.photos import PhotoHeader, PhotosBeside
@@ -26,7 +26,6 @@ from liftcore.scene.cameras import (
     InvalidPose,
     behind_lens,
     check_count,
-    pose_from,
     read_views,
     viewmat_of,
 )
@@ -80,14 +79,12 @@ def parse_transforms(document: Any, source: str, photos: PhotosBeside | None = N
         document: as JSON has it. source: its file, for errors.
         photos: source of sizes that the document does not have; None: none.
     """
-    if not isinstance(document, dict) or "frames" not in document:
-        listing = ", ".join(list(document)[:5]) if isinstance(document, dict) else type(document).__name__
-        raise InvalidCameras(
-            source, expected=FORMATS, got=f"an object with {listing}" if document else "an empty object"
-        )
-    names, frames = _named_frames(document["frames"], f"{source} frames", f"{source} frame")
-    scoped = [ChainMap(frame, document) for frame in frames]
-    views = zip(names, scoped, strict=True)
+    with reading(source, InvalidCameras, FORMATS):
+        if not isinstance(document, dict) or "frames" not in document:
+            listing = ", ".join(list(document)[:5]) if isinstance(document, dict) else type(document).__name__
+            raise ValueError(f"{FORMATS}, got {f'an object with {listing}' if document else 'an empty object'}")
+        names, frames = _named_frames(document["frames"], source)
+    views = zip(names, [ChainMap(frame, document) for frame in frames], strict=True)
     cameras, warnings = read_views(views, lambda name, keys: _cameras(name, keys, source, photos))
     of_nerfstudio = any(key in document for key in OF_NERFSTUDIO)
     warnings += [OWN_FRAME] if of_nerfstudio else []
@@ -102,41 +99,35 @@ def is_export(document: Any) -> bool:
 
 
 def parse_export(records: Any, source: str, data: Any = None, photos: PhotosBeside | None = None) -> Cameras:
-    """Return the cameras of nerfstudio's camera export, in the frame of its splats.
-
-    Args:
-        records: as JSON has them. source: their file, for errors. photos: as `parse_transforms` has it.
-        data: the transforms.json of the data, whose intrinsics count by the photo's name; None: there is none.
-    """
-    names, poses = _named_frames(records, source, f"{source} camera")
-    shared = data if isinstance(data, dict) else {}
-    frames = {}
-    if isinstance(shared.get("frames"), list):
-        frames = dict(
-            zip(*_named_frames(shared["frames"], "transforms.json frames", "transforms.json frame"), strict=True)
-        )
-    pairs = cameras_of_views(names, frames)
-    scoped = []
-    for name, record in zip(names, poses, strict=True):
-        keys = ChainMap(
-            {"transform_matrix": record.get("transform")}, record, frames.get(pairs.get(name, ""), {}), shared
-        )
-        if not any(key in keys for key in FOCALS):
-            got = f"none of {name!r}: this is nerfstudio's camera export (ns-export cameras), which has poses alone"
-            hint = "put the transforms.json of the data that nerfstudio was trained on beside it"
-            raise InvalidCameras(source, expected="intrinsics in the file or beside it", got=got, hint=hint)
-        scoped.append(keys)
+    """Return the cameras of nerfstudio's camera export, in the frame of its splats."""
+    shared, frames = data if isinstance(data, dict) else {}, {}
+    with reading(source, InvalidCameras, "a camera export"):
+        names, poses = _named_frames(records, source)
+        if isinstance(shared.get("frames"), list):
+            frames = dict(zip(*_named_frames(shared["frames"], "transforms.json"), strict=True))
+        pairs = cameras_of_views(names, frames)
+        scoped = []
+        for name, record in zip(names, poses, strict=True):
+            pose = {"transform_matrix": record.get("transform")}
+            keys = ChainMap(pose, record, frames.get(pairs.get(name, ""), {}), shared)
+            if not any(key in keys for key in FOCALS):
+                got = (
+                    f"none of {name!r}: this is nerfstudio's camera export (ns-export cameras), which has poses alone"
+                )
+                hint = "put the transforms.json of the data that nerfstudio was trained on beside it"
+                raise ValueError(f"intrinsics in the file or beside it, got {got}; {hint}")
+            scoped.append(keys)
     views = zip(names, scoped, strict=True)
     cameras, warnings = read_views(views, lambda name, keys: _cameras(name, keys, source, photos))
     return Cameras(cameras, world=nerfstudio_world(cameras), warnings=warnings)
 
 
-def _named_frames(frames: Any, source: str, each: str) -> tuple[list[str], list[dict[str, Any]]]:
+def _named_frames(frames: Any, source: str) -> tuple[list[str], list[dict[str, Any]]]:
     """Return the names of views, and their records."""
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-        raise InvalidCameras(source, expected="a list of objects", got=repr(frames)[:60])
+        raise ValueError(f"a list of objects as frames, got {repr(frames)[:60]}")
     check_count(len(frames), source)
-    return view_names([str(entry(frame, "file_path", f"{each} {i}")) for i, frame in enumerate(frames)]), frames
+    return view_names([str(entry(frame, "file_path")) for frame in frames]), frames
 
 
 def nerfstudio_world(cameras: Sequence[Camera]) -> WorldFrame:
@@ -167,115 +158,108 @@ def transforms_of(cameras: Mapping[str, Camera]) -> dict[str, Any]:
 def _cameras(name: str, keys: ChainMap[str, Any], source: str, photos: PhotosBeside | None) -> list[Camera]:
     """Return the view of a frame."""
     location = f"{source} frame {name!r}"
-    distortion = _distortion(keys, location)
-    width, height = _size(keys, location, photos)
-    with pose_from():
-        rows = matrix(keys.get("transform_matrix"), (3, 4), 4, f"{location} transform_matrix")
-    if len(rows) == 4 and np.abs(rows[3] - LAST_ROW).max() > 1e-6:
-        got = " ".join(f"{value:g}" for value in rows[3])
-        raise InvalidPose(f"{location} transform_matrix", expected="0 0 0 1 as the last row", got=got)
+    with reading(location, InvalidCameras, "a camera"):
+        distortion = _distortion(keys)
+        width, height = _size(keys, photos)
+        intrinsics = _intrinsics(keys, width, height)
+    with reading(location, InvalidPose, "a pose"):
+        rows = matrix(keys.get("transform_matrix"), (3, 4), 4, "transform_matrix")
+        if len(rows) == 4 and np.abs(rows[3] - LAST_ROW).max() > 1e-6:
+            got = " ".join(f"{value:g}" for value in rows[3])
+            raise ValueError(f"0 0 0 1 as the last row of transform_matrix, got {got}")
     pose = viewmat_of(rows[:3, :3] * CAMERA_AXES["opengl"], rows[:3, 3])
-    intrinsics = _intrinsics(keys, width, height, location)
     camera = Camera.pinhole(name, width, height, *intrinsics, viewmat=pose)
     return [camera if distortion is None else behind_lens(camera, distortion)]
 
 
-def _size(keys: Mapping[str, Any], location: str, photos: PhotosBeside | None) -> tuple[int, int]:
+def _size(keys: Mapping[str, Any], photos: PhotosBeside | None) -> tuple[int, int]:
     """Return width and height in pixels, of the frame or else of its photo."""
     if "w" in keys and "h" in keys:
-        return pixels(keys["w"], f"{location} w"), pixels(keys["h"], f"{location} h")
-    file_path = str(keys["file_path"])
+        return pixels(keys["w"], "w"), pixels(keys["h"], "h")
+    file_path, hint = str(keys["file_path"]), 'add the size of the photos as "w" and "h" at the top level of the file'
     try:
         header = photos.header(file_path) if photos else None
     except InvalidInput as error:
-        got, hint = f"{error.got} ({error.argument})", 'add "w" and "h" at the top level of the file'
-        raise InvalidCameras(location, expected="an image size, w and h, or a photo", got=got, hint=hint) from None
+        raise ValueError(f"an image size, w and h, or a photo, got {error.got} ({error.argument}); {hint}") from None
     if header is not None:
-        return _size_of_photo(header, keys, location)
-    photo_note = f", and no photo {photos.missing(file_path)}" if photos else ""
-    hint = 'add the size of the photos as "w" and "h" at the top level of the file'
-    hint = f"put the photos where file_path has them, or {hint}" if photos else hint
-    raise InvalidCameras(location, expected="an image size, w and h", got=f"none{photo_note}", hint=hint)
+        return _size_of_photo(header, keys)
+    if photos is None:
+        raise ValueError(f"an image size, w and h, got none; {hint}")
+    hint = f"put the photos where file_path has them, or {hint}"
+    raise ValueError(f"an image size, w and h, got none, and no photo {photos.missing(file_path)}; {hint}")
 
 
-def _size_of_photo(header: PhotoHeader, keys: Mapping[str, Any], location: str) -> tuple[int, int]:
+def _size_of_photo(header: PhotoHeader, keys: Mapping[str, Any]) -> tuple[int, int]:
     """Return the size of a photo as stored, or as EXIF rotates it if only that fits the principal point."""
-    centre = [number(keys[key], f"{location} {key}") if key in keys else None for key in ("cx", "cy")]
-    cx, cy = centre
+    cx, cy = (number(keys[key], key) if key in keys else None for key in ("cx", "cy"))
     turns = cx is not None and cy is not None and cx > 0 < cy and header.turns_for((round(2 * cx), round(2 * cy)))
     width, height = header.oriented if turns else header.stored
     if (cx or 0) >= width or (cy or 0) >= height:
-        expected, hint = f"a principal point within the photo of {width}x{height}", "the photo was made smaller: add"
-        hint = f'{hint} "w" and "h" of the photos that the intrinsics are of at the top level of the file'
-        raise InvalidCameras(f"{location} cx, cy", expected=expected, got=f"{cx}, {cy}", hint=hint)
+        expected = f"a principal point cx, cy within the photo of {width}x{height}"
+        hint = 'the photo was made smaller: add "w" and "h" of the photos that the intrinsics are of at the top level'
+        raise ValueError(f"{expected}, got {cx}, {cy}; {hint} of the file")
     return width, height
 
 
-def _intrinsics(keys: Mapping[str, Any], width: int, height: int, location: str) -> Intrinsics:
-    fx = _focal(keys, "x", width, location)
-    fy = _focal(keys, "y", height, location)
+def _intrinsics(keys: Mapping[str, Any], width: int, height: int) -> Intrinsics:
+    fx, fy = _focal(keys, "x", width), _focal(keys, "y", height)
     fx = fy if fx is None else fx
     fy = fx if fy is None else fy
     if fx is None or fy is None:
-        other_focal = next((key for key in OTHER_FOCALS if key in keys), None)
-        got = "neither" if other_focal is None else f"neither, but {other_focal!r}"
+        other_focal = next((f", but {key!r}" for key in OTHER_FOCALS if key in keys), "")
         hint = "add the focal length in pixels as fl_x and fl_y"
-        raise InvalidCameras(location, expected="fl_x or camera_angle_x", got=got, hint=hint)
-    cx = number(keys.get("cx", width / 2), f"{location} cx")
-    cy = number(keys.get("cy", height / 2), f"{location} cy")
-    return Intrinsics(fx, fy, cx, cy)
+        raise ValueError(f"fl_x or camera_angle_x, got neither{other_focal}; {hint}")
+    return Intrinsics(fx, fy, number(keys.get("cx", width / 2), "cx"), number(keys.get("cy", height / 2), "cy"))
 
 
-def _focal(keys: Mapping[str, Any], axis: str, side: int, location: str) -> float | None:
-    if f"fl_{axis}" in keys:
-        return number(keys[f"fl_{axis}"], f"{location} fl_{axis}")
-    if f"camera_angle_{axis}" not in keys:
+def _focal(keys: Mapping[str, Any], axis: str, side: int) -> float | None:
+    length, of_view = f"fl_{axis}", f"camera_angle_{axis}"
+    if length in keys:
+        return number(keys[length], length)
+    if of_view not in keys:
         return None
-    angle = number(keys[f"camera_angle_{axis}"], f"{location} camera_angle_{axis}")
+    angle = number(keys[of_view], of_view)
     if not 0 < angle < math.pi:
-        raise InvalidCameras(f"{location} camera_angle_{axis}", expected="an angle in 0..pi", got=f"{angle:g}")
+        raise ValueError(f"an angle in 0..pi as {of_view}, got {angle:g}")
     return 0.5 * side / math.tan(0.5 * angle)
 
 
-def _distortion(keys: ChainMap[str, Any], location: str) -> Distortion | None:
+def _distortion(keys: ChainMap[str, Any]) -> Distortion | None:
     """Return the distortion of a frame's photo; None where it has none."""
     model = keys.get("camera_model", "PINHOLE")
     other = next((key for scope in keys.maps for key in OTHER_LENSES if scope.get(key)), None)
     if model not in (*PERSPECTIVE, FISHEYE) or other:
-        got = other or repr(model)[:60]
         hint = PINHOLES if model == PANORAMA or other in ("equirectangular", "latlong") else UNDISTORT
-        raise InvalidCameras(location, expected=f"a perspective camera or {FISHEYE}", got=got, hint=hint)
+        raise ValueError(f"a perspective camera or {FISHEYE}, got {other or repr(model)[:60]}; {hint}")
     fisheye = model == FISHEYE or bool(keys.get("is_fisheye"))
-    candidates = [
-        coefficients for scope in keys.maps if (coefficients := _nonzero_coefficients(scope, location)) is not None
-    ]
+    candidates = [found for scope in keys.maps if (found := _nonzero_coefficients(scope)) is not None]
     if any(coefficients != candidates[0] for coefficients in candidates):  # programs differ in which of them counts
-        alternatives = " and ".join(_format_coefficients(coefficients) for coefficients in candidates)
-        raise InvalidCameras(location, expected="the same distortion as that of all frames", got=alternatives)
+        alternatives = " and ".join(map(_format_coefficients, candidates))
+        raise ValueError(f"the same distortion as that of all frames, got {alternatives}")
     values = candidates[0] if candidates else {}
     unread = next((key for key in values if key not in SUPPORTED_COEFFICIENTS[fisheye]), None)
     if unread:
         kind = "a fisheye" if fisheye else "a perspective camera"
         expected = f"{', '.join(SUPPORTED_COEFFICIENTS[fisheye])} alone of {kind}"
-        raise InvalidCameras(location, expected=expected, got=f"{unread} = {values[unread]:g}", hint=UNDISTORT)
+        raise ValueError(f"{expected}, got {unread} = {values[unread]:g}; {UNDISTORT}")
     return distortion_of(values, fisheye=fisheye)
 
 
-def _nonzero_coefficients(scope: Mapping[str, Any], location: str) -> dict[str, float] | None:
+def _nonzero_coefficients(scope: Mapping[str, Any]) -> dict[str, float] | None:
     """Return the parameters that are not zero, by name; None where none is named."""
     params = scope.get("distortion_params")
     if params is not None and (not isinstance(params, list) or len(params) not in (0, len(DISTORTION_ORDER))):
-        expected = f"a list of the {len(DISTORTION_ORDER)} numbers {', '.join(DISTORTION_ORDER)}"
-        raise InvalidCameras(f"{location} distortion_params", expected=expected, got=repr(params)[:60])
+        expected = f"distortion_params, a list of the {len(DISTORTION_ORDER)} numbers {', '.join(DISTORTION_ORDER)}"
+        raise ValueError(f"{expected}, got {repr(params)[:60]}")
     if not params and not any(key in scope for key in DISTORTION):
         return None
-    by_key = {key: number(scope[key], f"{location} {key}") for key in DISTORTION if key in scope}
+    by_key = {key: number(scope[key], key) for key in DISTORTION if key in scope}
     single = {key: value for key, value in by_key.items() if value != 0}
-    values = [number(value, f"{location} distortion_params[{i}]") for i, value in enumerate(params or [])]
+    values = [number(value, f"distortion_params[{i}]") for i, value in enumerate(params or [])]
     of_list = {key: value for key, value in zip(DISTORTION_ORDER, values, strict=False) if value != 0}
     if single and of_list and single != of_list:
         got = f"{_format_coefficients(single)} and {_format_coefficients(of_list)}"
-        raise InvalidCameras(f"{location} distortion_params", expected="the values of the single parameters", got=got)
+        raise ValueError(f"the values of the single parameters in distortion_params, got {got}")
     return of_list or single
 
 
@@ -302,35 +286,40 @@ def read_frame(path: Path, applied: Mapping[str, Any], source: str) -> np.ndarra
         source: the name of that file.
     """
     document = read_json(path)
-    transform = _affine(entry(document, "transform", str(path)), f"{path} transform")
-    scale = _scale(entry(document, "scale", str(path)), f"{path} scale")
-    before = np.eye(4)
-    if applied.get("applied_transform") is not None:
-        before = _affine(applied["applied_transform"], f"{source} applied_transform")
-        _require_similarity(before, f"{source} applied_transform")
-    combined = transform @ np.linalg.inv(before)
-    combined[:3] *= scale / _scale(applied.get("applied_scale", 1.0), f"{source} applied_scale")
-    _require_similarity(combined, f"{path} transform")
+    with reading(path, InvalidCameras, "the frame of a run"):
+        transform, scale = (
+            _affine(entry(document, "transform"), "transform"),
+            _scale(entry(document, "scale"), "scale"),
+        )
+    with reading(source, InvalidCameras, "a transforms.json"):
+        before = np.eye(4)
+        if applied.get("applied_transform") is not None:
+            before = _affine(applied["applied_transform"], "applied_transform")
+            _require_similarity(before, "applied_transform")
+        combined = transform @ np.linalg.inv(before)
+        combined[:3] *= scale / _scale(applied.get("applied_scale", 1.0), "applied_scale")
+    with reading(path, InvalidCameras, "the frame of a run"):
+        _require_similarity(combined, "transform")
     return combined
 
 
-def _require_similarity(matrix: np.ndarray, source: str) -> None:
+def _require_similarity(matrix: np.ndarray, name: str) -> None:
     try:
         Similarity.of(matrix)
     except InvalidInput as error:
-        raise InvalidCameras(source, expected=error.expected, got=error.got, hint=error.hint) from None
+        raise ValueError(f"{name} of {error.expected}, got {error.got}; {error.hint}") from None
 
 
-def _affine(value: Any, source: str) -> np.ndarray:
+def _affine(value: Any, name: str) -> np.ndarray:
     affine = np.eye(4)
-    affine[:3] = matrix(value, (3, 4), 4, source)[:3]
-    if float(np.abs(affine).max()) > LARGEST:
-        raise InvalidCameras(source, expected=f"numbers within {LARGEST:g}", got=f"{float(np.abs(affine).max()):.2g}")
+    affine[:3] = matrix(value, (3, 4), 4, name)[:3]
+    if (largest := float(np.abs(affine).max())) > LARGEST:
+        raise ValueError(f"numbers within {LARGEST:g} as {name}, got {largest:.2g}")
     return affine
 
 
-def _scale(value: Any, source: str) -> float:
-    scale = number(value, source)
+def _scale(value: Any, name: str) -> float:
+    scale = number(value, name)
     if not LEAST <= scale <= LARGEST:
-        raise InvalidCameras(source, expected=f"a scale in {LEAST:g}..{LARGEST:g}", got=f"{scale:g}")
+        raise ValueError(f"a scale in {LEAST:g}..{LARGEST:g} as {name}, got {scale:g}")
     return scale

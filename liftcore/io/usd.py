@@ -51,12 +51,7 @@ def open_library() -> Any:
 
 
 def usd_blocks(splats: Splats, document: Mapping[str, Any] | None = None, suffix: str = ".usdc") -> Iterator[bytes]:
-    """Yield the bytes of a USD file of any splats (`gaussian_rows`), with their extras and the labels' document.
-
-    Args:
-        splats: P. Those of an instance are ``/Scene/instance_N``, the others ``/Scene/Splats``.
-        document: of `liftcore.io.labels`; None: splats without labels. suffix: .usdc or .usdz.
-    """
+    """Yield the bytes of a USD file of any splats (`gaussian_rows`), with their extras and the labels' document."""
     pxr, columns = open_library(), stored_columns(splats)
     with scratch_folder("splatlift-") as folder:
         path = folder / f"scene{'.usdc' if suffix == '.usdz' else suffix}"

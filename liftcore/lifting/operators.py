@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Unpack
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,7 +21,6 @@ from liftcore.runtime.torch_modes import callers_modes, default_modes
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.compositing import CompositingParams, check_antialiased
 from liftcore.scene.splats import Splats, shared_tensor
-from liftcore.values.lift_options import LiftOptions
 from liftcore.values.lift_views import ViewValues
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import LiftSettings, Preset
@@ -168,7 +167,7 @@ def region_weights(
     *,
     progress: Progress | bool | None = None,
     threads: int | None = None,
-    **settings: Unpack[LiftOptions],
+    **settings: Any,
 ) -> RegionWeights:
     """Compute the weight of each region, or cell of a grid, of each view at each splat: ``W = A^T S``.
 

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
 import torch
@@ -40,7 +40,6 @@ from liftcore.solve.optimum import compare_with_optimum
 from liftcore.solve.reweight import reweighting_facts
 from liftcore.solve.smooth import smooth
 from liftcore.values.levels import at_levels
-from liftcore.values.lift_options import LiftOptions
 from liftcore.values.lift_views import ViewValues
 from liftcore.values.settings import LiftSettings, Preset
 from liftcore.values.views import ViewFeatures
@@ -63,7 +62,7 @@ def lift(
     threads: int | None = None,
     checkpoint: Checkpoint | Path | str | None = None,
     engine: Engine | None = None,
-    **settings: Unpack[LiftOptions],
+    **settings: Any,
 ) -> LiftResult:
     """Lift the features of views onto splats: ``X = D^-1 A^T B``, with A the weights of splats on rays.
 
@@ -270,7 +269,7 @@ def plan(
     *,
     threads: int | None = None,
     in_blocks: bool = False,
-    **settings: Unpack[LiftOptions],
+    **settings: Any,
 ) -> Plan:
     """Plan the lift of the same arguments: the views that it takes, its memory, its warnings.
 

@@ -302,9 +302,9 @@ def read_vector(path: Path) -> Vector:
         InvalidFeatures: no such file, or no array of numbers in it; a pickle is never opened.
         InvalidQuery: the array is no vector.
     """
-    from liftcore.io.npy import open_npy
+    from liftcore.io.npy import open_array
 
-    values = open_npy(path)
+    values = open_array(path)
     if values.shape not in ((values.size,), (1, values.size)):
         raise InvalidQuery(str(path), expected="one vector, [F] or [1, F]", got=f"the shape {list(values.shape)}")
     return Vector(tuple(values.reshape(-1).astype(np.float64).tolist()))

@@ -1,14 +1,23 @@
-"""Checks of arguments of public functions: choices, texts, counts, and single values in place of lists."""
+"""Checks of arguments of public functions: choices, texts, counts, devices, and single values in place of lists."""
 
 from __future__ import annotations
 
+import re
+import sys
 from collections.abc import Iterable
+from difflib import SequenceMatcher
+from itertools import islice
 from numbers import Integral
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 from liftcore.errors import InvalidInput, InvalidSettings, SplatliftError
+
+_CHARACTERS = 80  # of each name, and of the text, that are compared and printed
+_MAX_NAMES = 2000  # names that are compared; longer lists would delay other requests
+_MAX_CHARACTERS = 40_000  # of the compared names, each counted as long as the longest: a fifth of a second
+_DEVICE_NUMBER = re.compile(r"cuda:([0-9]{1,4})")
 
 
 def one_of(names: Iterable[str]) -> str:
@@ -57,3 +66,36 @@ def check_count(argument: str, value: object, none: str = "") -> None:
     if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
         expected = f"a whole number of one or more{none and f', or None for {none}'}"
         raise InvalidSettings(argument, expected=expected, got=repr(value)[:80])
+
+
+def device_name(device: object) -> object:
+    """Return ``cuda`` for the current GPU, given as ``cuda:0`` or a ``torch.device``; other values unchanged."""
+    name = str(device) if type(device).__module__ == "torch" else device
+    match = _DEVICE_NUMBER.fullmatch(name) if isinstance(name, str) else None
+    if match is None:
+        return name
+    torch, number = sys.modules.get("torch"), int(match[1])
+    current = torch.cuda.current_device() if torch is not None and torch.cuda.is_available() else 0
+    if number != current:
+        hint = f"set CUDA_VISIBLE_DEVICES={number}, or call torch.cuda.set_device({number}), and use device=cuda"
+        raise InvalidSettings("device", expected=f"cuda:{current}, the current GPU", got=repr(str(name)), hint=hint)
+    return "cuda"
+
+
+def nearest(text: str, names: Iterable[str], count: int) -> str:
+    """Return a hint with the ``count`` names most similar to the text, of the first thousands, by their first
+    letters.
+
+    Names that begin with the text as a word come first: "car (automobile)" for "car", before "scarf".
+    """
+    text, cut = text[:_CHARACTERS], [name[:_CHARACTERS] for name in islice(names, _MAX_NAMES)]
+    begin = [name for name in cut if text and name.startswith(f"{text} ")]
+    limit = _MAX_CHARACTERS // max(1, *map(len, cut), 1)
+    matcher = SequenceMatcher(b=text)
+
+    def likeness(name: str) -> float:
+        matcher.set_seq1(name)
+        return matcher.ratio()
+
+    ranked = sorted(cut[:limit], key=likeness, reverse=True)  # stable: equally near names keep their order
+    return f"nearest: {', '.join(list(dict.fromkeys([*begin, *ranked]))[:count])}"

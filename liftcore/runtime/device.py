@@ -6,7 +6,6 @@ import ctypes
 import importlib.util
 import os
 import platform
-import re
 import shutil
 import sys
 from contextlib import contextmanager, suppress
@@ -19,14 +18,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 
 from liftcore.errors import InvalidSettings, Unavailable
-from liftcore.runtime.device_name import device_name
+from liftcore.runtime.arguments import device_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 OLDEST_CAPABILITY = (7, 5)  # compute capability that Triton and current builds of torch support
 COMPILERS = ("gcc", "clang", "cc")
-DRIVER = Path("/proc/driver/nvidia/version")
 MEMORY_SIGNS = ("out of memory", "alloc_failed", "memoryallocation")  # of CUDA's libraries, lower case
 _EXPECTED = "a GPU that torch and Triton can use"
 _OR_CPU = "or use device=cpu"
@@ -54,7 +52,7 @@ class Device:
         packages = ("torch", "numba", "numpy") if self.kind == "cpu" else ("torch", "triton", "numpy")
         versions = {"torch": torch.__version__} | {name: version(name) for name in packages[1:]}
         if self.place.type == "cuda":
-            versions |= {"cuda": str(torch.version.cuda), "driver": driver_version()}
+            versions |= {"cuda": str(torch.version.cuda)}
         return {"kind": self.kind, "name": self.name, "versions": versions}
 
     def free_bytes(self) -> int | None:
@@ -161,12 +159,3 @@ def processor() -> str:
             if line.startswith("model name"):
                 return line.split(":", 1)[1].strip()
     return platform.processor() or platform.machine()
-
-
-def driver_version(path: Path = DRIVER) -> str:
-    """Return the version of NVIDIA's kernel module; ``unknown`` if it cannot be read."""
-    with suppress(OSError):
-        match = re.search(r"Kernel Module.*?\b(\d+(?:\.\d+)+)", path.read_text(encoding="utf-8"))
-        if match:
-            return match[1]
-    return "unknown"

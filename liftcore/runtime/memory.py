@@ -1,5 +1,11 @@
-"""Large arrays in memory or in unlinked mapped files, which the system can page out; and free memory."""
+"""Large arrays in memory or in unlinked mapped files, which the system can page out; and free memory.
 
+Torch is imported where tensors are made: processes without it map memory too.
+"""
+
+from __future__ import annotations
+
+import mmap
 import os
 import shutil
 import sys
@@ -7,20 +13,17 @@ import tempfile
 from contextlib import suppress
 from math import prod
 from pathlib import Path
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING
 
 from liftcore.errors import Unavailable
-from liftcore.runtime.mapping import map_anonymous
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
 
 MOUNTS = Path("/proc/self/mounts")
 IN_MEMORY = ("tmpfs", "ramfs")
-CONTROL_GROUPS = (  # folder, and the files of limit, usage and statistics: versions 2 and 1
-    ("/sys/fs/cgroup", ("memory.max", "memory.current", "memory.stat")),
-    ("/sys/fs/cgroup/memory", ("memory.limit_in_bytes", "memory.usage_in_bytes", "memory.stat")),
-)
-FILE_PAGES = ("inactive_file", "active_file")
+CONTROL_GROUP = Path("/sys/fs/cgroup")  # of version 2
 
 
 def zeros(shape: tuple[int, ...], dtype: torch.dtype, *, name: str, in_file: bool = False) -> Tensor:
@@ -30,6 +33,8 @@ def zeros(shape: tuple[int, ...], dtype: torch.dtype, *, name: str, in_file: boo
         name: of the array, for errors. in_file: map a file in the temporary folder that is removed with the tensor;
             on Windows, which cannot delete mapped files, the page file serves.
     """
+    import torch
+
     size = prod(shape) * dtype.itemsize
     if not size:
         return torch.zeros(shape, dtype=dtype)
@@ -48,6 +53,13 @@ def zeros(shape: tuple[int, ...], dtype: torch.dtype, *, name: str, in_file: boo
     finally:
         os.close(handle)
         Path(path).unlink()
+
+
+def map_anonymous(size: int, flags: int = 0) -> mmap.mmap:
+    """Map ``size`` bytes of zeros, private to this process; pages are allocated when they are first written."""
+    if sys.platform == "win32":
+        return mmap.mmap(-1, size)
+    return mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | flags)
 
 
 def check_disk(size: int, name: str) -> None:
@@ -92,10 +104,9 @@ def free_memory() -> int | None:
     with suppress(OSError, ValueError):  # not Linux
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
         limits += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
-    for folder, names in CONTROL_GROUPS:
-        with suppress(OSError, ValueError):  # a machine has one of the two, or none
-            limit, usage, stat = (Path(folder, name).read_text(encoding="ascii") for name in names)
-            limits += [group_memory(limit, usage, stat)]
+    with suppress(OSError, ValueError):  # no control group
+        names = ("memory.max", "memory.current", "memory.stat")
+        limits += [group_memory(*((CONTROL_GROUP / name).read_text(encoding="ascii") for name in names))]
     return min((free_bytes for free_bytes in limits if free_bytes is not None), default=None)
 
 
@@ -107,6 +118,5 @@ def group_memory(limit: str, usage: str, stat: str) -> int | None:
     if limit.strip() == "max":
         return None
     counts = dict(line.split() for line in stat.splitlines())
-    names = [f"total_{name}" if f"total_{name}" in counts else name for name in FILE_PAGES]  # version 1: all below it
-    cached = sum(int(counts.get(name, 0)) for name in names)
+    cached = sum(int(counts.get(name, 0)) for name in ("inactive_file", "active_file"))
     return max(0, int(limit) - max(0, int(usage) - cached))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import numpy as np
 
 from liftcore.errors import InvalidCameras, NotFound
-from liftcore.runtime.nearest import nearest
+from liftcore.runtime.arguments import nearest
 from liftcore.runtime.one_line import join_names, one_line
 from liftcore.scene.compositing import MAX_SIDE
 from liftcore.scene.distortion import Distortion, Lens, Rectangle, shared_lens
@@ -463,23 +463,10 @@ def cameras_from(source: str) -> Iterator[None]:
         raise type(error)(argument, expected=error.expected, got=error.got, hint=error.hint) from None
 
 
-@contextmanager
-def pose_from() -> Iterator[None]:
-    """Raise errors of a pose's numbers as `InvalidPose`."""
-    try:
-        yield
-    except InvalidCameras as error:
-        raise InvalidPose(error.argument, expected=error.expected, got=error.got, hint=error.hint) from None
-
-
 def read_views(
     views: Iterable[tuple[str, R]], cameras_of: Callable[[str, R], list[Camera]]
 ) -> tuple[list[Camera], list[str]]:
-    """Return the cameras of a file's views, and a warning that names those that were skipped for a broken pose.
-
-    Args:
-        views: names and records. cameras_of: of a name and its record, its cameras.
-    """
+    """Return the cameras of a file's views, and a warning that names those that were skipped for a broken pose."""
     cameras: list[Camera] = []
     broken: dict[str, InvalidPose] = {}
     for name, record in views:

@@ -69,11 +69,7 @@ def kernel_of_mode(mode: RenderMode | None) -> Kernel:
 
 
 def mode_of_word(word: object, source: str) -> tuple[RenderMode | None, tuple[str, ...]]:
-    """Return the mode that a word of a file names, and a warning where it names none.
-
-    Args:
-        source: location of the word, such as ``'model' in meta.json``.
-    """
+    """Return the mode that a word of a file names, and a warning where it names none."""
     model = _BY_NAME.get(word.strip().lower()) if isinstance(word, str) else None
     if model is None:
         return None, (f"{source} names a render mode that is not known: taken for classic",)

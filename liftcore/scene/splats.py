@@ -15,14 +15,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from liftcore.errors import InvalidSplats
+from liftcore.errors import InvalidInput, InvalidSplats
 from liftcore.runtime.one_line import one_line, point_text
 from liftcore.scene.harmonics import SH_C0, band_rotation
 from liftcore.scene.kernel import DARK_LOBE, LOBE_COLOURS, NORMALS, Kernel, kernel_named, scale_count
 from liftcore.scene.origin import FILE_ORIGIN, Origin, extent_of_most, float32_step, local_origin, usual_size
 from liftcore.scene.quaternions import product_matrix
 from liftcore.scene.render_mode import RenderMode, RenderModel, render_mode_of
-from liftcore.scene.rows import Rows, chosen_rows
 from liftcore.scene.similarity import Similarity
 from liftcore.scene.world import UNKNOWN, WorldFrame
 
@@ -36,6 +35,7 @@ if TYPE_CHECKING:
     Array = Tensor | np.ndarray
 
 
+Rows = Any  # a boolean mask [P], a slice, or whole numbers [n]; of numpy, torch on any device, or a list
 SH_ROWS = (1, 4, 9, 16, 25)  # (degree + 1)^2
 _BEYOND = {"opacity_logits": (True, True), "log_scales": (True, False)}  # True if -inf and +inf have a meaning
 ROUNDED = 0.25  # of a splat's size: a coarser float32 has moved splats visibly
@@ -228,7 +228,7 @@ class Splats:
         """Return the splats of a mask [P], a slice or row numbers [n], with all columns, extras and the origin.
 
         Raises:
-            InvalidInput: they choose no splat, or are none of these (`liftcore.scene.rows`).
+            InvalidInput: they choose no splat, or are none of these (`chosen_rows`).
         """
         rows = chosen_rows(keep, self.count).to(self.means.device)
         columns = {name: value[rows] for name, value in vars(self).items() if isinstance(value, torch.Tensor)}
@@ -362,11 +362,7 @@ def _in_range(name: str, values: Tensor, maximum: float, expected: str) -> Tenso
 
 
 def joined_harmonics(first: Tensor, rest: Array | None, names: tuple[str, str]) -> Tensor:
-    """Return [P, K, 3] f32 of the constant terms [P, 3] or [P, 1, 3] and all others [P, K - 1, 3], or None.
-
-    Args:
-        names: of both, for errors.
-    """
+    """Return [P, K, 3] f32 of the constant terms [P, 3] or [P, 1, 3] and all others [P, K - 1, 3], or None."""
     higher = first[:0] if rest is None else _floats(names[1], rest)
     try:
         higher = first.new_zeros(len(first), 0, 3) if rest is None else higher
@@ -510,3 +506,62 @@ def _all_meaningful(name: str, values: Tensor) -> bool:
 def _meaningful(name: str, values: Tensor) -> Tensor:
     minus, plus = _BEYOND.get(name, (False, False))
     return torch.isfinite(values) | (torch.isneginf(values) & minus) | (torch.isposinf(values) & plus)
+
+
+# ---- rows
+
+
+def chosen_rows(keep: Rows, count: int) -> Tensor:
+    """Return the numbers [n] i64, on the CPU, of the selected rows, in the order of the selection.
+
+    Args:
+        keep: booleans [P], a slice, or whole numbers [n], of which negative ones count from the end. count: P.
+    """
+    expected = f"booleans [{count}], a slice, or row numbers in 0..{count - 1}"
+    if isinstance(keep, slice):
+        try:
+            rows = torch.arange(count)[_forward(keep, count)]
+        except TypeError:
+            raise InvalidInput("keep", expected=expected, got=repr(keep)[:80]) from None
+    else:
+        selection = _as_tensor(keep, expected)
+        if selection.dtype == torch.bool:
+            if len(selection) != count:
+                got, hint = f"a mask of {len(selection)}", "a mask has an entry for each row"
+                raise InvalidInput("keep", expected=expected, got=got, hint=hint)
+            rows = torch.nonzero(selection)[:, 0]
+        else:
+            rows = selection.to(torch.int64)
+            wrong = rows[(rows < -count) | (rows >= count)]
+            if len(wrong):
+                raise InvalidInput("keep", expected=expected, got=f"row {int(wrong[0])} of {count}")
+            rows = torch.where(rows < 0, rows + count, rows)
+    if not len(rows):
+        raise InvalidInput("keep", expected="at least one row", got=f"none of {count}")
+    return rows
+
+
+def _as_tensor(keep: Any, expected: str) -> Tensor:
+    if isinstance(keep, torch.Tensor):
+        selection = keep.detach().cpu()
+    else:
+        try:
+            selection = torch.from_numpy(np.array(keep))
+        except (TypeError, ValueError):
+            got = f"{type(keep).__name__} {keep!r}"[:80]
+            raise InvalidInput("keep", expected=expected, got=got) from None
+    if selection.ndim == 2 and selection.shape[1] == 1:
+        selection = selection[:, 0]
+    if selection.shape == (0,) and selection.dtype != torch.bool:  # an empty list, which has no type
+        return selection.to(torch.int64)
+    if selection.ndim != 1 or selection.is_floating_point() or selection.is_complex():
+        kind = str(selection.dtype).removeprefix("torch.")
+        got = f"{kind} {list(selection.shape)}" if selection.ndim else f"{keep!r}"[:80]
+        hint = "a single row is keep=[row]" if not selection.ndim else ""
+        raise InvalidInput("keep", expected=expected, got=got, hint=hint)
+    return selection
+
+
+def _forward(keep: slice, count: int) -> Tensor:
+    """Return the rows of a slice, whose step may be negative, which torch does not take."""
+    return torch.tensor(range(*keep.indices(count)), dtype=torch.int64)

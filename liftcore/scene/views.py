@@ -9,9 +9,8 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import PurePosixPath
-from urllib.parse import unquote
 
 from liftcore.errors import InvalidCameras, InvalidFeatures, InvalidInput
 
@@ -23,6 +22,7 @@ NAMED_AFTER = (
     "a view is named after its image, without the extension, and with its folders where file names of the scene "
     "repeat (camA/000)"
 )
+NOT_UTF8 = "names of cameras are not UTF-8: rename the photos, and their names in the camera file"
 REPLACED = "\ufffd"  # in the place of bytes that are no UTF-8
 UNSAYABLE = re.compile("[\\x00-\\x1f\\x7f\\ud800-\\udfff]")
 
@@ -89,41 +89,14 @@ def require_pairs(views: Collection[str], cameras: Collection[str]) -> dict[str,
     """Return `cameras_of_views` of the views of features, and refuse none."""
     pairs = cameras_of_views(views, cameras)
     if not pairs:
+        unreadable = sum(REPLACED in camera for camera in cameras) > len(cameras) / 2
         raise InvalidFeatures(
             "features",
             expected="views named like the cameras",
             got=f"views {first_names(views)} and cameras {first_names(cameras)}, none in common",
-            hint=_difference(views, cameras) or NAMED_AFTER,
+            hint=NOT_UTF8 if unreadable else NAMED_AFTER,
         )
     return pairs
-
-
-def _difference(views: Collection[str], cameras: Collection[str]) -> str:
-    """Describe the change of names after which most pair, of those that programs make; empty if none does."""
-    if sum(REPLACED in camera for camera in cameras) > len(cameras) / 2:
-        return "names of cameras are not UTF-8: rename the photos, and their names in the camera file"
-    names = [composed(view) for view in views]
-    before, behind = _shared_start(names), _shared_start([name[::-1] for name in names])[::-1]
-    ways: dict[str, Callable[[str], str]] = {
-        "in capital letters": str.casefold,
-        "in kinds of spaces": lambda name: " ".join(name.split()),
-        "in leading zeros of numbers": lambda name: re.sub(r"0+(?=[0-9])", "", name),
-        "in characters written as %XX": unquote,
-        f"by {behind!r}, with which views end": lambda name: name.removesuffix(behind),
-        f"by {before!r}, with which views begin": lambda name: name.removeprefix(before),
-    }
-    for difference, normalise in ways.items():
-        paired = cameras_of_views({normalise(view) for view in views}, {normalise(camera) for camera in cameras})
-        if 2 * len(paired) > min(len(views), len(cameras)):
-            return f"they differ {difference}: rename the files of the features, and pack them again"
-    return ""
-
-
-def _shared_start(names: Sequence[str]) -> str:
-    """Return the common prefix of several names."""
-    first, last = min(names, default=""), max(names, default="")  # which differ before any others do
-    length = next((k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), len(first))
-    return first[:length] if len(names) > 1 else ""
 
 
 def first_names(names: Collection[str]) -> str:

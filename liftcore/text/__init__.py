@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from liftcore.errors import InvalidInput, InvalidQuery, Unavailable
+from liftcore.errors import InvalidInput, InvalidQuery, InvalidTable, Unavailable
 
 __all__ = ["BUILT_IN", "NO_WORDS", "OWN_WORDS", "TextEncoder", "check_encoder", "encoder_file", "open_encoder"]
 ENCODER_SPECS = (
@@ -68,10 +68,7 @@ def encoder_file(spec: str) -> Path | None:
 
 
 def check_encoder(spec: str) -> None:
-    """Check that a specification is valid, that its file opens, and that a table has a valid header.
-
-    Values are read and checked when the encoder is opened.
-    """
+    """Check that a specification is valid, that its file opens, and that a table is one."""
     file = encoder_file(spec)
     if file is None:
         if spec not in BUILT_IN and not spec.startswith("open_clip:"):
@@ -83,9 +80,13 @@ def check_encoder(spec: str) -> None:
         got, hint = f"{file} ({error.strerror})", "check the path and its permissions"
         raise InvalidInput("encoder", expected="a readable file", got=got, hint=hint) from None
     if not spec.startswith("open_clip:"):
-        from liftcore.text.table import check_table
+        from liftcore.text.table import TableEncoder
 
-        check_table(file)
+        try:
+            TableEncoder.open(file)
+        except InvalidTable as error:
+            got = f"{error.got} at {file}"
+            raise InvalidInput("encoder", expected=error.expected, got=got, hint=error.hint) from None
 
 
 def open_encoder(spec: str | Path, *, remembers: bool = False) -> TextEncoder:
@@ -161,24 +162,10 @@ class CachingEncoder:
     """
 
     def __init__(self, encoder: TextEncoder, size: int = CACHE_SIZE) -> None:
-        self.source = encoder
+        self.source, self.name, self.channels = encoder, encoder.name, encoder.channels
+        self.words: Sequence[str] = getattr(encoder, "words", ())  # that it is limited to; empty: it encodes any text
         self._size = size
         self._rows: OrderedDict[str, np.ndarray] = OrderedDict()
-
-    @property
-    def name(self) -> str:
-        """Name of the other encoder."""
-        return self.source.name
-
-    @property
-    def channels(self) -> int:
-        """Length F of the other encoder's vectors."""
-        return self.source.channels
-
-    @property
-    def words(self) -> Sequence[str]:
-        """Words that the other encoder is limited to; empty if it encodes any text."""
-        return getattr(self.source, "words", ())
 
     def encode(self, texts: Sequence[str]) -> np.ndarray:
         """Encode n texts as [n, F] f32 unit rows. Errors of the other encoder are raised and not cached."""

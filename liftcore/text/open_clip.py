@@ -3,23 +3,30 @@
 The image towers are used by `liftcore.features.encoders.clip`.
 """
 
+import importlib
 import logging
+import threading
+import urllib.error
+import urllib.request
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar
+from urllib.parse import urlsplit
 
 import numpy as np
 import torch
 
 from liftcore.errors import InvalidQuery, Unavailable
-from liftcore.runtime.nearest import nearest
+from liftcore.runtime.arguments import nearest
 from liftcore.text import BUILT_IN, check_texts
-from liftcore.text.torchvision_ops import import_torchvision
-from liftcore.text.weights import fetch_weights
 
+T = TypeVar("T")
+SECONDS = 5.0  # timeout of the first response
+EXPECTED = "weights in the cache or a network to fetch them"
+log = logging.getLogger(__name__)
 # open_clip and timm read these with weights_only; the loader of big_vision .npz files has no such switch.
 WEIGHT_SUFFIXES = (".safetensors", ".pt", ".pth", ".bin", ".ckpt")
 
@@ -37,10 +44,6 @@ def open_model(kind: str, spec: str) -> OpenedModel:
     """Load ``MODEL/PRETRAINED_TAG`` (cached or downloaded by open_clip) or ``MODEL@WEIGHTS_FILE``.
 
     Local files are read with ``weights_only``: a pickle that contains more than tensors is an error.
-
-    Args:
-        kind: the user's text before the colon, for messages.
-        spec: the text after the colon.
     """
     model_name, at, file = spec.partition("@")
     model_name, _, tag = (model_name, "", "") if at else spec.partition("/")
@@ -117,16 +120,21 @@ def _from_tag(kind: str, model_name: str, tag: str) -> Any:
 
 
 def _from_file(label: str, model_name: str, path: Path) -> Any:
-    if not path.is_file():
-        raise Unavailable(label, expected="a file of weights", got=f"nothing at {path}")
-    if path.suffix not in WEIGHT_SUFFIXES:
-        raise InvalidQuery(label, expected=f"a file ending in {', '.join(WEIGHT_SUFFIXES)}", got=path.name)
+    require_weights(label, path)
     try:
         return create_model(model_name, str(path))
     except Exception as error:  # readers of pickles and state dicts raise many types for files of other content
         raise InvalidQuery(
             label, expected=f"only tensors of {model_name} in {path.name}", got=str(error)[:200]
         ) from None
+
+
+def require_weights(label: str, path: Path) -> None:
+    """Refuse a path without a file, or with one that no loader reads without running code."""
+    if not path.is_file():
+        raise Unavailable(label, expected="a file of weights", got=f"nothing at {path}")
+    if path.suffix not in WEIGHT_SUFFIXES:
+        raise InvalidQuery(label, expected=f"a file ending in {', '.join(WEIGHT_SUFFIXES)}", got=path.name)
 
 
 @contextmanager
@@ -200,3 +208,83 @@ def _without_images(model: Any) -> Any:
     if hasattr(model, "visual"):
         model.visual = None
     return model
+
+
+# ---- weights by name, from the cache of their library or else from the network, in one attempt: the libraries
+# themselves contact the network first and retry for most of a minute if there is none
+
+
+def fetch_weights(label: str, load: Callable[[], T], hint: str) -> T:
+    """Call ``load``, which reads weights of the Hugging Face Hub, and return its result. A download is logged."""
+    from huggingface_hub import constants
+
+    with _cache_alone(), suppress(Exception):  # each library raises its own types
+        return load()
+    host = urlsplit(constants.ENDPOINT).netloc
+    if constants.HF_HUB_OFFLINE:
+        raise Unavailable(label, expected=EXPECTED, got="none, and HF_HUB_OFFLINE is set", hint=hint)
+    if not _is_reachable(constants.ENDPOINT):
+        got = f"neither: {host} did not respond within {SECONDS:g} s"
+        raise Unavailable(label, expected=EXPECTED, got=got, hint=hint)
+    log.warning("%s: downloading weights from %s", label, host)
+    try:
+        return load()
+    except Exception as error:  # clients of the hub raise their own types, those of urllib and OSErrors
+        got = " ".join(str(error).split())
+        raise Unavailable(label, expected=EXPECTED, got=got[:200], hint=hint) from None
+
+
+@contextmanager
+def _cache_alone() -> Iterator[None]:
+    """Make the hub's client refuse every request at once, so that only its cache is read."""
+    from huggingface_hub import constants
+
+    before = constants.HF_HUB_OFFLINE
+    constants.HF_HUB_OFFLINE = True
+    try:
+        yield
+    finally:
+        constants.HF_HUB_OFFLINE = before
+
+
+def _is_reachable(url: str) -> bool:
+    """Return True if the host responds in time. A thread waits for it, as name resolution has no timeout."""
+    answers: list[bool] = []
+
+    def request_head() -> None:
+        with suppress(OSError, ValueError):
+            with suppress(urllib.error.HTTPError):  # an error status is a response too
+                urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=SECONDS).close()
+            answers.append(True)
+
+    thread = threading.Thread(target=request_head, daemon=True)
+    thread.start()
+    thread.join(SECONDS)
+    return bool(answers)
+
+
+# ---- torchvision, whose compiled library of PyPI is linked against the CUDA build of torch. With the CPU build its
+# import fails with "operator torchvision::nms does not exist" while it registers shape functions. Encoders never call
+# these operators: with their signatures declared the import succeeds.
+
+# Operators exist as long as the library object that declared them.
+_libraries: list[torch.library.Library] = []
+
+
+def import_torchvision() -> None:
+    """Import torchvision, declaring the missing operators only if the import fails without them.
+
+    A compiled library that loads declares the operators itself, and a second declaration would be an error, so the
+    import is tried first.
+    """
+    try:
+        importlib.import_module("torchvision")
+    except RuntimeError as error:
+        if "torchvision::" not in str(error) or _libraries:
+            raise
+        library = torch.library.Library("torchvision", "DEF")
+        for name in ("nms", "qnms"):
+            if not hasattr(torch.ops.torchvision, name):
+                library.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+        _libraries.append(library)
+        importlib.import_module("torchvision")

@@ -5,44 +5,20 @@ import re
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
-from liftcore.errors import InvalidInput, InvalidQuery, InvalidTable
-from liftcore.io.safetensors_file import check_header, map_tensors
+from liftcore.errors import InvalidQuery, InvalidTable, reading
+from liftcore.io.safetensors_file import check_arrays, check_header, map_tensors
 from liftcore.runtime.one_line import one_line
 from liftcore.text import check_texts
 from liftcore.text.wording import SUGGESTED, Vocabulary, normalize_text
 
 __all__ = ["TableEncoder", "Vocabulary"]
 _HALF = re.compile("[\ud800-\udfff]")  # half a surrogate pair, which UTF-8 cannot carry
-TABLE = "a text table: safetensors with embeddings [n, F] and metadata words, a JSON list of n strings"
 _ERROR_CHARACTERS = 200  # of an unknown word in an error
-EXPECTED = "a safetensors file with embeddings and words"
-
-
-def check_table(path: Path) -> None:
-    """Check the header of a table, without reading its values."""
-    from safetensors import SafetensorError, safe_open
-
-    from liftcore.io.kinds import wrong_kind
-
-    if error := wrong_kind(path, "table", InvalidInput, expected=TABLE):
-        raise InvalidInput("encoder", expected=error.expected, got=f"{error.got} at {path}", hint=error.hint)
-    try:
-        check_header(path, str(path), InvalidInput, expected=TABLE)
-        handle: Any
-        with safe_open(str(path), framework="np") as handle:
-            shape = handle.get_slice("embeddings").get_shape()
-            words = json.loads((handle.metadata() or {}).get("words", "null"))
-    except InvalidInput as error:
-        raise InvalidInput("encoder", expected=error.expected, got=f"{error.got} at {path}") from None
-    except (SafetensorError, OSError, ValueError, RecursionError) as error:
-        raise InvalidInput("encoder", expected=TABLE, got=f"{str(error)[:120]} in {path}") from None
-    if len(shape) != 2 or not isinstance(words, list) or len(words) != shape[0]:
-        count = f"{len(words)} words" if isinstance(words, list) else "no words"
-        raise InvalidInput("encoder", expected=TABLE, got=f"{path} with {count} and embeddings {shape}")
+EXPECTED = "a text table: safetensors with embeddings [n, F] and metadata words, a JSON list of n strings"
 
 
 class TableEncoder:
@@ -92,30 +68,23 @@ class TableEncoder:
 
     @classmethod
     def _read(cls, path: Path, name: str) -> Self:
-        from safetensors import SafetensorError
-
-        check_header(path, name, InvalidTable, expected=EXPECTED)
-        try:
+        with reading(name, InvalidTable, EXPECTED):
+            check_header(path)
             tensors, metadata = map_tensors(path)
-        except (SafetensorError, OSError, ValueError) as error:
-            raise InvalidTable(name, expected=EXPECTED, got=str(error)[:120]) from None
-        if "embeddings" not in tensors:
-            raise InvalidTable(name, expected=EXPECTED, got="no embeddings")
+            if "embeddings" not in tensors:
+                raise ValueError(f"{EXPECTED}, got no embeddings")
         return cls.of(name, metadata.get("words", "null"), tensors["embeddings"])
 
     @classmethod
     def of(cls, name: str, words: str, embeddings: np.ndarray) -> Self:
         """Create a table from the words of a file, a JSON list of n strings, and its embeddings [n, F] f16 or f32."""
-        try:
+        with reading(name, InvalidTable, "metadata words, a JSON list of strings"):
             word_list = json.loads(words)
-        except (ValueError, RecursionError) as error:
-            raise InvalidTable(name, expected="metadata words, a JSON list", got=str(error)[:120]) from None
-        if not isinstance(word_list, list) or not all(
-            isinstance(word, str) and not _HALF.search(word) for word in word_list
-        ):
-            raise InvalidTable(name, expected="metadata words, a JSON list of strings", got=repr(words[:80]))
-        if embeddings.dtype not in (np.float16, np.float32):
-            raise InvalidTable(name, expected="float16 or float32", got=str(embeddings.dtype))
+            if not isinstance(word_list, list) or not all(
+                isinstance(word, str) and not _HALF.search(word) for word in word_list
+            ):
+                raise ValueError(repr(words[:80]))
+            check_arrays({"embeddings": embeddings}, {"embeddings": ("f2 f4", "n F")})
         return cls(name, word_list, embeddings)
 
     @property

@@ -19,11 +19,7 @@ def region_levels(regions: Regions) -> np.ndarray:
 
 
 def at_levels(features: ViewFeatures, levels: Levels, view: str) -> ViewFeatures:
-    """Return the features as ``levels`` takes them; a grid is its own level 0.
-
-    Args:
-        levels: "rows" as they are, a number that level alone. view: named in an error.
-    """
+    """Return the features as ``levels`` takes them; a grid is its own level 0."""
     if levels == "rows":
         return features
     count = features.labels.shape[0] if isinstance(features, Regions) else 1

@@ -23,9 +23,8 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-    from liftcore.scene.rows import Rows
     from liftcore.scene.similarity import Numbers
-    from liftcore.scene.splats import Splats
+    from liftcore.scene.splats import Rows, Splats
 
 
 class InputFile(BaseModel):
@@ -143,7 +142,7 @@ class Lift:
         All columns follow. Objects and clusters of which no splat is left go, and the others are numbered anew in
         their order. It remembers no file of splats, as a file's rows are others. Diagnostics stay those of the whole.
         """
-        from liftcore.scene.rows import chosen_rows
+        from liftcore.scene.splats import chosen_rows
 
         rows = chosen_rows(keep, len(self)).to(self.features.device)
         names = ("features", "total_weight", "has_feature", "confidence", "cluster", "object")

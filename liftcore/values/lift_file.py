@@ -96,8 +96,6 @@ def read_lift(path: Path | str) -> tuple[dict[str, np.ndarray], str]:
 
 
 def _read_arrays(source: Path, path: Path | str) -> tuple[dict[str, np.ndarray], str]:
-    from safetensors import SafetensorError
-
     try:
         tensors, header = map_tensors(source)
         if "splatlift" not in header:
@@ -110,7 +108,7 @@ def _read_arrays(source: Path, path: Path | str) -> tuple[dict[str, np.ndarray],
         _check_tensors(arrays)
     except FileNotFoundError:
         raise InvalidLift(str(path), expected="a lift file", got="no such file") from None
-    except (SafetensorError, OSError, ValueError) as error:
+    except (OSError, ValueError) as error:
         raise _no_lift(path, error) from None
     return arrays, header["splatlift"]
 
@@ -188,9 +186,6 @@ def camera_input(path: Path) -> InputFile:
     """Return the path of cameras, and the digest of their file or, of several, of the names and digests of all read.
 
     Photos, features and lifts that lie in the same folder do not count: they may come and go.
-
-    Args:
-        path: of the cameras.
     """
     from liftcore.io.cameras import camera_source
     from liftcore.values.lift import InputFile

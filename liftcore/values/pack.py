@@ -19,7 +19,7 @@ from typing import IO, Any, Protocol, cast
 import torch
 from torch import Tensor
 
-from liftcore.errors import InvalidFeatures, InvalidTable, Unavailable
+from liftcore.errors import InvalidFeatures, InvalidTable, Unavailable, reading
 from liftcore.io.files import whole_file
 from liftcore.io.kinds import wrong_kind
 from liftcore.io.safetensors_file import MAX_HEADER_BYTES, TYPES, check_header, safetensors_header, tensor_bytes
@@ -452,7 +452,8 @@ def _open(path: Path) -> _PackFile:
 
     expected, hint = "a feature pack (.safetensors)", "make packs with 'splatlift pack'"
     try:
-        check_header(path, str(path), InvalidFeatures, expected=expected, hint=hint)
+        with reading(path, InvalidFeatures, expected, hint):
+            check_header(path)
     except InvalidFeatures as error:
         raise wrong_kind(path, "features", InvalidFeatures, expected=expected) or error from None
     try:
@@ -512,10 +513,9 @@ def _table(packs: Sequence[_PackFile], channels: int) -> TableEncoder | None:
     for pack in packs:
         if TABLE not in pack.specs:
             continue
-        if pack.specs[TABLE].dtype not in ("F16", "F32"):
-            raise InvalidFeatures(f"{pack.path} {TABLE}", expected="F16 or F32", got=pack.specs[TABLE].dtype)
         try:
-            rows = pack.handle.get_tensor(TABLE).numpy()
+            rows = pack.handle.get_tensor(TABLE)
+            rows = (rows.float() if rows.dtype == torch.bfloat16 else rows).numpy()
             tables[pack.path] = TableEncoder.of(
                 f"words of {pack.path.name}", pack.metadata.get("words", "null"), rows
             )

@@ -12,11 +12,10 @@ from typing import Any, Self
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from liftcore.errors import InvalidInput, Unavailable
+from liftcore.errors import InvalidInput, Unavailable, reading
 from liftcore.io.safetensors_file import map_tensors, write_tensors
 from liftcore.runtime.cores import cores
 from liftcore.runtime.device import out_of_memory
@@ -188,12 +187,10 @@ class RegionWeights:
     def load_with_others(cls, path: Path | str) -> tuple[Self, dict[str, Tensor]]:
         """Load the weights and the other tensors of the file."""
         names, hint = [field.name for field in fields(cls) if field.name != "views"], "save it anew"
-        try:
+        with reading("weights", InvalidInput, f"a file of {FORMAT}", hint):
             arrays, metadata = map_tensors(Path(path))
-        except (OSError, ValueError, SafetensorError) as error:
-            raise InvalidInput("weights", expected=f"a file of {FORMAT}", got=str(error), hint=hint) from None
-        if metadata.get("format") != FORMAT or not set(names) <= arrays.keys():
-            raise InvalidInput("weights", expected=f"a file of {FORMAT}", got="another safetensors file", hint=hint)
+            if metadata.get("format") != FORMAT or not set(names) <= arrays.keys():
+                raise ValueError("another safetensors file")
         tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
         extra_tensors = {name: tensor for name, tensor in tensors.items() if name not in names}
         stored = {name: tensors[name] for name in names}
@@ -282,11 +279,7 @@ def _stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None) -
 
 
 def row_blocks(lengths: np.ndarray, rows: int, entries: int) -> list[tuple[int, int]]:
-    """Return (first, last) of blocks of rows: at most about so many rows and entries, at least one row.
-
-    Args:
-        lengths: [n] i64, entries of each row.
-    """
+    """Return (first, last) of blocks of rows: at most about so many rows and entries, at least one row."""
     before = np.concatenate([[0], np.cumsum(lengths / entries + 1 / rows)])  # of a full block
     number = max(ceil(before[-1]), 1)
     ends = np.searchsorted(before, before[-1] * np.arange(1, number) / number)

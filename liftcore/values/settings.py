@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
 from liftcore.errors import InvalidSettings
-from liftcore.runtime.device_name import device_name
+from liftcore.runtime.arguments import device_name, nearest
 from liftcore.runtime.fields import PlainModel
-from liftcore.runtime.nearest import nearest
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.compositing import (
     LARGEST_ALPHA,
@@ -89,8 +88,7 @@ _LEVELS: dict[Quality, dict[str, Any]] = {
 }
 
 
-# Limit of a new lift: 10 million rays of one view took 8 GB. The field allows more, as older lift files have it.
-MOST_DIAGNOSTIC_RAYS = 1_000_000
+MOST_DIAGNOSTIC_RAYS = 1_000_000  # 10 million rays of one view took 8 GB
 
 
 GROUPS = {  # of the settings, for people who read all of them
@@ -199,9 +197,8 @@ class LiftSettings(PlainModel):
     diagnostic_rays: int = Field(
         4_000,
         ge=0,
-        le=10_000_000,
+        le=MOST_DIAGNOSTIC_RAYS,
         description="rays sampled for the diagnostics, a million at most",
-        json_schema_extra={"maximum": MOST_DIAGNOSTIC_RAYS},  # of a new lift
     )
     seed: int = Field(
         0,
@@ -373,13 +370,9 @@ class LiftSettings(PlainModel):
     def _build_checked(cls, build: Callable[[], Self]) -> Self:
         """Build and check settings; an error of pydantic becomes an `InvalidSettings`."""
         try:
-            settings = build()
+            return build()
         except ValidationError as error:
             raise _settings_error(error, cls.model_fields) from None
-        if settings.diagnostic_rays > MOST_DIAGNOSTIC_RAYS:  # here, not in the field: older lifts have more
-            expected, got = f"at most {MOST_DIAGNOSTIC_RAYS} rays", str(settings.diagnostic_rays)
-            raise InvalidSettings("diagnostic_rays", expected=expected, got=got)
-        return settings
 
 
 def _settings_error(error: ValidationError, known_names: Iterable[str]) -> InvalidSettings:

@@ -12,7 +12,7 @@ import torch
 from liftcore.errors import InvalidSettings, Unavailable
 from liftcore.lifting.files import lift_files
 from liftcore.lifting.planning.plan import check_device_memory
-from liftcore.runtime.device import CPU, Device, choose_device, driver_version, processor, within_memory
+from liftcore.runtime.device import CPU, Device, choose_device, processor, within_memory
 from liftcore.values.settings import LiftSettings
 from tests.scenes import write_scene
 
@@ -66,7 +66,7 @@ def test_what_a_card_lacks_is_said_with_a_hint_of_its_own(card: pytest.MonkeyPat
 def test_facts_of_a_card_name_it_and_all_versions(card: pytest.MonkeyPatch) -> None:
     facts = CARD.facts()
     assert (facts["kind"], facts["name"]) == ("cuda", "Card")
-    assert facts["versions"].keys() == {"torch", "triton", "numpy", "cuda", "driver"}
+    assert facts["versions"].keys() == {"torch", "triton", "numpy", "cuda"}
     assert CARD.free_bytes() == 4 * GIB  # with what torch holds and does not use
     interpreter = Device("cuda", torch.device("cpu"))
     assert interpreter.name.startswith("Triton's interpreter") and interpreter.free_bytes() is None
@@ -83,20 +83,6 @@ def test_diagnostics_name_the_device_that_lifted(tmp_path: Path) -> None:
         "numpy",
     }
     assert result.metadata.diagnostics["plan"]["device"] == "cpu"
-
-
-@pytest.mark.parametrize(
-    ("text", "version"),
-    [
-        ("NVRM version: NVIDIA UNIX x86_64 Kernel Module  550.54.15  Tue Mar  5 22:23:56 UTC 2024\n", "550.54.15"),
-        ("NVRM version: NVIDIA UNIX Open Kernel Module for x86_64  570.86  Release Build\n", "570.86"),
-        ("something else\n", "unknown"),
-    ],
-)
-def test_driver_is_read_from_either_kernel_module(tmp_path: Path, text: str, version: str) -> None:
-    (tmp_path / "version").write_text(text)
-    assert driver_version(tmp_path / "version") == version
-    assert driver_version(tmp_path / "none") == "unknown"
 
 
 def test_room_that_ends_in_the_middle_is_said_in_words(card: pytest.MonkeyPatch) -> None:

@@ -5,7 +5,6 @@ Photos are read in the orientation of their cameras (`liftcore.io.photos`).
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +17,11 @@ from liftcore.errors import InvalidInput
 from liftcore.features.encoders import ImageEncoder, Pixels, open_image_encoder
 from liftcore.features.folders import files_below, folders_of, grids_of
 from liftcore.io.cameras import read_cameras
-from liftcore.io.outputs import check_output, writing
+from liftcore.io.files import check_output, writing
 from liftcore.io.photos import ORIENTATION, UNREAD, UPRIGHT, PhotoHeader, Reading, header_of, orientation_warnings
 from liftcore.runtime.arguments import as_path, as_paths
 from liftcore.runtime.folders import scratch_folder
-from liftcore.runtime.progress import Progress, shown_progress, silent
+from liftcore.runtime.progress import Progress, shown_progress
 from liftcore.scene.cameras import Cameras, photo_sizes
 from liftcore.scene.views import IMAGE_SUFFIXES, require_name, without_image_suffix
 from liftcore.values.pack import write_pack
@@ -45,99 +44,26 @@ _FILTERS = {
 }
 
 
-@dataclass(frozen=True)
-class EncodeSettings:
-    """Settings of encoding images as grids."""
-
-    size: int | None = None  # pixels of the shorter side; None = the encoder's default
-    batch: int = 1  # images of one size encoded at once
-    normalised: bool = True  # True: cells become unit vectors (a cell of zeros stays zero)
-
-
-@dataclass(frozen=True)
-class Encoded:
-    """Summary of a written pack."""
-
-    views: int
-    readings: Mapping[str, Reading]  # by view, the orientation its photo was read in
-    wide: tuple[str, ...]  # views with values beyond float16, stored as float32
-
-
-def write_encoded(
-    images: Mapping[str, Path],
-    encoder: ImageEncoder,
-    out: Path,
-    settings: EncodeSettings,
-    progress: Progress = silent,
-    sizes: Mapping[str, tuple[int, int]] | None = None,
-) -> Encoded:
-    """Encode images and write them as a feature pack, completely or not at all.
-
-    Grids are stored in a temporary folder next to the pack first, so memory holds one batch.
-
-    Args:
-        images: view name -> image, from `find_images`.
-        encoder: of dense features.
-        out: path of the pack.
-        settings: of the resizing and the batches.
-        progress: called for the stages "encode", "check" and "pack", in views.
-        sizes: view name -> width and height of its camera, which give the orientation of photos.
-    """
-    patch = encoder.pixels.patch
-    if settings.size is not None and settings.size < patch:
-        got = f"{settings.size} pixels"
-        raise InvalidInput("size", expected=f"at least a patch, {patch} pixels", got=got)
-    readings: dict[str, Reading] = {}
-    wide: list[str] = []
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with scratch_folder(f".{out.name}.", out.parent) as scratch:
-        files = {name: scratch / f"{number}.npy" for number, name in enumerate(images)}
-        count = 0
-        for names, batch in _batches(images, encoder, settings, sizes or {}, readings):
-            for name, grid in zip(names, encoder.encode(batch), strict=True):
-                stored = _stored(grid, name, settings)
-                if stored.dtype == torch.float32:
-                    wide.append(name)
-                np.save(files[name], stored.numpy())
-            count += len(names)
-            progress("encode", count, len(images), "views")
-        metadata = {
-            "encoder": encoder.name,
-            "text_space": encoder.text_space,
-            "normalised": "true" if settings.normalised else "false",
-        }
-        write_pack(out, grids_of(files), metadata, progress)
-    return Encoded(len(images), readings, tuple(wide))
-
-
 def _batches(
     images: Mapping[str, Path],
-    encoder: ImageEncoder,
-    settings: EncodeSettings,
+    pixels: Pixels,
+    shorter: int,
+    batch: int,
     sizes: Mapping[str, tuple[int, int]],
     readings: dict[str, Reading],
 ) -> Iterator[tuple[list[str], Tensor]]:
     """Yield names and images [n, 3, H, W] of consecutive images of one size; fills ``readings``."""
-    shorter = settings.size or encoder.pixels.shorter
     names: list[str] = []
     waiting: list[Tensor] = []
     for name, path in images.items():
         image, readings[name] = read_image(path, sizes.get(name))
-        ready = prepare(image, encoder.pixels, shorter)
-        if waiting and (len(waiting) == settings.batch or ready.shape != waiting[0].shape):
+        ready = prepare(image, pixels, shorter)
+        if waiting and (len(waiting) == batch or ready.shape != waiting[0].shape):
             yield names, torch.stack(waiting)
             names, waiting = [], []
         names.append(name)
         waiting.append(ready)
     yield names, torch.stack(waiting)
-
-
-def _stored(grid: Tensor, name: str, settings: EncodeSettings) -> Tensor:
-    """Convert a grid to [h, w, F] f16, or f32 if a value is beyond float16."""
-    check_finite(grid, f"features of image {name!r}")
-    if settings.normalised:
-        grid = torch.nn.functional.normalize(grid, dim=-1)
-    return grid if float(grid.abs().max()) > LARGEST_F16 else grid.to(torch.float16)
 
 
 def encode_images(
@@ -154,6 +80,8 @@ def encode_images(
 ) -> dict[str, Any]:
     """Encode photos and write them as a feature pack, completely or not at all.
 
+    Grids are stored in a temporary folder next to the pack first, so memory holds one batch.
+
     Args:
         images: images, and folders of them; a view has the name of its image.
         out: path of the pack.
@@ -161,7 +89,8 @@ def encode_images(
         device: of an encoder opened by its specification, as torch names it.
         cameras: of the photos, or their file: their sizes decide whether photos with an EXIF orientation are read as
             stored or rotated.
-        size, batch, normalised: as for `EncodeSettings`.
+        size: pixels of the shorter side; None: the encoder's default. batch: images of one size encoded at once.
+        normalised: True: cells become unit vectors (a cell of zeros stays zero).
         progress: as for `liftcore.lift`.
 
     Returns:
@@ -177,22 +106,45 @@ def encode_images(
         raise InvalidInput("images", expected="images or folders of images", got="none")
     check_output(out, list(photos.values()), "pack")
     model = open_image_encoder(encoder, device) if isinstance(encoder, str) else encoder
+    if size is not None and size < model.pixels.patch:
+        expected = f"at least a patch, {model.pixels.patch} pixels"
+        raise InvalidInput("size", expected=expected, got=f"{size} pixels")
     if isinstance(cameras, Path | str):
         cameras = read_cameras(cameras)
     sizes = {} if cameras is None else photo_sizes(photos, cameras)
-    file = as_path(out, "output")
+    file, readings, wide, count = as_path(out, "output"), dict[str, Reading](), list[str](), 0
     with shown_progress(progress) as reporter, writing(file):
-        pack = write_encoded(photos, model, file, EncodeSettings(size, batch, normalised), reporter, sizes)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with scratch_folder(f".{file.name}.", file.parent) as scratch:
+            files = {name: scratch / f"{number}.npy" for number, name in enumerate(photos)}
+            shorter = size or model.pixels.shorter
+            for names, stack in _batches(photos, model.pixels, shorter, batch, sizes, readings):
+                for name, grid in zip(names, model.encode(stack), strict=True):
+                    check_finite(grid, f"features of image {name!r}")
+                    cells = torch.nn.functional.normalize(grid, dim=-1) if normalised else grid
+                    if float(cells.abs().max()) > LARGEST_F16:
+                        wide.append(name)
+                    else:
+                        cells = cells.to(torch.float16)
+                    np.save(files[name], cells.numpy())
+                count += len(names)
+                reporter("encode", count, len(photos), "views")
+            metadata = {
+                "encoder": model.name,
+                "text_space": model.text_space,
+                "normalised": "true" if normalised else "false",
+            }
+            write_pack(file, grids_of(files), metadata, reporter)
         size_bytes = file.stat().st_size
-    warnings = orientation_warnings(pack.readings, "their cameras")
-    if pack.wide:
-        warnings.append(f"{len(pack.wide)} views have features beyond float16 and are stored as float32")
+    warnings = orientation_warnings(readings, "their cameras")
+    if wide:
+        warnings.append(f"{len(wide)} views have features beyond float16 and are stored as float32")
     if model.text_space == "none":
         warnings.append("these features have no text space: query a lift of them by example")
     return {
         "out": str(out),
         "bytes": size_bytes,
-        "views": pack.views,
+        "views": len(photos),
         "folders": folders_of(photos),
         "channels": model.channels,
         "patch": model.pixels.patch,

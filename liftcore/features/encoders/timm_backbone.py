@@ -10,10 +10,8 @@ from torch import Tensor, nn
 
 from liftcore.errors import InvalidInput, Unavailable
 from liftcore.features.encoders import Pixels
-from liftcore.runtime.nearest import nearest
-from liftcore.text.open_clip import WEIGHT_SUFFIXES
-from liftcore.text.torchvision_ops import import_torchvision
-from liftcore.text.weights import fetch_weights
+from liftcore.runtime.arguments import nearest
+from liftcore.text.open_clip import fetch_weights, import_torchvision, require_weights
 
 # Tensors of checkpoints besides the backbone, needed in training only.
 _LEFT_OVER = ("mask_token",)
@@ -113,10 +111,7 @@ def _by_name(label: str, name: str) -> Any:
 
 
 def _from_file(label: str, name: str, path: Path) -> Any:
-    if not path.is_file():
-        raise Unavailable(label, expected="a file of weights", got=f"nothing at {path}")
-    if path.suffix not in WEIGHT_SUFFIXES:
-        raise InvalidInput(label, expected=f"a file ending in {', '.join(WEIGHT_SUFFIXES)}", got=path.name)
+    require_weights(label, path)
     model = _create(name, pretrained=False)
     try:
         stored = _library().models.load_state_dict(str(path), device="cpu", weights_only=True)

@@ -20,16 +20,14 @@ from liftcore.features.encoders import Pixels, open_image_encoder
 from liftcore.features.encoders.clip import ClipImageEncoder, resnet_values, vit_values
 from liftcore.features.encoders.encode import (
     MAX_CELLS,
-    Encoded,
-    EncodeSettings,
+    encode_images,
     find_images,
     grid_size,
     read_image,
-    write_encoded,
 )
 from liftcore.features.encoders.timm_backbone import TimmEncoder
 from liftcore.io.photos import Reading, read_header
-from liftcore.text import weights
+from liftcore.text import open_clip as weights
 from liftcore.text.open_clip import OpenedModel, library
 from liftcore.values.pack import read_features
 from liftcore.values.views import FeatureGrid
@@ -54,20 +52,15 @@ class MeanColour:
         return self.scale * torch.nn.functional.avg_pool2d(images, 4).permute(0, 2, 3, 1)
 
 
-Encode = Callable[..., tuple[Encoded, dict[str, Tensor]]]
+Encode = Callable[..., tuple[list[str], dict[str, Tensor]]]
 
 
 @pytest.fixture
 def encode(tmp_path: Path) -> Encode:
-    def run(
-        folder: Path,
-        encoder: MeanColour | None = None,
-        sizes: dict[str, tuple[int, int]] | None = None,
-        **settings: Any,
-    ) -> tuple[Encoded, dict[str, Tensor]]:
+    def run(folder: Path, encoder: MeanColour | None = None, **options: Any) -> tuple[list[str], dict[str, Tensor]]:
         out = tmp_path / "out" / "pack.safetensors"
-        options = EncodeSettings(**{"normalised": False, **settings})
-        result = write_encoded(find_images([folder]), encoder or MeanColour(), out, options, sizes=sizes)
+        options = {"normalised": False, "progress": False, **options}
+        report = encode_images(folder, out, encoder or MeanColour(), **options)
         assert [path.name for path in out.parent.iterdir()] == [out.name]
         packs = read_features(out)
         grids = {}
@@ -75,7 +68,7 @@ def encode(tmp_path: Path) -> Encode:
             observed = packs[view]
             assert isinstance(observed, FeatureGrid)
             grids[view] = observed.grid
-        return result, grids
+        return report["warnings"], grids
 
     return run
 
@@ -99,8 +92,8 @@ def test_a_blob_lights_the_cell_that_it_lies_in_as_the_photo_is_stored(photos: P
     exif = Image.Exif()
     exif[ORIENTATION] = 6
     upright.save(photos / "tagged.png", exif=exif)
-    result, grids = encode(photos)
-    assert result.readings == {"a": Reading.UPRIGHT, "tagged": Reading.STORED}
+    warnings, grids = encode(photos)
+    assert any("1 of 2 photos (tagged) were read as stored" in text for text in warnings)
     for grid in grids.values():
         assert grid.shape == (2, 3, 3) and grid.dtype == torch.float16
         assert int(grid.sum(dim=-1).argmax()) == 2 and grid[1].max() == 0
@@ -186,8 +179,8 @@ def test_what_float16_cannot_hold_is_float32_and_what_is_no_number_refused(
 ) -> None:
     Image.new("RGB", (8, 8), (255, 255, 255)).save(photos / "bright.png")
     Image.new("RGB", (8, 8), (9, 9, 9)).save(photos / "dark.png")
-    result, grids = encode(photos, MeanColour(scale=1e5))
-    assert result.wide == ("bright",)
+    warnings, grids = encode(photos, MeanColour(scale=1e5))
+    assert any(text.startswith("1 views have features beyond float16") for text in warnings)
     assert grids["bright"].dtype == torch.float32 and grids["bright"].max() == 1e5
     assert grids["dark"].dtype == torch.float16
     before = (tmp_path / "out" / "pack.safetensors").read_bytes()

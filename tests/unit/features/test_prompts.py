@@ -82,11 +82,10 @@ def with_legend(view: str) -> bytes:
 
 
 LABELS = {**{f"{view}.png": numbered_masks(view) for view in MASKS}, "names.json": {7: "red_apple", 14: "Lamp"}}
-COLOURS = {name: np.repeat(mask[..., None] // 255, 3, axis=2) for name, mask in binary("{view}/{phrase}").items()}
+COLOURS = {name: np.repeat(mask[..., None] // 255, 3, axis=2) for name, mask in binary("{phrase}/{view}").items()}
 KINDS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "binary PNGs": (binary("{phrase}/{view}"), {}),
-    "binary PNGs a view": (COLOURS, {"folders": "views"}),
-
+    "binary PNGs in colours": (COLOURS, {}),
     "run lengths as strings": (run_lengths(as_string=True), {}),
     "COCO's data set": (data_set(), {}),
     "label PNGs": (LABELS, {"names": "names.json"}),

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import struct
 from dataclasses import replace
@@ -74,15 +73,11 @@ def join(path: Path, document: dict[str, Any], binary: bytes) -> Path:
     return path
 
 
-def test_a_file_of_another_program_is_read_as_the_ply_that_it_was_made_of(tmp_path: Path) -> None:
+def test_a_file_of_another_program_is_read_as_the_ply_that_it_was_made_of() -> None:
     expected = read_splats(FILES / "degree3.sog.decoded.ply")
     assert format_of(FILES / "degree3.glb") is SplatFormat.GLTF
     assert_same(read_splats(FILES / "degree3.glb"), expected)
     np.testing.assert_allclose(read_places(FILES / "degree3.glb"), expected.means, atol=1e-6)
-    document, binary = parts_of(FILES / "degree3.glb")
-    document["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
-    (tmp_path / "s.gltf").write_text(json.dumps(document), encoding="utf-8")
-    assert_same(read_splats(tmp_path / "s.gltf"), expected)
 
 
 def test_what_the_format_has_no_word_for_is_kept(tmp_path: Path) -> None:

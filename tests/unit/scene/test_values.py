@@ -161,15 +161,6 @@ def test_more_views_than_a_scene_may_have_are_refused_before_they_are_read(
         read_cameras(path)
 
 
-@pytest.mark.parametrize(
-    ("views", "cameras", "difference"),
-    [
-        (["img_1", "img_2"], ["IMG_1", "IMG_2"], "capital letters"),
-        (["frame_1", "frame_2"], ["frame_0001", "frame_0002"], "leading zeros"),
-        (["IMG_1_mask", "IMG_2_mask"], ["IMG_1", "IMG_2"], "'_mask', with which views end"),
-        (["left", "right"], ["IMG_1", "IMG_2"], "a view is named after its image"),
-    ],
-)
-def test_names_that_do_not_pair_say_how_they_differ(views: list[str], cameras: list[str], difference: str) -> None:
-    with pytest.raises(InvalidFeatures, match=f"none in common; .*{difference}"):
-        require_pairs(views, cameras)
+def test_names_that_do_not_pair_are_refused_with_how_views_are_named() -> None:
+    with pytest.raises(InvalidFeatures, match=r"none in common; .*a view is named after its image"):
+        require_pairs(["left", "right"], ["IMG_1", "IMG_2"])
