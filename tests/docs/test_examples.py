@@ -27,7 +27,20 @@ import liftcore as lc
 from liftcore.cli import main
 from liftcore.io.cameras import read_cameras
 from service.commands.demo import read_truth
-from tests.tiny_scene import HEIGHT, WIDTH, WORDS, cameras_document, codebook, colmap_zip, labels, make_scene
+from tests.tiny_scene import (
+    FOCAL,
+    HEIGHT,
+    SPLATS_A_CLUSTER,
+    VIEWS,
+    WIDTH,
+    WORDS,
+    cameras_document,
+    codebook,
+    colmap_zip,
+    labels,
+    make_scene,
+    splat_rows,
+)
 
 from .readme import GUIDE, PYTHON, ROOT, blocks, text
 
@@ -217,54 +230,32 @@ def test_cells_run_in_order_and_print_what_is_saved(
     assert overlap is not None and overlap > 0.8
 
 
-# The five lines for a training loop, on tensors as gsplat trains them
-
-
-@pytest.fixture
-def loop() -> dict[str, Any]:
-    """Return the state of a training loop: parameters, poses and photos of two clouds of splats, an image encoder."""
-    random = torch.Generator().manual_seed(5)
-    means = 0.25 * torch.randn(400, 3, generator=random)
-    means[:200, 0] -= 0.8
-    means[200:, 0] += 0.8
-    params: dict[str, Any] = {
-        "means": means,
-        "quats": 3 * torch.randn(400, 4, generator=random),  # unnormalised, as they are trained
-        "log_scales": torch.full((400, 3), -2.6) + 0.2 * torch.randn(400, 3, generator=random),
-        "opacity_logits": torch.full((400,), 1.5),
+def test_five_lines_lift_the_tensors_of_a_training_loop() -> None:
+    """On parameters as gsplat trains them, with an encoder whose maps have gradients."""
+    rows, K = torch.from_numpy(splat_rows()), torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    columns = {
+        "means": rows[:, :3],
+        "quats": 3 * rows[:, 10:],
+        "log_scales": rows[:, 7:10],
+        "opacity_logits": rows[:, 6],
     }
-    names = dict(torch.nn.ParameterDict(params).items())
-    viewmats, Ks = torch.eye(4).repeat(5, 1, 1), torch.eye(3).repeat(5, 1, 1)
-    viewmats[:, 0, 3], viewmats[:, 2, 3] = torch.linspace(-0.5, 0.5, 5), 4.0
-    Ks[:, 0, 0] = Ks[:, 1, 1] = 30.0
-    Ks[:, 0, 2], Ks[:, 1, 2] = WIDTH / 2, HEIGHT / 2
-    splats = lc.Splats(**params)
-    colours = torch.where(means[:, :1] < 0, torch.tensor([1.0, 0.2, 0.1]), torch.tensor([0.1, 0.3, 1.0]))
-    views = [f"{view:04d}" for view in range(5)]
-    poses: Any = list(zip(views, viewmats, Ks, strict=True))
+    loop: dict[str, Any] = dict(torch.nn.ParameterDict(columns).items())
+    poses = []
+    for number, x in enumerate(VIEWS.values()):
+        viewmat = torch.diag(torch.tensor([1.0, -1, -1, 1]))
+        viewmat[0, 3] = -x
+        poses.append((f"{number:04d}", viewmat, K))
+    cameras = {name: lc.Camera(viewmat, K, WIDTH, HEIGHT) for name, viewmat, K in poses}
+    photos = [(name, lc.render(lc.Splats(**columns), camera, rows[:, 3:6])) for name, camera in cameras.items()]
     torch.manual_seed(2)
-    net = torch.nn.Sequential(
-        torch.nn.Conv2d(3, 16, 3, stride=2, padding=1), torch.nn.Tanh(), torch.nn.Conv2d(16, 12, 1)
-    )
-
-    def encode(photo: torch.Tensor) -> torch.Tensor:
-        """[h, w, F] of a photo [H, W, 3], with gradients as a network gives them."""
-        return net(photo.permute(2, 0, 1)[None])[0].permute(1, 2, 0)
-
-    photos = [(name, lc.render(splats, lc.Camera(viewmat, K, WIDTH, HEIGHT), colours)) for name, viewmat, K in poses]
-    return names | {"poses": poses, "photos": photos, "encode": encode, "width": WIDTH, "height": HEIGHT}
-
-
-def test_five_lines_lift_the_tensors_of_a_training_loop(loop: dict[str, Any]) -> None:
-    assert all(loop[name].requires_grad for name in ("means", "quats", "log_scales", "opacity_logits"))
+    loop |= {"poses": poses, "photos": photos, "encode": torch.nn.Linear(3, 12), "width": WIDTH, "height": HEIGHT}
     (example,) = (block for block in blocks(PYTHON, "python") if "lc.Splats(" in block)
     five = example.splitlines()[2:]
     assert len(five) == 5
     exec("\n".join([example.splitlines()[0], *five[:4]]), loop)
     assert inspect.isgenerator(loop["views"])
-    features = loop["result"].features.float()
-    loop["text_vectors"] = features[loop["means"][:, 0].detach() < 0].mean(dim=0)
+    loop["text_vectors"] = loop["result"].features[:SPLATS_A_CLUSTER].float().mean(dim=0)
     exec(five[4], loop)
-    columns = np.nonzero(np.asarray(loop["mask"]))[1]
-    assert len(columns) > 10 and columns.max() < WIDTH / 2  # the cloud on the left was asked for
+    pixels = np.nonzero(np.asarray(loop["mask"]))[1]
+    assert len(pixels) > 10 and pixels.max() < WIDTH / 2  # the cluster on the left was asked for
     assert loop["means"].grad is None
