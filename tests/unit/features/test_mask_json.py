@@ -122,8 +122,8 @@ def test_polygons_are_filled_as_coco_fills_them() -> None:
         expected = read_runs({"size": [*size], "counts": counts}).pixels()
         assert_within_a_pixel(actual, expected)
     corners = [[2.3, 1.2], [10.7, 2.1], [8.4, 9.6]]  # of the first, as the labels of LeRF-OVS have them
-    masks = [fill_polygons((12, 14), read_polygons(polygon)) for polygon in (corners, cases[0][0])]
-    assert np.array_equal(*masks)
+    first, second = (fill_polygons((12, 14), read_polygons(polygon)) for polygon in (corners, cases[0][0]))
+    assert np.array_equal(first, second)
 
 
 def assert_within_a_pixel(actual: np.ndarray, expected: np.ndarray) -> None:
