@@ -16,8 +16,8 @@ Then the objects of the region graph (`liftcore.solve.objects`) correct the sele
   objects by mistake, the rest of it must be nearer to its selected part than to any other object, in features; else
   only those splats of the rest are added for which this holds. A rest of many splats, though of little weight, must
   also have the query's word among its nearest, as it may be a larger thing that few rays see; else it is added splat
-  by splat likewise. Where less than `MOSTLY_SELECTED` is selected, all of the rest is added or none, and no other
-  object's best word may be nearer to it, both as cosines and about the scene's mean.
+  by splat likewise. Where less than `MOSTLY_SELECTED` is selected, all of the rest is added or none: the word must
+  be among the nearest for `NEAR` of its total weight.
 - An object of which less than `PARTLY_SELECTED` is selected is **removed** where this part, too, is nearer to the
   object's own best word than to the query's: masks show that the part belongs to the object. What is visible through
   an object, or was merged with it by mistake, has its own word as the nearest and stays.
@@ -80,6 +80,12 @@ class CompetingWords:
         """Count the words that are nearer to unit features [n, F] than the query's words, [n] i64."""
         ones = np.ones(len(means), np.float32)
         return np.minimum(*nearer_counts(means, ones, scene.rough_mean, *self._pair))
+
+    def near_share(self, scene: OpenedLift, rows: np.ndarray) -> float:
+        """Return the share of the total weight of some splats, of a sample of them, that the words are near to."""
+        rows = rows[:: -(-len(rows) // _BLOCK) or 1]
+        near = self.count_nearer(scene, rows) <= self.nearer_limit
+        return float(np.average(near, weights=scene.total_weight[rows] + np.float32(1e-30)))
 
     @property
     def _pair(self) -> tuple[np.ndarray, np.ndarray]:
@@ -170,11 +176,6 @@ def correct_by_objects(
     has_mean = np.linalg.norm(means, axis=1) > 0
     near = has_mean & (competitors.count_nearer_means(scene, means) <= competitors.nearer_limit)
     other_means = means[has_mean & ~near]  # of objects that are no part of the answer
-    words = (
-        competitors.vectors[np.unique((other_means @ competitors.vectors.T).argmax(axis=1))]
-        if len(competitors.vectors)
-        else other_means
-    )
     corrected, grown_count, clauses = selected.copy(), 0, []
     for target in np.flatnonzero(near & (shares >= PARTLY_SELECTED) & (inside < totals)).tolist():
         members = objects == target
@@ -183,14 +184,13 @@ def correct_by_objects(
         is_other = len(other_means) and _about(scene, other_means, rest).max() >= _about(scene, part[None], rest)[0]
         is_large = len(rest_rows) > (1 - MOSTLY_SELECTED) * members.sum()
         is_odd = is_large and competitors.count_nearer_means(scene, rest[None])[0] > competitors.nearer_limit
-        if is_other or (is_odd and shares[target] >= MOSTLY_SELECTED):
-            if shares[target] < MOSTLY_SELECTED:
+        if shares[target] < MOSTLY_SELECTED:
+            if is_other or competitors.near_share(scene, rest_rows) < NEAR:
                 continue
+        elif is_other or is_odd:
             rest_rows = _nearest_to(scene, rest_rows, means[has_mean], int(has_mean[:target].sum()))
             if is_odd:
                 rest_rows = rest_rows[competitors.count_nearer(scene, rest_rows) <= competitors.nearer_limit]
-        elif shares[target] < MOSTLY_SELECTED and _nearer_both_ways(scene, words, competitors.directions, rest):
-            continue
         corrected[rest_rows] = True
         grown_count += bool(rest_rows.size)
     if grown_count:
@@ -331,16 +331,6 @@ def _objects_of_other_words(
         if ((word - competitors.directions) @ np.concatenate([pair, pair - scene.rough_mean]).T > 0).all():
             numbers.append(number)
     return numbers
-
-
-def _nearer_both_ways(scene: OpenedLift, words: np.ndarray, directions: np.ndarray, mean: np.ndarray) -> bool:
-    """Return True if one of some words [m, F] is nearer to a mean [F] than directions [p, F], also about the mean.
-
-    Words lie in a cone: a word that is near to a whole scene is also the nearest to much that it does not mean. So
-    the comparison is repeated about the scene's mean.
-    """
-    sides = np.stack([mean, mean - scene.rough_mean])
-    return bool(len(words)) and bool(((words @ sides.T) > (directions @ sides.T).max(axis=0)).all(axis=1).any())
 
 
 def _nearest_to(scene: OpenedLift, rows: np.ndarray, means: np.ndarray, target: int) -> np.ndarray:

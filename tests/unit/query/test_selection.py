@@ -79,13 +79,16 @@ def test_mostly_selected_object_is_selected_whole_unless_it_holds_two(scene: Sce
     assert not of_mixed.selected[300:].any()
 
 
-def test_rest_of_an_object_is_added_only_if_it_answers_by_itself(scene: Scene, table: TableEncoder) -> None:
+@pytest.mark.parametrize("weight", [0.1, 0.6])  # of its splats: most of the object's weight is the cat's, or not
+def test_rest_of_an_object_is_added_only_if_it_answers_by_itself(
+    scene: Scene, table: TableEncoder, weight: float
+) -> None:
     """A larger thing that masks join with a cat, seen by few rays: it is like no other object, and smoothed."""
     words = ["cat"] * 300 + ["sofa"] * 900 + ["pizza"] * 400
     rows = pictures(table, words, 0.1)
     rows[300:1200] = 0.75 * rows[300:1200] + 0.25 * pictures(table, ["cat"] * 900, 0.1)
     numbers = torch.from_numpy(np.repeat([0, 1], [1200, 400]).astype(np.int32))
-    weights = torch.from_numpy(np.repeat([1, 0.1, 1], [300, 900, 400]).astype(np.float32))
+    weights = torch.from_numpy(np.repeat([1, weight, 1], [300, 900, 400]).astype(np.float32))
     objects = {"object": numbers, "object_views": torch.zeros((2, 5), dtype=torch.int32), "total_weight": weights}
     answer = ask(lifted(scene, rows, **objects), "cat", table)
     assert answer.selected[:300].mean() > 0.9
