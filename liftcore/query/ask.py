@@ -64,6 +64,8 @@ LEAST_RIVAL_OF_CLEAR = 0.5  # the same for a clear answer
 WHOLE_SHARE = 0.9  # of an object's splats, from which a selection is no part of it
 LEAST_OF_WHOLE = 0.1  # of what a word selects in the whole scene, from which its splats in an object are a part
 SAME_AS_WORD = 0.9  # cosine of all splats to a word without competitors, from which all are of it
+SAME_AS_EXAMPLE = 0.98  # the same of an example: features of one encoder are more alike
+MOST_COMPARED = 4_096  # splats that are compared with an example
 _OF_ANSWER = ("rivals", "candidates", "threshold", "clear", "statistics", "present", "presence", "reason")
 _QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 
@@ -401,7 +403,11 @@ def _select(
     is_automatic = query.threshold == "auto" and in_words.any() and in_words.sum() == mask[:positives].sum()
     has_references = bool(competitors) and isinstance(request.references, References)
     lack = explain_no_selection(valid_scores)
-    if lack and is_automatic and valid_scores.any() and _are_of_word(scene, valid_scores, scores, competitors):
+    is_of_word = lack and is_automatic and valid_scores.any()
+    is_example = query.threshold == "auto" and not in_words.any() and len(mask) == 1
+    if (is_example and _is_one_thing(scene, request.rows[0])) or (
+        is_of_word and _are_of_word(scene, valid_scores, scores, competitors)
+    ):
         return _select_all(scene, valid_scores)
     if lack:
         method = query.threshold if isinstance(query.threshold, str) else "fixed"
@@ -413,9 +419,9 @@ def _select(
     if not is_automatic:
         return threshold, selected
     is_unclear = not has_references and has_one_mode(valid_scores, threshold.value, scene.weights)
+    threshold = threshold.model_copy(update={"clear": threshold.clear and not is_unclear})
     if is_unclear and _are_of_word(scene, valid_scores, scores, competitors):
-        threshold = _select_all(scene, valid_scores)[0]
-        selected = scene.has_feature.copy()
+        threshold, selected = _select_all(scene, valid_scores)
     if not competitors:
         return threshold, selected
     comparison = compare_ranks(scene, scores, threshold.value, competitors[0])
@@ -452,6 +458,18 @@ def _are_of_word(
     if competitors:
         return compare_ranks(scene, scores, math.inf, competitors[0]).rest >= NEAR
     return float(valid_scores.min()) >= SAME_AS_WORD
+
+
+def _is_one_thing(scene: OpenedLift, example: np.ndarray) -> bool:
+    """Return True if a scene is alike to an example [F], and no valley parts it without the most similar splat."""
+    rows = np.flatnonzero(scene.has_feature)
+    rows = rows[:: -(-len(rows) // MOST_COMPARED) or 1]
+    similar = products(scene.features[rows], scene.norms[rows], example[None], example[None])[0][:, 0]
+    if similar.min(initial=1.0) < SAME_AS_EXAMPLE:
+        return False
+    others = np.argsort(similar, kind="stable")[:-1]
+    values, weights = similar[others], scene.total_weight[rows[others]]
+    return not len(values) or has_one_mode(values, find_threshold(values, "auto", weights).value, weights)
 
 
 def _select_all(scene: OpenedLift, valid_scores: np.ndarray) -> tuple[Threshold, np.ndarray]:

@@ -80,6 +80,14 @@ def test_a_scene_of_one_thing_is_selected_whole_or_not_at_all(noise: float) -> N
     assert "all is of one thing" in answers["mug"].threshold.explanation
 
 
+@pytest.mark.parametrize("noise", [0.0, 1e-3, 0.1])
+def test_an_example_selects_a_scene_of_one_thing_whole(noise: float) -> None:
+    mugs = scene_with(photo_vectors(["mug"] * 80, noise))
+    assert mugs.ask(lc.Query(like=["splat:3"]), places=False).count == 80
+    two = scene_with(photo_vectors(["mug"] * 40 + ["lamp"] * 40, noise / 10))
+    assert two.ask(lc.Query(like=["splat:3"]), places=False).count == 40
+
+
 @pytest.mark.parametrize("noise", [0.0, 1e-3, 1e-2, 0.1])
 def test_a_valley_between_equals_is_none(noise: float, tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
