@@ -46,7 +46,7 @@ class PackOptions(TypedDict, total=False):
     layout: Layout
     """of ``npy``, the order of the axes: hwc or chw"""
     map_fit: Fit
-    """of ``npy``, what the encoder's preprocessing did to photos (`liftcore.values.fit`): stretch, pad or crop"""
+    """of ``npy``, what the encoder's preprocessing did to photos (`liftcore.values.fit`)"""
     unlabelled: int | None
     """of label pictures, the value of pixels without a mask; None: 0 for ``masks``, no value for ``prompts``"""
     encoder: str | None

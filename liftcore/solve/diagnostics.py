@@ -233,8 +233,8 @@ def shape_warnings(packs: Views, views: Sequence[Camera]) -> list[str]:
     advice = {
         "of another shape than their images{}: check that they are [rows, columns], channels last": odd,
         "of another aspect than their images{}, over which they are stretched: say if the encoder's preprocessing "
-        "stretched the photos, or did pad or crop them (pack npy --map-fit, in Python FeatureGrid(map, fit=)); "
-        "splatlift check compares the three": stretched,
+        "stretched the photos, or did pad, pad-end or crop them (pack npy --map-fit, in Python FeatureGrid(map, "
+        "fit=)); splatlift check compares these": stretched,
     }
     return [
         f"{len(cameras)} of {len(views)} views have maps {text.format(_shapes(packs, cameras[0]))}"

@@ -4,10 +4,11 @@
 |---|---|---|
 | `stretch` | its sides were scaled to those of the map, each by itself | the whole photo |
 | `pad` | the whole photo was scaled, with bars on both sides | the whole photo, and bars |
+| `pad-end` | the same, with bars at the right or the bottom, as in SAM | the whole photo, and bars |
 | `crop` | its centre was cut out, as CLIP's preprocessing does | the centre |
 
-A map of the fit `pad` or `crop` is read by the camera of the part of the photo that its cells show: cells of bars are
-cut off with the rest of a cell that they share with the photo, and rays beside a crop have no feature.
+A map of another fit than `stretch` is read by the camera of the part of the photo that its cells show: cells of bars
+are cut off with the rest of a cell that they share with the photo, and rays beside a crop have no feature.
 """
 
 import math
@@ -16,7 +17,7 @@ from typing import Literal, NamedTuple, get_args
 from liftcore.errors import InvalidFeatures
 from liftcore.scene.cameras import Camera
 
-Fit = Literal["stretch", "pad", "crop"]
+Fit = Literal["stretch", "pad", "pad-end", "crop"]
 FITS: tuple[Fit, ...] = get_args(Fit)
 ROUNDING = 1e-6  # of a cell
 
@@ -38,18 +39,24 @@ def window_of(fit: str, cells: tuple[int, int], photo: tuple[int, int]) -> Windo
     Args:
         fit: of the map; "" for not recorded, which is read as ``stretch``. cells, photo: width and height of each.
     """
-    if fit not in ("pad", "crop"):
+    if fit in ("", "stretch"):
         return None
-    fits = max if fit == "pad" else min
+    fits = min if fit == "crop" else max
     pixels = fits(photo[0] / cells[0], photo[1] / cells[1])  # of a cell's side
-    spans = [_span(count, side, pixels) for count, side in zip(cells, photo, strict=True)]
+    spans = [
+        _span(count, side, pixels, 0.0 if fit == "pad-end" else 0.5) for count, side in zip(cells, photo, strict=True)
+    ]
     (columns, left, right), (rows, top, bottom) = spans
     return Window(rows, columns, left, top, right, bottom)
 
 
-def _span(cells: int, side: int, pixels: float) -> tuple[slice, float, float]:
-    """Return the cells of an axis that lie within the photo, and the first and last pixels' edges under them."""
-    start = (side - cells * pixels) / 2  # of the first cell, in pixels of the photo
+def _span(cells: int, side: int, pixels: float, before: float) -> tuple[slice, float, float]:
+    """Return the cells of an axis that lie within the photo, and the first and last pixels' edges under them.
+
+    Args:
+        before: share of a bar, or of what was cut off, that lies before the photo.
+    """
+    start = before * (side - cells * pixels)  # of the first cell, in pixels of the photo
     first, last = math.ceil(-start / pixels - ROUNDING), math.floor((side - start) / pixels + ROUNDING)
     first, last = max(first, 0), min(last, cells)
     return slice(first, last), start + first * pixels, start + last * pixels

@@ -143,8 +143,8 @@ class FeatureGrid:
 
     Args:
         grid: [h, w, F] of floats, as the codebook of `Regions`. Maps [F, h, w] of torch are ``permute(1, 2, 0)``.
-        fit: of the map to its photo, ``stretch``, ``pad`` or ``crop`` (`liftcore.values.fit`): what the encoder's
-            preprocessing did to the photo. "": not known, read as ``stretch``, with a warning where shapes differ.
+        fit: of the map to its photo, one of ``FITS`` (`liftcore.values.fit`): what the encoder's preprocessing
+            did to the photo. "": not known, read as ``stretch``, with a warning where shapes differ.
         context: text before the argument's name in errors, such as a view.
 
     Raises:

@@ -15,10 +15,12 @@ from PIL import Image
 from tests.promises.command_line import run
 from tests.promises.scenes import look_at, plane_under_pixels
 
-FITS = ("stretch", "pad", "crop")
+FITS = ("stretch", "pad", "pad-end", "crop")
 WIDTH, HEIGHT, CELLS = 96, 64, 24
 COLOURS = np.random.default_rng(5).uniform(0, 1, (16, 3))
-CANVAS = {"stretch": (WIDTH, HEIGHT), "pad": (WIDTH, WIDTH), "crop": (HEIGHT, HEIGHT)}  # that a map covers, in pixels
+CANVAS = {  # that a map covers, in pixels
+    "stretch": (WIDTH, HEIGHT), "pad": (WIDTH, WIDTH), "pad-end": (WIDTH, WIDTH), "crop": (HEIGHT, HEIGHT),
+}  # fmt: skip
 
 
 def patch_of(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -44,7 +46,8 @@ def map_of(camera: lc.Camera, fit: str) -> np.ndarray:
     """Return a map [24, 24, 16] of the patches, of a photo that was made to fit; bars are of patch 5."""
     sides = CANVAS[fit]
     scale = [CELLS / side for side in sides]
-    bars = [(side - photo) / 2 for side, photo in zip(sides, (WIDTH, HEIGHT), strict=True)]
+    before = 0.0 if fit == "pad-end" else 0.5
+    bars = [before * (side - photo) for side, photo in zip(sides, (WIDTH, HEIGHT), strict=True)]
     at_cells = camera.replace(
         width=CELLS, height=CELLS, fx=camera.fx * scale[0], fy=camera.fy * scale[1],
         cx=(camera.cx + bars[0]) * scale[0], cy=(camera.cy + bars[1]) * scale[1],
