@@ -30,7 +30,7 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
     arrays = formats.add_parser("npy", parents=[shared], help="IMG.npy (.npz, .pt), one dense map a view")
     arrays.add_argument("--layout", choices=("hwc", "chw"), default="hwc", help="of the axes; default hwc")
     fit = "what the encoder did to photos of another shape"
-    fits = ("stretch", "pad", "crop")
+    fits = ("stretch", "pad", "pad-end", "crop")
     arrays.add_argument("--map-fit", choices=fits, default=argparse.SUPPRESS, help=fit)
     masks = formats.add_parser("masks", parents=[shared], help="IMG.npy, a vector a mask, with JSON or pictures")
     unlabelled = "of pixels without a mask"
