@@ -21,6 +21,7 @@ ENCODER_SPECS = (
 # Encoders that need no file from the user, and the text space of each: the defaults where no encoder was chosen.
 BUILT_IN = {"lvis": "open_clip:ViT-B-32/openai"}
 LVIS_TABLE = Path(__file__).with_name("lvis_clip_vit_b_32.safetensors")  # its licences: service/commands/tabletop
+TABLES = (".safetensors", ".npy", ".npz", ".pt")  # of these only the first is read: the others' error says how
 TEMPLATES = (1, 7, 80)  # numbers of sentences that a word is put into: 1 is the word alone, 7 and 80 are CLIP's
 NO_WORDS = "none"  # the text space of features that no text encoder shares
 OWN_WORDS = "prompts"  # the text space of features whose packs contain their words
@@ -64,7 +65,7 @@ def encoder_file(spec: str) -> Path | None:
         return Path(spec.removeprefix("table:"))
     if spec.startswith("open_clip:") and "@" in spec:
         return Path(without_templates(spec)[0].partition("@")[2])
-    return Path(spec) if spec.endswith(".safetensors") else None
+    return Path(spec) if spec.endswith(TABLES) else None
 
 
 def check_encoder(spec: str) -> None:
@@ -108,7 +109,7 @@ def open_encoder(spec: str | Path, *, remembers: bool = False) -> TextEncoder:
     spec, templates = without_templates(str(spec))
     kind, _, rest = spec.partition(":")
     # A path may contain a colon, so the suffix is compared first.
-    if kind != "table" and spec.endswith(".safetensors") and not spec.startswith("open_clip:"):
+    if kind != "table" and spec.endswith(TABLES) and not spec.startswith("open_clip:"):
         kind, rest = "table", spec
     if spec == "lvis" or (kind == "table" and rest):
         from liftcore.text.table import TableEncoder
