@@ -24,13 +24,10 @@ from difflib import get_close_matches
 from functools import cache, cached_property
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from liftcore.errors import InvalidQuery
 from liftcore.text.phrases import ARTICLES, IRREGULAR, PUNCTUATION, PartPhrase, heads, part_phrases, read_phrase
-
-if TYPE_CHECKING:
-    import numpy as np
 
 SYNONYMS = Path(__file__).with_name("synonyms.json")
 SUGGESTED = 5  # words suggested for an unknown one
@@ -42,7 +39,6 @@ _MAX_TYPED = 80  # characters of a text that are compared
 _MAX_COMPARED = 3000  # words whose spelling is compared: a longer list would delay other queries
 _TYPO_SIMILARITY = 0.8  # least similarity of spelling of a misspelt word, of difflib
 _PREFIX_SIMILARITY = 0.8  # the same for the beginning of a word
-_MEANING_COSINE = 0.35  # least cosine of related words, about the mean of the shipped words
 
 
 class Wording(NamedTuple):
@@ -196,7 +192,7 @@ class Vocabulary:
             words.update(dict.fromkeys(self._misspelt(text)))
         for head in chain([text], heads(text)):
             of_kind = sorted(self._of_group(head), key=lambda word: word not in preferred)
-            words.update(dict.fromkeys([*of_kind, *self._of_meaning(head), *self._with_token(head)]))
+            words.update(dict.fromkeys([*of_kind, *self._with_token(head)]))
             if len(words) >= count:
                 break
         return tuple(words)[:count]
@@ -261,24 +257,6 @@ class Vocabulary:
                     if word is not None and _spelling_key(word) not in forms:
                         yield word
 
-    def _of_meaning(self, text: str) -> list[str]:
-        """Return words whose vectors are near to that of the shipped word that matches the text."""
-        import numpy as np
-
-        shipped, rows = _shipped()
-        shipped_word = shipped.word_of(text)
-        if shipped_word is None or len(self.words) > _MAX_COMPARED:
-            return []
-        shipped_rows = {shipped_name: row for row, shipped_name in enumerate(shipped.words)}
-        word_pairs = [(word, shipped_name) for word in self.words if (shipped_name := shipped.word_of(word))]
-        if not word_pairs:
-            return []
-        cosines = (
-            rows[[shipped_rows[shipped_name] for _, shipped_name in word_pairs]] @ rows[shipped_rows[shipped_word]]
-        )
-        order = np.argsort(-cosines, kind="stable")[: SUGGESTED + 1]
-        return [word_pairs[row][0] for row in order.tolist() if cosines[row] >= _MEANING_COSINE]
-
     def _with_token(self, text: str) -> list[str]:
         """Return words of several parts, one of which is the text; those that end with it come first."""
         forms = {form for form in _forms(text) if form}
@@ -341,19 +319,10 @@ def _synonyms() -> dict[str, list[str]]:
     return synonyms_by_key
 
 
+@cache
 def shipped_words() -> Vocabulary:
     """Return the words of the table that ships."""
-    return _shipped()[0]
-
-
-@cache
-def _shipped() -> tuple[Vocabulary, np.ndarray]:
-    """Return the shipped words, and their embeddings [n, F] f32 with their mean subtracted, unit rows."""
-    import numpy as np
-
     from liftcore.text import LVIS_TABLE
     from liftcore.text.table import TableEncoder
 
-    table = TableEncoder.open(LVIS_TABLE)
-    about = table.embeddings - table.embeddings.mean(axis=0)
-    return Vocabulary(table.words), about / np.linalg.norm(about, axis=1, keepdims=True)
+    return Vocabulary(TableEncoder.open(LVIS_TABLE).words)

