@@ -94,6 +94,7 @@ def test_map_coordinates_keep_the_digits_of_the_file(tmp_path: Path) -> None:
     quats, log_scales = torch.from_numpy(rows[:, 10:]), torch.from_numpy(rows[:, 7:10])
     far = rows[:, :3] + np.array([500_000.0, 5_400_000.0, 300.0])
     splats = lc.Splats(far, quats, log_scales, torch.from_numpy(rows[:, 6]))
+    assert "float32" in lc.Splats(far.astype(np.float32), quats, log_scales, splats.opacity_logits).warnings[0]
     lc.write_splats(tmp_path / "far.ply", splats)
     read = lc.read_splats(tmp_path / "far.ply")
     assert np.abs(read.positions() - far).max() < 1e-6 and float(read.means.abs().max()) < 1e4

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,14 @@ import pytest
 import torch
 
 import liftcore as lc
+from liftcore.io.splats import read_places, read_splats
 from liftcore.query.splat_colours import view_colours
 from liftcore.raster.reference import dense_view
 from liftcore.scene.compositing import CompositingParams
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
 from tests.scenes import look_at, observed, random_camera, random_splats
+from tests.tiny_scene import ply, splat_rows
 
 COUNT, BROKEN = 40, {"means": 5, "log_scales": 9, "quats": 17, "opacity_logits": 20}
 VALID_ROWS = torch.tensor([row not in BROKEN.values() for row in range(COUNT)])
@@ -76,6 +79,13 @@ def test_a_colour_that_is_no_number_is_grey_from_everywhere(kernel: Kernel) -> N
         torch.testing.assert_close(colours[grey], torch.full((len(grey), 3), 0.5), atol=1e-6, rtol=0)
         assert bool(torch.isfinite(colours).all())
     assert torch.equal(with_colours.opacity_logits, splats.opacity_logits)
+
+
+def test_places_of_a_file_are_numbers(tmp_path: Path) -> None:
+    rows = splat_rows()
+    rows[5, 0] = np.nan
+    (tmp_path / "s.ply").write_bytes(ply(rows))
+    np.testing.assert_array_equal(read_places(tmp_path / "s.ply"), read_splats(tmp_path / "s.ply").means.numpy())
 
 
 def test_whole_and_empty_opacities_and_flat_splats_are_numbers() -> None:

@@ -73,7 +73,7 @@ def test_what_chooses_no_rows_is_refused(keep: Any, message: str) -> None:
 def test_cameras_moved_with_the_splats_see_the_same(kernel: Kernel) -> None:
     splats, camera = coloured(kernel), random_camera(3)
     values = np.random.default_rng(2).random((60, 2))
-    transformed, seen_from = splats.transformed(MATRIX), camera.transformed(MATRIX)
+    transformed, seen_from = splats.transformed(torch.from_numpy(MATRIX)), camera.transformed(MATRIX)
     np.testing.assert_allclose(
         transformed.positions(), splats.positions() @ MATRIX[:3, :3].T + MATRIX[:3, 3], atol=1e-4
     )
