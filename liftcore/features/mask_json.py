@@ -73,8 +73,8 @@ def read_mask_document(path: Path, *, unannotated_negative: bool = False) -> Mas
     with reading(path, InvalidFeatures, "COCO's JSON, or records with masks and phrases", AS_COCO):
         content = read_mask_json(path)
         fields = content if isinstance(content, dict) else {}
-        if others := sorted(OTHER_PROGRAMS & fields.keys()):
-            raise ValueError(f"COCO's JSON, or records with masks and phrases, got {others[0]!r}; {AS_COCO}")
+        if foreign := sorted(OTHER_PROGRAMS & fields.keys()):
+            raise ValueError(f"COCO's JSON, or records with masks and phrases, got {foreign[0]!r}; {AS_COCO}")
         if "mask_name" in fields and isinstance(fields.get("labels"), dict):
             document.images = [_tracked(fields)]
         elif isinstance(fields.get("images"), list):

@@ -71,8 +71,8 @@ class PageFiles(StaticFiles):
 
     def lookup_path(self, path: str) -> tuple[str, os.stat_result | None]:
         """Return a file, or the compressed one."""
-        plain = super().lookup_path(path)
-        return plain if plain[1] else super().lookup_path(f"{path}.gz")
+        file = super().lookup_path(path)
+        return file if file[1] else super().lookup_path(f"{path}.gz")
 
     def file_response(
         self, full_path: Any, stat_result: os.stat_result, scope: Scope, status_code: int = 200

@@ -223,8 +223,8 @@ def _links(question: Question, lift: str) -> dict[str, str]:
     links = {"lift": f"/lifts/{lift}", "render": f"/render?lift={lift}"}
     names = ("scores", "objects", "mask", "attention")
     for name, output in {**dict(zip(names, names, strict=True)), "object": "splats", "coloured": "splats"}.items():
-        more = {"what": "scores"} if name == "coloured" else {}
-        links[name] = f"/query/{output}?{urlencode(fields | more | {'lift': lift}, doseq=True)}"
+        channel = {"what": "scores"} if name == "coloured" else {}
+        links[name] = f"/query/{output}?{urlencode(fields | channel | {'lift': lift}, doseq=True)}"
     return links
 
 

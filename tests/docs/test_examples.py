@@ -233,7 +233,7 @@ def test_cells_run_in_order_and_print_what_is_saved(
 def test_five_lines_lift_the_tensors_of_a_training_loop() -> None:
     """On parameters as gsplat trains them, with an encoder whose maps have gradients."""
     rows, K = torch.from_numpy(splat_rows()), torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
-    columns = {
+    columns: dict[str, Any] = {
         "means": rows[:, :3],
         "quats": 3 * rows[:, 10:],
         "log_scales": rows[:, 7:10],

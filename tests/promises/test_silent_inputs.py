@@ -158,9 +158,9 @@ def test_an_odd_form_makes_the_pack_of_the_plain_one(form: str, tmp_path: Path) 
             (folder / name).write_bytes(content)
         lc.pack_folder(folder, pack, progress=False, **options)
         views.append(lc.read_features(pack)["é"])
-    plain, odd = views
-    assert plain.codebook.equal(odd.codebook)
-    assert isinstance(plain, lc.FeatureGrid) or plain.labels.equal(odd.labels)
+    usual, odd = views
+    assert usual.codebook.equal(odd.codebook)
+    assert isinstance(usual, lc.FeatureGrid) or usual.labels.equal(odd.labels)
 
 
 def test_a_frame_in_which_nothing_was_found_has_no_label(tmp_path: Path) -> None:
@@ -173,8 +173,8 @@ def test_a_frame_in_which_nothing_was_found_has_no_label(tmp_path: Path) -> None
 
 
 def test_remarks_of_a_ply_are_kept_and_not_understood(tmp_path: Path) -> None:
-    plain, remarks = ply(splat_rows()), b"comment d\xe9j\xe0 vu, element vertex 3\nobj_info end of 7\nelement"
-    (tmp_path / "s.ply").write_bytes(plain.replace(b"element", remarks, 1))
+    content, remarks = ply(splat_rows()), b"comment d\xe9j\xe0 vu, element vertex 3\nobj_info end of 7\nelement"
+    (tmp_path / "s.ply").write_bytes(content.replace(b"element", remarks, 1))
     splats = lc.read_splats(tmp_path / "s.ply")
     lc.write_splats(tmp_path / "copy.ply", splats)
     assert (tmp_path / "copy.ply").read_bytes() == (tmp_path / "s.ply").read_bytes()
