@@ -285,8 +285,8 @@ def best_view(scene: OpenedLift, answer: Answer) -> str | None:
 
 
 def _similarities(scene: OpenedLift, requests: Sequence[ResolvedQuery]) -> list[np.ndarray]:
-    """Compute for each query the cosines of every splat to each of its terms, [P, n] f32."""
-    features, norms = scene.features, scene.norms
+    """Compute for each query the cosines of every row of the features to each of its terms, [K, n] f32."""
+    features, norms = scene.features.rows, scene.features.norms
     of_words = np.concatenate([request.rows[request.by_cosine] for request in requests])
     # A row a word from here on, so that its scores are contiguous.
     columns = iter(np.ascontiguousarray(cosines(features, norms, of_words).T) if len(of_words) else ())
@@ -304,14 +304,13 @@ def _similarities(scene: OpenedLift, requests: Sequence[ResolvedQuery]) -> list[
 
 
 def _answer(scene: OpenedLift, request: ResolvedQuery, similarities: np.ndarray) -> Answer:
-    query, has_feature = request.query, scene.has_feature
+    query, has_feature, rows = request.query, scene.has_feature, scene.distinct
     if query.sets:
         return _set_answer(scene, query)
-    presence, mask = _presence(scene, request, similarities)
+    presence, mask = _presence(rows, request, similarities)
     scores = combine(similarities if mask.all() else similarities[:, mask], int(mask[: len(query.positives)].sum()))
-    if not scene.all_have_features:
-        scores = np.where(has_feature, scores, np.float32(LOWEST_COSINE))
-    valid_scores = scores if scene.all_have_features else scores[has_feature]
+    if not rows.all_have_features:
+        scores = np.where(rows.has_feature, scores, np.float32(LOWEST_COSINE))
     if presence.present is False and query.absent == "drop":
         method = query.threshold if isinstance(query.threshold, str) else "fixed"
         threshold = Threshold(value=math.inf, method=method, explanation=presence.reason, clear=False)
@@ -324,7 +323,13 @@ def _answer(scene: OpenedLift, request: ResolvedQuery, similarities: np.ndarray)
             threshold, selected = _select(scene, request, mask, scores)
     clear = threshold.clear and presence.present is not False and bool(selected.any())
     least = LEAST_RIVAL_OF_CLEAR if clear and presence.present is not None else LEAST_RIVAL
-    competitors = _nearer_words(scene, request, scores, selected, least)
+    is_selected = scene.features.with_splats(selected)
+    competitors = _nearer_words(rows, request, scores, is_selected, least)
+    counts = None if rows.row_counts is None else rows.row_counts[rows.has_feature]
+    statistics = finite(_statistics(scores[rows.has_feature], counts))
+    if rows is not scene:
+        scores = scene.features.of_splats(scores)
+        scores = scores if scene.all_have_features else np.where(has_feature, scores, np.float32(LOWEST_COSINE))
     nodes = request.candidates
     if request.unknown_part is not None and selected.any():
         nodes = parts_of(scene, objects_within(scene, selected))
@@ -336,8 +341,7 @@ def _answer(scene: OpenedLift, request: ResolvedQuery, similarities: np.ndarray)
     wording = tuple(WordMatch(**word._asdict()) for word in request.asked_as.values() if word.match)
     return Answer.of(
         query, scores, has_feature, selected, wording=wording, rivals=competitors,
-        candidates=nodes, threshold=threshold, clear=clear, statistics=finite(_statistics(valid_scores)),
-        **dict(presence),
+        candidates=nodes, threshold=threshold, clear=clear, statistics=statistics, **dict(presence),
     )  # fmt: skip
 
 
@@ -384,7 +388,7 @@ def _set_answer(scene: OpenedLift, query: Query) -> Answer:
     presence = Presence(present=count > 0, presence=float(count > 0), reason=f"{label} has {count} splats.")
     return Answer.of(
         query, scores, np.ones_like(members), members,
-        threshold=threshold, clear=count > 0, statistics=finite(_statistics(scores)), **dict(presence),
+        threshold=threshold, clear=count > 0, statistics=finite(_statistics(scores, None)), **dict(presence),
     )  # fmt: skip
 
 
@@ -394,8 +398,29 @@ def _select(
     """Return the threshold of a query and the selected splats, [P] bool.
 
     Args:
-        mask: [n] bool, the terms that take part in the scores. scores: [P] f32.
+        mask: [n] bool, the terms that take part in the scores. scores: [K] f32, of the rows of the features.
     """
+    threshold, row_mask, competitors = _select_rows(scene.distinct, request, mask, scores)
+    selected = row_mask if scene.distinct is scene else scene.has_feature & scene.features.of_splats(row_mask)
+    if competitors is None:
+        return threshold, selected
+    parts = part_nodes(scene, competitors)
+    if parts:
+        selected = scene.has_feature & np.logical_or.reduce([scene.members(node) for node in parts])
+        addition = f"levels differ in meaning, so the named parts are selected: {', '.join(map(str, parts))}"
+    else:
+        selected, addition = correct_by_objects(scene, selected, competitors)
+    if addition:
+        threshold = threshold.model_copy(
+            update={"explanation": f"{threshold.explanation.removesuffix('.')}; {addition}."}
+        )
+    return threshold, selected
+
+
+def _select_rows(
+    scene: OpenedLift, request: ResolvedQuery, mask: np.ndarray, scores: np.ndarray
+) -> tuple[Threshold, np.ndarray, CompetingWords | None]:
+    """Return the threshold of a query, the splats above it, [P] bool, and the words by which objects correct them."""
     query, positives = request.query, len(request.query.positives)
     valid_scores = scores if scene.all_have_features else scores[scene.has_feature]
     in_words = (request.by_cosine & mask)[:positives]
@@ -408,25 +433,27 @@ def _select(
     if (is_example and _is_one_thing(scene, request.rows[0])) or (
         is_of_word and _are_of_word(scene, valid_scores, scores, competitors)
     ):
-        return _select_all(scene, valid_scores)
+        return *_select_all(scene, valid_scores), None
     if lack:
         method = query.threshold if isinstance(query.threshold, str) else "fixed"
         threshold = Threshold(value=math.inf, method=method, explanation=lack, clear=False)
-        return threshold, np.zeros_like(scene.has_feature)
+        return threshold, np.zeros_like(scene.has_feature), None
     least = -math.inf if in_words.any() else LEAST_LIKENESS
     threshold = find_threshold(valid_scores, query.threshold, scene.weights, least)
     selected = scene.has_feature & (scores >= np.float32(threshold.value))
     if not is_automatic:
-        return threshold, selected
-    is_unclear = not has_references and has_one_mode(valid_scores, threshold.value, scene.weights)
+        return threshold, selected, None
+    is_unclear = not has_references and has_one_mode(
+        valid_scores, threshold.value, scene.weights, scene.effective_count
+    )
     threshold = threshold.model_copy(update={"clear": threshold.clear and not is_unclear})
     if is_unclear and _are_of_word(scene, valid_scores, scores, competitors):
         threshold, selected = _select_all(scene, valid_scores)
     if not competitors:
-        return threshold, selected
+        return threshold, selected, None
     comparison = compare_ranks(scene, scores, threshold.value, competitors[0])
     if has_references and comparison.rest >= NEAR:
-        return _select_all(scene, valid_scores)
+        return *_select_all(scene, valid_scores), None
     if comparison.lowest > threshold.value:
         retry = find_threshold(valid_scores, "auto", scene.weights, comparison.lowest)
         value = max(retry.value, comparison.lowest)
@@ -438,17 +465,7 @@ def _select(
     threshold = threshold.model_copy(update={"clear": threshold.clear and comparison.first >= LEAST_FIRST})
     if competitors[-1].nearer_limit == 0:  # a small table: splats nearer to another of its words are not selected
         selected = nearest_to_query(scene, selected, competitors[-1])
-    parts = part_nodes(scene, competitors[0])
-    if parts:
-        selected = scene.has_feature & np.logical_or.reduce([scene.members(node) for node in parts])
-        addition = f"levels differ in meaning, so the named parts are selected: {', '.join(map(str, parts))}"
-    else:
-        selected, addition = correct_by_objects(scene, selected, competitors[0])
-    if addition:
-        threshold = threshold.model_copy(
-            update={"explanation": f"{threshold.explanation.removesuffix('.')}; {addition}."}
-        )
-    return threshold, selected
+    return threshold, selected, competitors[0]
 
 
 def _are_of_word(
@@ -493,8 +510,9 @@ def _select_each(
         word_mask = mask.copy()
         word_mask[: len(request.query.positives)] = False
         word_mask[word] = True
-        scores = combine(similarities[:, word_mask], 1)
-        scores = scores if scene.all_have_features else np.where(scene.has_feature, scores, np.float32(LOWEST_COSINE))
+        scores = np.where(
+            scene.distinct.has_feature, combine(similarities[:, word_mask], 1), np.float32(LOWEST_COSINE)
+        )
         threshold, of_word = _select(scene, request, word_mask, scores)
         cuts.append(threshold)
         selected |= of_word
@@ -537,13 +555,19 @@ def _presence(scene: OpenedLift, request: ResolvedQuery, similarities: np.ndarra
     return presence, mask
 
 
-def _statistics(scores: np.ndarray) -> dict[str, float]:
+def _statistics(scores: np.ndarray, counts: np.ndarray | None) -> dict[str, float]:
+    """Return the ends, mean and quantiles of scores [n] f32, each of ``counts`` [n] splats; None: of one."""
     if len(scores) == 0:
         return {}
-    ordered = np.sort(scores)  # vectorised, so faster than selecting seven order statistics
-    quantiles = {f"q{round(100 * q):02d}": float(ordered[round(q * (len(scores) - 1))]) for q in _QUANTILES}
-    mean = float(scores.mean(dtype=np.float64))
-    return {"min": float(ordered[0]), "max": float(ordered[-1]), "mean": mean, **quantiles}
+    if counts is None:
+        mean = scores.mean(dtype=np.float64)
+        last, ordered = np.arange(len(scores)), np.sort(scores)  # faster than selecting seven order statistics
+    else:
+        mean, order = np.average(scores.astype(np.float64), weights=counts), np.argsort(scores)
+        last, ordered = np.cumsum(counts[order]) - 1, scores[order]
+    ends = np.searchsorted(last, [round(q * last[-1]) for q in _QUANTILES])
+    quantiles = {f"q{round(100 * q):02d}": float(ordered[end]) for q, end in zip(_QUANTILES, ends, strict=True)}
+    return {"min": float(ordered[0]), "max": float(ordered[-1]), "mean": float(mean), **quantiles}
 
 
 def _point(row: np.ndarray) -> Point:

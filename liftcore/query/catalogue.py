@@ -192,11 +192,16 @@ def _compute_object_features(scene: OpenedLift) -> np.ndarray:
     sums = np.zeros((number, scene.channels))
     weights = np.where(scene.has_feature, scene.total_weight / np.where(scene.has_feature, scene.norms, 1.0), 0.0)
     indices = np.flatnonzero((scene.object >= 0) & (weights > 0))
-    for first in range(0, indices.size, _BLOCK):
-        rows = indices[first : first + _BLOCK]
-        places = scene.object[rows], np.arange(rows.size)
-        shares = csr_array((weights[rows].astype(np.float64), places), shape=(number, rows.size))
-        sums += shares @ scene.features[rows].astype(np.float32)
+    objects, rows, weights = scene.object[indices], indices, weights[indices].astype(np.float64)
+    if scene.features.code is not None:  # a sum for each pair of an object and a row
+        count = len(scene.features.rows)
+        pairs, place = np.unique(objects * count + scene.features.code[indices], return_inverse=True)
+        objects, rows, weights = pairs // count, pairs % count, np.bincount(place, weights)
+    for first in range(0, rows.size, _BLOCK):
+        block = slice(first, first + _BLOCK)
+        places = objects[block], np.arange(rows[block].size)
+        shares = csr_array((weights[block], places), shape=(number, rows[block].size))
+        sums += shares @ scene.features.rows[rows[block]].astype(np.float32)
     lengths = np.linalg.norm(sums, axis=1, keepdims=True)
     return np.divide(sums, lengths, out=np.zeros_like(sums), where=lengths > 0).astype(np.float32)
 

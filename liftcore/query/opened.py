@@ -14,11 +14,11 @@ import numpy as np
 
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound
 from liftcore.io.splats import quick_count
-from liftcore.query.scores import mean_direction, norms_of
+from liftcore.query.scores import Features
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.world import UNKNOWN, WorldFrame
 from liftcore.text.table import TableEncoder, own_words
-from liftcore.values.lift_file import NODE_TENSORS, OBJECT_TENSORS, read_lift
+from liftcore.values.lift_file import read_lift, tensors_of
 
 if TYPE_CHECKING:  # these load torch
     from torch import Tensor
@@ -48,34 +48,24 @@ class OpenedLift:
     Arguments and errors are those of `Scene`. Norms, mean, axes and encoders are computed once and cached.
     """
 
-    features: np.ndarray
-    """[P, F] f16 or f32; zero rows without a feature"""
+    features: Features
+    """[P, F], exact or as codes; zero rows without a feature"""
+    row_counts: np.ndarray | None = None
+    """[P] f64, the number of splats that each row is of, of `distinct` rows; None: one"""
+    # The tensors of `liftcore.values.lift.Lift`, as arrays.
     total_weight: np.ndarray
-    """[P] f32"""
     cluster: np.ndarray | None
-    """[P] i32, -1 = in no cluster; None without aggregation"""
     cluster_features: np.ndarray | None
-    """[K, F] like features"""
     confidence: np.ndarray | None
-    """[P] f32 in 0..1; None where the lift was not reweighted"""
     object: np.ndarray | None
-    """[P] i32, -1 = of no object; None: the lift has no objects"""
     object_views: np.ndarray | None
-    """[N, V] i32, of `Lift`"""
     node: np.ndarray | None
-    """[P] i32, the smallest node of each splat (`Lift`); None in lifts without a tree"""
     node_parents: np.ndarray | None
-    """[T] i32, -1 for none"""
     node_views: np.ndarray | None
-    """[T, V] i32"""
     node_confidence: np.ndarray | None
-    """[T] f32 in 0..1"""
     node_features: np.ndarray | None
-    """[T, F] f16, unit; zero for none"""
-    _metadata_json: str
-    """the metadata of a lift file, as JSON"""
-    _new_paths: dict[str, Path | None]
-    """new paths of files that were moved, by their roles"""
+    _metadata_json: str  # of a lift file
+    _new_paths: dict[str, Path | None]  # of files that were moved, by their roles
 
     def __init__(
         self,
@@ -101,16 +91,7 @@ class OpenedLift:
             splats_path = self._new_paths["splats"]
             cached: dict[str, Any] = {}
         else:
-            names = (
-                "features",
-                "total_weight",
-                "has_feature",
-                "cluster",
-                "cluster_features",
-                "confidence",
-                "embeddings",
-            )
-            arrays = {name: as_numpy(getattr(source, name)) for name in (*names, *OBJECT_TENSORS, *NODE_TENSORS)}
+            arrays = {name: as_numpy(tensor) for name, tensor in tensors_of(source).items()}
             self.path, splats_path = Path("lift"), None
             cached = {"lift": source, "metadata": self._with_places(source.metadata)}
         self._set_arrays(arrays)
@@ -124,8 +105,9 @@ class OpenedLift:
             self.__dict__["splats"] = splats.cpu()
 
     def _set_arrays(self, arrays: dict[str, Any]) -> None:
-        columns = (arrays[name] for name in ("features", "total_weight", "has_feature"))
-        self.features, self.total_weight, self._has_feature = columns
+        features, code = arrays["features"], arrays.get("code")
+        self.features = Features(features if code is None else features.astype(np.float32), code)
+        self.total_weight, self._has_feature = arrays["total_weight"], arrays["has_feature"]
         self.cluster, self.cluster_features = arrays.get("cluster"), arrays.get("cluster_features")
         self.confidence = arrays.get("confidence")
         self._embeddings = arrays.get("embeddings")
@@ -220,12 +202,12 @@ class OpenedLift:
     @property
     def channels(self) -> int:
         """F."""
-        return int(self.features.shape[1])
+        return self.features.rows.shape[1]
 
     @cached_property
     def norms(self) -> np.ndarray:
         """[P] f32, the features' norms."""
-        return norms_of(self.features)
+        return self.features.of_splats(self.features.norms)
 
     @cached_property
     def has_feature(self) -> np.ndarray:
@@ -244,15 +226,39 @@ class OpenedLift:
         return weights if weights.max(initial=0.0) > 0 else None
 
     @cached_property
+    def effective_count(self) -> float:
+        """Number of splats with a feature whose scores have as much noise as those of these total weights."""
+        count, weights = np.count_nonzero(self.has_feature), self.weights
+        return float(count if weights is None else weights.sum() ** 2 / max(float(np.square(weights).sum()), 1e-30))
+
+    @cached_property
     def mean(self) -> np.ndarray:
         """[F] f32, the mean of the unit features by total weight, which all features of the scene share."""
-        return mean_direction(self.features, self.norms, self.total_weight)
+        return self.features.mean(self.total_weight)
 
     @cached_property
     def rough_mean(self) -> np.ndarray:
         """[F] f32, the mean of at most MOST_SAMPLED evenly spaced ones: faster, and accurate enough for words."""
         rows = slice(None, None, -(-len(self.features) // MOST_SAMPLED) or 1)
-        return mean_direction(self.features[rows], self.norms[rows], self.total_weight[rows])
+        return self.features.mean(self.total_weight[rows], rows)
+
+    @cached_property
+    def distinct(self) -> Self:
+        """The lift with a splat for each row of the features, of the row's total weight; itself if they are exact."""
+        if self.features.code is None:
+            return self
+        rows = copy(self)
+        for name in ("has_feature", "all_have_features", "weights", "norms"):
+            rows.__dict__.pop(name, None)
+        rows.__dict__ |= {"mean": self.mean, "rough_mean": self.rough_mean, "effective_count": self.effective_count}
+        rows.features = Features(self.features.rows)
+        rows.features.__dict__["norms"] = self.features.norms
+        rows.row_counts = self.features.of_rows(self.has_feature)
+        rows._has_feature = rows.row_counts > 0
+        weights = self.features.of_rows(np.where(self.has_feature, self.total_weight, np.float32(0.0)))
+        rows.total_weight = weights if weights.any() else rows.row_counts
+        rows.object = rows.node = None  # of splats
+        return rows
 
     @cached_property
     def object_means(self) -> np.ndarray:
@@ -263,6 +269,14 @@ class OpenedLift:
         ends = np.searchsorted(objects[order], np.arange(len(self.object_views) + 1))
         means = [self.mean_of(order[first:last]) for first, last in pairwise(ends.tolist())]
         return np.stack(means) if means else np.zeros((0, self.channels), np.float32)
+
+    @cached_property
+    def object_numbers(self) -> tuple[np.ndarray, np.ndarray]:
+        """The object of each splat with a feature, [P] i32, -1 for none; and the total weight of each, [N] f64."""
+        assert self.object is not None and self.object_views is not None
+        numbers = np.where(self.has_feature, self.object, -1)
+        in_object = numbers >= 0
+        return numbers, np.bincount(numbers[in_object], self.total_weight[in_object], len(self.object_views))
 
     def node_path(self, node: int) -> tuple[int, ...]:
         """Return the nodes of the tree that contain a node, the largest first, and the node itself."""
@@ -326,13 +340,23 @@ class OpenedLift:
         Means and shares of total weight are those of these splats, so that a query distinguishes among them.
         """
         inner = copy(self)
-        for name in ("has_feature", "all_have_features", "weights", "mean", "object_means", "principal"):
+        for name in (
+            "has_feature",
+            "all_have_features",
+            "weights",
+            "effective_count",
+            "mean",
+            "distinct",
+            "object_numbers",
+            "object_means",
+            "principal",
+        ):
             inner.__dict__.pop(name, None)
         inner._has_feature = self.has_feature & members
         inner.total_weight = np.where(members, self.total_weight, np.float32(0.0))
         rows = np.flatnonzero(inner._has_feature)
         rows = rows[:: -(-len(rows) // MOST_SAMPLED) or 1]
-        inner.__dict__["rough_mean"] = mean_direction(self.features[rows], self.norms[rows], self.total_weight[rows])
+        inner.__dict__["rough_mean"] = self.features.mean(self.total_weight[rows], rows)
         if self.node is not None and self.node_views is not None:
             inner.object, inner.object_views = self.node, self.node_views
         inner.node_features = None  # of all splats of the nodes
@@ -342,7 +366,7 @@ class OpenedLift:
         """Compute the unit mean [F] f32 of the unit features of splats [n] by total weight; of many, by a sample."""
         rows = rows[:: -(-len(rows) // MOST_OF_OBJECT) or 1]
         weights = self.total_weight[rows]
-        mean = mean_direction(self.features[rows], self.norms[rows], weights if weights.any() else weights + 1)
+        mean = self.features.mean(weights if weights.any() else weights + 1, rows)
         return mean / max(float(np.linalg.norm(mean)), 1e-30)
 
     @cached_property
@@ -350,7 +374,8 @@ class OpenedLift:
         """[P, 3] f32 in 0..1, the features as colours."""
         from liftcore.query.splat_colours import principal_colours
 
-        return principal_colours(self.features, self.total_weight)
+        colours = principal_colours(self.features.rows, self.features.of_rows(self.total_weight))
+        return colours if self.features.code is None else colours[self.features.code.astype(np.int64)]
 
     @cached_property
     def splat_file(self) -> Path:

@@ -9,6 +9,9 @@ other row and no other direction.
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -175,6 +178,59 @@ def cosines_about(features: np.ndarray, norms: np.ndarray, mean: np.ndarray, exa
     valid = (distances > LEAST_OFFSET) & (reaches > LEAST_OFFSET)
     scale = np.maximum(distances * reaches, LEAST_OFFSET**2)
     return np.where(valid, np.clip(products / scale, -1.0, 1.0), np.float32(0.0))
+
+
+@dataclass(frozen=True)
+class Features:
+    """Features [P, F] of splats: the rows that differ, and the row of each splat.
+
+    Of a lift as codes these are some thousands, whatever its number of splats. So what queries compute of features
+    they compute of rows, with the total weight of a row's splats (`liftcore.query.opened.OpenedLift.distinct`), and
+    take the answer to the splats at the end. Exact features have a row a splat.
+    """
+
+    rows: np.ndarray  # [K, F] f16 or f32, finite; zeros for no feature
+    code: np.ndarray | None = None  # [P] u16, the row of each splat; None: K = P, a row a splat
+
+    def __len__(self) -> int:
+        """P."""
+        return len(self.rows if self.code is None else self.code)
+
+    def __getitem__(self, splats: Any) -> np.ndarray:
+        """Return the features of some splats, [n, F] f16 or f32."""
+        return self.rows[splats if self.code is None else self.code[splats]]
+
+    @cached_property
+    def norms(self) -> np.ndarray:
+        """[K] f32, of the rows."""
+        return norms_of(self.rows)
+
+    def of_splats(self, values: np.ndarray) -> np.ndarray:
+        """Return the value of each splat, [P], of those of the rows [K]."""
+        return values if self.code is None else values.take(self.code)
+
+    def of_rows(self, values: np.ndarray) -> np.ndarray:
+        """Return the sum [K] f64 of the values [P] of each row's splats; of a row a splat the values themselves."""
+        return values if self.code is None else np.bincount(self.code, values, len(self.rows))
+
+    def with_splats(self, mask: np.ndarray) -> np.ndarray:
+        """Return the rows of which a splat is in a mask [P] bool, [K] bool."""
+        if self.code is None:
+            return mask
+        rows = np.zeros(len(self.rows), np.bool_)
+        rows[self.code[mask]] = True
+        return rows
+
+    def mean(self, weights: np.ndarray, splats: Any = slice(None)) -> np.ndarray:
+        """Compute the mean [F] f32 of the unit features of some splats [n] by their weights [n]."""
+        rows = splats if self.code is None else self.code[splats]
+        if self.code is None or len(rows) < len(self.rows):
+            return mean_direction(self.rows[rows], self.norms[rows], weights)
+        return mean_direction(self.rows, self.norms, np.bincount(rows, weights, len(self.rows)))
+
+    def distinct(self, splats: np.ndarray) -> tuple[np.ndarray, Any]:
+        """Return the rows [m] of some splats [n], and the index among them of each splat."""
+        return (splats, slice(None)) if self.code is None else np.unique(self.code[splats], return_inverse=True)
 
 
 def combine(similarities: np.ndarray, positives: int) -> np.ndarray:

@@ -140,37 +140,42 @@ def segment(
         raise InvalidQuery("words", expected="every word once", got=f"{twice!r} twice")
     weights = np.where(scene.has_feature, scene.total_weight, 0.0).astype(np.float64)
     weights = weights if weights.any() else scene.has_feature.astype(np.float64)
+    table = scene.distinct
+    row_weights = scene.features.of_rows(weights)
     thresholds, answer_weights = np.empty(len(words)), np.empty(len(words))
-    nearest = _Nearest(len(weights))
-    for row, scores in _scores(scene, rows, range(len(words))):
-        threshold = find_threshold(scores[scene.has_feature], "auto", scene.weights)
+    nearest = _Nearest(len(row_weights))
+    for row, scores in _scores(table, rows, range(len(words))):
+        threshold = find_threshold(scores[table.has_feature], "auto", table.weights)
         thresholds[row] = threshold.value if threshold.clear else np.inf
-        answer_weights[row] = weights[scores >= thresholds[row]].sum()
+        answer_weights[row] = row_weights[scores >= thresholds[row]].sum()
         nearest.take(row, scores)
         progress("words", row + 1, len(words), "words")
     is_answer = nearest.score >= thresholds[nearest.row]
-    shares = np.bincount(nearest.row[is_answer], weights[is_answer], len(words)) / np.maximum(answer_weights, 1e-30)
-    winners = _Nearest(len(weights))
+    sums = np.bincount(nearest.row[is_answer], row_weights[is_answer], len(words))
+    shares = sums / np.maximum(answer_weights, 1e-30)
+    winners = _Nearest(len(row_weights))
     unit = rows / np.linalg.norm(rows, axis=1, keepdims=True)
     if references is None:
         suffices = len(words) >= LEAST_WORDS
         references = References(words, unit) if suffices else references_of_space(unit, scene.metadata.text_space)
     parts = _parts(scene, unit, references)
-    for row, scores in _scores(scene, rows, np.flatnonzero((shares >= LEAST_OWN) | parts.any(axis=1)).tolist()):
+    for row, scores in _scores(table, rows, np.flatnonzero((shares >= LEAST_OWN) | parts.any(axis=1)).tolist()):
         if (
             isinstance(references, References)
-            and estimate_presence(scene, words[row], unit[row], scores, references).present is False
+            and estimate_presence(table, words[row], unit[row], scores, references).present is False
         ):
             parts[row] = False
             continue
         if shares[row] >= LEAST_OWN and not parts[row].any():
-            winners.take(row, np.where(scene.has_feature & (scores >= thresholds[row]), scores, -np.inf))
-    labels = np.where(winners.score > -np.inf, winners.row, NO_WORD).astype(np.int32)
+            winners.take(row, np.where(table.has_feature & (scores >= thresholds[row]), scores, -np.inf))
+    of_splats = scene.features.of_splats
+    labels = of_splats(np.where(winners.score > -np.inf, winners.row, NO_WORD).astype(np.int32))
+    labels = np.where(scene.has_feature, labels, np.int32(NO_WORD))
     labels = _by_nodes(scene, labels, weights, parts)
     score = np.zeros(len(labels), np.float32)
-    for row, scores in _scores(scene, rows, np.unique(labels[labels != NO_WORD]).tolist()):
-        score[labels == row] = scores[labels == row]
-    other = np.where(labels == nearest.row, nearest.second, nearest.score)
+    for row, scores in _scores(table, rows, np.unique(labels[labels != NO_WORD]).tolist()):
+        score = np.where(labels == row, of_splats(scores), score)
+    other = np.where(labels == of_splats(nearest.row), of_splats(nearest.second), of_splats(nearest.score))
     has_margin = (labels != NO_WORD) & (other > -np.inf)
     margin = np.subtract(score, other, out=np.zeros_like(score), where=has_margin)
     groups = [
@@ -246,12 +251,11 @@ class _Nearest:
 
 
 def _scores(scene: OpenedLift, vectors: np.ndarray, rows: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield each row with the cosines [P] f32 of its vector; AT_ONCE rows in one pass over the features."""
+    """Yield each row with the cosines [K] f32 of its vector; AT_ONCE rows in one pass over the features."""
     for first in range(0, len(rows), AT_ONCE):
         block = rows[first : first + AT_ONCE]
-        yield from zip(
-            block, np.ascontiguousarray(cosines(scene.features, scene.norms, vectors[block]).T), strict=True
-        )
+        scores = cosines(scene.features.rows, scene.features.norms, vectors[block])
+        yield from zip(block, np.ascontiguousarray(scores.T), strict=True)
 
 
 def best_words(

@@ -165,10 +165,9 @@ def correct_by_objects(
     """
     if scene.object is None or scene.object_views is None or len(scene.object) != len(selected):
         return selected, ""
-    count, objects = len(scene.object_views), np.where(scene.has_feature, scene.object, -1)
-    in_object, weights = objects >= 0, scene.total_weight
-    totals = np.bincount(objects[in_object], weights[in_object], count)
-    inside = np.bincount(objects[in_object & selected], weights[in_object & selected], count)
+    objects, totals = scene.object_numbers
+    weights, rows = scene.total_weight, np.flatnonzero(selected & (objects >= 0))
+    inside = np.bincount(objects[rows], weights[rows], len(totals))
     shares = inside / np.where(totals > 0, totals, 1.0)
     if not (inside > 0).any():
         return selected, ""
@@ -341,12 +340,14 @@ def _nearest_to(scene: OpenedLift, rows: np.ndarray, means: np.ndarray, target: 
     """
     offsets = means - scene.rough_mean
     offsets /= np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), np.float32(1e-12))
-    shift, nearest = offsets @ scene.rough_mean, []
-    for first in range(0, len(rows), _BLOCK):
-        block = rows[first : first + _BLOCK]
-        along = products(scene.features[block], scene.norms[block], offsets, offsets[:0])[0] - shift
-        nearest.append(block[along.argmax(axis=1) == target])
-    return np.concatenate([rows[:0], *nearest])
+    shift, features = offsets @ scene.rough_mean, scene.features
+    table, inverse = features.distinct(rows)
+    is_nearest = np.zeros(len(table), np.bool_)
+    for first in range(0, len(table), _BLOCK):
+        block = table[first : first + _BLOCK]
+        along = products(features.rows[block], features.norms[block], offsets, offsets[:0])[0] - shift
+        is_nearest[first : first + _BLOCK] = along.argmax(axis=1) == target
+    return rows[is_nearest[inverse]]
 
 
 def _about(scene: OpenedLift, means: np.ndarray, mean: np.ndarray) -> np.ndarray:

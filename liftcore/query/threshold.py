@@ -128,19 +128,21 @@ def explain_no_selection(scores: np.ndarray) -> str:
     return explain_equal_scores(low, high)
 
 
-def has_one_mode(scores: np.ndarray, value: float, weights: np.ndarray | None) -> bool:
+def has_one_mode(scores: np.ndarray, value: float, weights: np.ndarray | None, count: float | None = None) -> bool:
     """Return True if no valley of the scores [n] f32 at a threshold is told from chance, and no wide gap lies there.
 
-    The counts in the valley and in the hills on both sides are compared, each under the width of the smoothing. They
-    are effective ones, ``(sum w)^2 / sum w^2``, as weights [n] differ.
+    The counts in the valley and in the hills on both sides are compared, each under the width of the smoothing.
+
+    Args:
+        weights: [n], of the scores; None: equal ones.
+        count: of splats that have the scores; None: the effective one of the weights, ``(sum w)^2 / sum w^2``.
     """
+    if count is None:
+        count = len(scores) if weights is None else float(weights.sum() ** 2 / max(np.square(weights).sum(), 1e-30))
     low, high = float(scores.min()), float(scores.max())
     histogram = _count(scores, low, high, weights)
     if histogram is None:
         return True
-    count = (
-        len(scores) if weights is None else float(weights.sum() ** 2 / max(float(np.square(weights).sum()), 1e-30))
-    )
     expected = histogram.smoothed() * count * 2 * math.sqrt(math.pi) * SMOOTHING
     place = min(int((value - low) / histogram.width), BINS - 1)
     left, right = int(expected[: place + 1].argmax()), place + int(expected[place:].argmax())
@@ -156,7 +158,7 @@ def _count(scores: np.ndarray, low: float, high: float, weights: ArrayLike | Non
         return None
     width = (high - low) / BINS
     places = np.minimum(((scores.astype(np.float64) - low) * (1.0 / width)).astype(np.int32), BINS - 1)
-    shares = None if weights is None else np.asarray(weights, np.float32).ravel()
+    shares = None if weights is None else np.asarray(weights).ravel()
     mass = np.bincount(places, shares, BINS).astype(np.float64)
     total = mass.sum()
     return Histogram(mass / total, low, width) if total > 0 else None

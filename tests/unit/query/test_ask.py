@@ -148,7 +148,7 @@ def test_every_kind_of_example_finds_its_cluster(scene: Scene, cluster: int) -> 
 
 
 def test_pixel_is_the_feature_rendered_there(scene: Scene) -> None:
-    features = torch.from_numpy(scene.features).float()
+    features = torch.from_numpy(scene.features[:]).float()
     image = scene.raster.render(scene.cameras["middle"], features, scene.compositing)
     for x, y in ((5, 12), (16, 12), (26, 10)):
         (direction,) = directions(scene, Query.of((Pixel("middle", x, y),)), None)
