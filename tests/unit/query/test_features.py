@@ -21,14 +21,14 @@ REGIONS = 20  # of each word
 
 @pytest.fixture(scope="module")
 def scenes() -> list[lc.Scene]:
-    """A lift of things of five words, a hundredth without a feature; exact, and the same features as codes."""
+    """A lift of clusters of five words, a hundredth without a feature; exact, and the same features as codes."""
     rng = np.random.default_rng(1)
-    things = rng.integers(0, len(WORDS), COUNT)
+    clusters = rng.integers(0, len(WORDS), COUNT)
     regions = photo_vectors([word for word in WORDS for _ in range(REGIONS)], 0.3)
     codebook = np.concatenate([np.zeros_like(regions[:1]), regions]).astype(np.float16)
-    code = (1 + things * REGIONS + rng.integers(0, REGIONS, COUNT)).astype(np.uint16)
+    code = (1 + clusters * REGIONS + rng.integers(0, REGIONS, COUNT)).astype(np.uint16)
     code[::100] = 0
-    objects = np.where(rng.random(COUNT) < 0.9, things, rng.integers(-1, len(WORDS), COUNT)).astype(np.int32)
+    objects = np.where(rng.random(COUNT) < 0.9, clusters, rng.integers(-1, len(WORDS), COUNT)).astype(np.int32)
     lift = scene_with(codebook[code[:12]].astype(np.float32)).lift
     columns = {
         "features": codebook[code],
@@ -55,7 +55,7 @@ def test_codes_answer_words_as_their_rows_do(scenes: list[lc.Scene], text: str) 
 
 
 def test_codes_answer_examples_as_their_rows_do(scenes: list[lc.Scene]) -> None:
-    exact, coded = (scene.ask(lc.Query(like=("splat:5",))) for scene in scenes)
+    exact, coded = (scene.ask(lc.Query(like=["splat:5"])) for scene in scenes)
     np.testing.assert_allclose(coded.scores, exact.scores, atol=1e-5)
     assert exact.count and np.array_equal(exact.selected, coded.selected)
 
