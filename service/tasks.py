@@ -141,7 +141,7 @@ def check_lift(path: Path, cameras: str | None) -> dict[str, Any]:
     require_texts("word", metadata["words"], WORD_CHARACTERS, InvalidLift)
     if None in metadata["timings"].values():  # JSON has no infinite numbers
         raise InvalidLift("lift", expected="finite timings", got="others", hint="a list of lifts tells them")
-    return lift_content(path, arrays["features"].shape, metadata)
+    return lift_content(path, (len(lift), lift.features.shape[1]), metadata)
 
 
 def lift_content(path: Path, shape: Sequence[int], metadata: dict[str, Any]) -> dict[str, Any]:

@@ -299,7 +299,7 @@ def _pack_warnings(packs: Views, facts: list[_ViewFacts], low: float, high: floa
 def describe_lift(lift: Lift) -> dict[str, Any]:
     """Return counts, ranges, provenance and warnings of a lift."""
     metadata = lift.metadata
-    count, channels = lift.features.shape
+    count, channels = len(lift), lift.features.shape[1]
     feature_share = float(lift.has_feature.float().mean())
     diagnostics = lift.diagnostics
     return {
@@ -328,9 +328,10 @@ def _ends(values: torch.Tensor) -> dict[str, float]:
 
 
 def _lift_warnings(lift: Lift, metadata: LiftMetadata) -> list[str]:
-    count = len(lift.features)
+    count = len(lift)
     unseen = int((~lift.has_feature).sum())
-    bad = int((~torch.isfinite(lift.features)).any(dim=1).sum())
+    is_bad = (~torch.isfinite(lift.features)).any(dim=1)
+    bad = int((is_bad if lift.code is None else is_bad[lift.code.long()]).sum())
     warnings = list(metadata.diagnostics.get("warnings", ()))
     if unseen:
         warnings.append(f"{unseen} of {count} {UNSEEN}")

@@ -22,7 +22,7 @@ from liftcore.runtime.memory import map_anonymous
 
 DTYPES = {
     "F64": np.float64, "F32": np.float32, "F16": np.float16, "I64": np.int64, "I32": np.int32, "I16": np.int16,
-    "I8": np.int8, "U8": np.uint8, "BOOL": np.bool_,
+    "I8": np.int8, "U8": np.uint8, "U16": np.uint16, "BOOL": np.bool_,
 }  # fmt: skip
 
 if TYPE_CHECKING:
@@ -40,6 +40,7 @@ TYPES = {
     "torch.int16": "I16",
     "torch.int8": "I8",
     "torch.uint8": "U8",
+    "torch.uint16": "U16",
     "torch.bool": "BOOL",
 }
 COPIED_BYTES = 1 << 20

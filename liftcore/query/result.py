@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from liftcore.errors import InvalidInput, InvalidQuery
 from liftcore.values.lift import Lift
@@ -106,18 +106,10 @@ class LiftResult(Lift):
         *,
         encoder: TextEncoder | str | Path | None = None,
     ) -> Segmentation:
-        """Label every splat with the most similar word, or none (`liftcore.query.segment`).
+        """Label every splat with the most similar word, or none, as `liftcore.Scene.segment`.
 
         Args:
-            words: n different ones. vectors: [n, F], torch or numpy, their text vectors, of any length above zero.
-                None: the encoder computes them.
             splats: that were lifted; may be left out if the lift was made of files that are still in place.
-            encoder: as in `query`.
-
-        Raises:
-            InvalidQuery: no words, one word twice, vectors that are no directions of the lift's space, a word that
-                the encoder cannot encode, or no encoder of the space.
-            Unavailable: the encoder's weights are not on this machine.
         """
         return self.scene(splats).segment(words, vectors, encoder=encoder)
 
@@ -129,18 +121,10 @@ class LiftResult(Lift):
         *,
         encoder: TextEncoder | str | Path | None = None,
     ) -> Catalogue:
-        """List the objects on which masks of many views agree, found at lift time without words; the largest first.
+        """List the objects on which masks of many views agree, the largest first, as `liftcore.Scene.catalogue`.
 
         Args:
             splats: that were lifted; may be left out if the lift was made of files that are still in place.
-            words: n, candidates for names. vectors: [n, F], torch or numpy, their text vectors, of any length above
-                zero. None: the encoder computes them.
-            encoder: as in `query`.
-
-        Raises:
-            InvalidQuery: vectors that are no directions of the lift's space, a word that the encoder cannot encode,
-                or no encoder of the space.
-            Unavailable: the encoder's weights are not on this machine.
         """
         return self.scene(splats).catalogue(words, vectors, encoder=encoder)
 
@@ -181,19 +165,51 @@ class LiftResult(Lift):
         """
         return has_poses(Path(path), self.metadata)
 
-    def save(self, path: Path | str, *, progress: Progress | bool | None = False) -> None:
+    def as_codes(self) -> Self:
+        """Return the lift with at most 8,192 rows of features, and the number of its row for each splat.
+
+        ``diagnostics["codes"]`` has the number of rows, and the loss: 1 - the mean cosine of splats about the scene's
+        mean, by total weight. Where it is too large, or nothing is saved, it has the reason, and features stay exact.
+        """
+        import torch
+
+        from liftcore.solve.codes import code_features
+
+        if self.code is not None:
+            return self
+        lift = self.cpu()
+        codes = code_features(*(part.numpy() for part in (lift.features, lift.has_feature, lift.total_weight)))
+        facts, changes = {"reason": codes}, dict[str, Any]()
+        if not isinstance(codes, str):
+            facts = {"rows": len(codes.codebook), "loss": codes.loss}
+            changes = {"features": torch.from_numpy(codes.codebook), "code": torch.from_numpy(codes.code)}
+        metadata = self.metadata.model_copy(update={"diagnostics": self.diagnostics | {"codes": facts}})
+        return replace(lift, **changes, metadata=metadata)
+
+    def save(
+        self,
+        path: Path | str,
+        *,
+        features: Literal["exact", "codes"] | None = None,
+        progress: Progress | bool | None = False,
+    ) -> None:
         """Write a lift file (`liftcore.values.lift_file`), whole or not at all.
 
         Args:
             path: a file.
+            features: ``codes``: two bytes a splat, where that loses little (`as_codes`); None: as the lift has them.
             progress: as `liftcore.lift` has it; there is one step.
 
         Raises:
+            InvalidInput: other ``features``.
         """
         from liftcore.runtime.progress import one_step, shown_progress
 
+        if features not in (None, "exact", "codes"):
+            raise InvalidInput("features", expected="exact, codes or None", got=repr(features))
         with shown_progress(progress) as reporter, one_step(reporter, "save"):
-            save_lift(self, path)
+            lift = self.as_codes() if features == "codes" else self
+            save_lift(lift.with_exact_features() if features == "exact" else lift, path)
 
     def save_scene(
         self, folder: Path, splats: Splats | None = None, cameras: Mapping[str, Camera] | None = None

@@ -10,7 +10,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-import torch
 
 from liftcore.errors import InvalidSplats
 from liftcore.scene.neighbours import COLOUR_WIDTH, base_colours, set_apart
@@ -52,12 +51,12 @@ def transfer(lift: AnyLift, old: Splats, new: Splats, matrix: Any = None) -> Any
         got = f"{int(is_copy.sum())} of {new.count} near a lifted one"
         hint = "give the matrix if the scene was moved, or lift the new splats"
         raise InvalidSplats("splats", expected="splats of the lifted scene", got=got, hint=hint)
-    result, copied = lift[rows], torch.from_numpy(is_copy)
+    result = lift[rows]
     labels = ("cluster", "object", "node")
-    values = ("features", "total_weight", "has_feature", "confidence", *labels)
+    values = ("features" if lift.code is None else "code", "total_weight", "has_feature", "confidence", *labels)
     columns = {name: column for name in values if (column := getattr(result, name)) is not None}
     for name, column in columns.items():
-        column[~copied] = -1 if name in labels else 0
+        column.numpy()[~is_copy] = -1 if name in labels else 0
     counts = {"from_splats": len(lift), "rows": int(is_copy.sum()), "without_partner": int((~is_copy).sum())}
     diagnostics = lift.diagnostics | {"transfer": counts}
     if isinstance(plan := diagnostics.get("plan"), dict):

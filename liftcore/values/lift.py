@@ -78,7 +78,7 @@ class Lift:
     """X and what supports it, one row a splat, in the splats' order."""
 
     features: Tensor
-    """[P, F] f16 or f32; zero rows without a feature"""
+    """[P, F] f16 or f32; zero rows without a feature. Of a lift as codes [K, F], the rows that ``code`` refers to"""
     total_weight: Tensor
     """[P] f32, sum of plain weights w over the feature views, each ray once"""
     has_feature: Tensor
@@ -106,9 +106,11 @@ class Lift:
     """[T] f32 in 0..1, of the views that see a node those that have a mask of the whole"""
     node_features: Tensor | None = None
     """[T, F] f16, the unit mean of its own masks' unit vectors, without those of its parts; zero where they cancel"""
+    code: Tensor | None = None
+    """[P] u16, the row of ``features`` of each splat, 0 = none, which is zero; None: a row a splat"""
 
     def __repr__(self) -> str:
-        splats, channels = self.features.shape
+        splats, channels = len(self), self.features.shape[1]
         counts = f"{splats} splats", f"{channels} channels from {len(self.views)} views"
         return one_line(self, *counts, f"preset={str(self.settings.preset)!r}", f"on {self.features.device}")
 
@@ -134,7 +136,7 @@ class Lift:
 
     def __len__(self) -> int:
         """P, the number of rows."""
-        return len(self.features)
+        return len(self.total_weight)
 
     def __getitem__(self, keep: Rows) -> Self:
         """Return the lift of the splats of a mask [P], a slice or row numbers [n], as ``splats[keep]`` has them.
@@ -145,7 +147,14 @@ class Lift:
         from liftcore.scene.splats import chosen_rows
 
         rows = chosen_rows(keep, len(self)).to(self.features.device)
-        names = ("features", "total_weight", "has_feature", "confidence", "cluster", "object")
+        names = (
+            "features" if self.code is None else "code",
+            "total_weight",
+            "has_feature",
+            "confidence",
+            "cluster",
+            "object",
+        )
         tensors = {name: getattr(self, name) for name in names}
         columns = {name: column[rows] for name, column in tensors.items() if column is not None}
         for labels, table in (("cluster", "cluster_features"), ("object", "object_views")):
@@ -164,6 +173,10 @@ class Lift:
             "diagnostics": self.diagnostics | {"cropped_from": full_count},
         }
         return replace(self, **columns, metadata=self.metadata.model_copy(update=changes))
+
+    def with_exact_features(self) -> Self:
+        """Return the lift with a row of features a splat, [P, F]."""
+        return self if self.code is None else replace(self, features=self.features[self.code.long()], code=None)
 
     def transformed(self, matrix: Numbers) -> Self:
         """Return the lift of splats that were moved alike (`Splats.transformed`), ``p' = scale R p + translation``.

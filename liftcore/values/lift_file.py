@@ -5,8 +5,9 @@ has ``confidence`` [P] f32, which tells right splats from wrong ones; after Post
 i32, -1 for splats in none, and ``cluster_features`` [K, F]; where objects were looked for ``object`` [P] i32, -1 for
 none, and ``object_views`` [N, 5] i32, and of the tree of objects, parts and groups ``node`` [P] i32, ``node_parents``
 [T] i32, ``node_views`` [T, 5] i32, ``node_confidence`` [T] f32 and ``node_features`` [T, F] f16 (`Lift`); of packs
-with words their vectors, ``embeddings`` [n, F] f32. Its metadata hold settings, inputs with digests, the encoder,
-words, the diagnostics, timings and the version, as JSON.
+with words their vectors, ``embeddings`` [n, F] f32. A lift as codes (`liftcore.solve.codes`) has ``code`` [P] u16,
+the row of ``features`` [K, F] of each splat, whose first row is zero. Its metadata hold settings, inputs with
+digests, the encoder, words, the diagnostics, timings and the version, as JSON.
 """
 
 from __future__ import annotations
@@ -47,9 +48,9 @@ OBJECT_TENSORS = ("object", "object_views")  # in lifts that looked for objects
 NODE_TENSORS = ("node", "node_parents", "node_views", "node_confidence", "node_features")  # beside objects
 MOST_DEPTH = 63  # of a tree of nodes
 EMBEDDINGS = "embeddings"  # in lifts of packs with words
-SCHEMA = {  # types, and axes: P splats, F channels, C clusters, O objects, V views, N nodes, W words
-    "features": ("f2 f4", "P F"), "total_weight": ("f4", "P"), "has_feature": ("?", "P"), CONFIDENCE: ("f4", "P"),
-    "cluster": ("i4", "P"), "cluster_features": ("f2 f4", "C F"),
+SCHEMA = {  # types, and axes: P splats, K rows, F channels, C clusters, O objects, V views, N nodes, W words
+    "features": ("f2 f4", "K F"), "code": ("u2", "P"), "total_weight": ("f4", "P"), "has_feature": ("?", "P"),
+    CONFIDENCE: ("f4", "P"), "cluster": ("i4", "P"), "cluster_features": ("f2 f4", "C F"),
     "object": ("i4", "P"), "object_views": ("i4", "O V"),
     "node": ("i4", "P"), "node_parents": ("i4", "N"), "node_views": ("i4", "N V"), "node_confidence": ("f4", "N"),
     "node_features": ("f2", "N F"), EMBEDDINGS: ("f4", "W F"),
@@ -144,6 +145,11 @@ def _check_tensors(arrays: dict[str, np.ndarray]) -> None:
     lengths = check_arrays(arrays, SCHEMA)
     if not arrays["features"].size:
         raise ValueError("features of at least one splat and channel, got none")
+    code = arrays.get("code")
+    if code is None and lengths["K"] != lengths["P"]:
+        raise ValueError(f"features of {lengths['P']} splats, got {lengths['K']} rows")
+    if code is not None and int(code.max(initial=0)) >= lengths["K"]:
+        raise ValueError(f"code of 0..{lengths['K'] - 1}, got {code.max()}")
     for names in (CLUSTER_TENSORS, OBJECT_TENSORS, NODE_TENSORS):
         present = [name for name in names if name in arrays]
         if present and len(present) < len(names):

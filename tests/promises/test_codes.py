@@ -1,0 +1,122 @@
+"""A lift as codes: two bytes a splat and rows of features, of which questions have the answers of exact features."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import liftcore as lc
+import numpy as np
+import pytest
+import torch
+
+from tests.promises.tiny_files import photo_vectors, row_of_splats, scene_with
+
+COUNT = 6_000
+WORDS = ("cat", "boat", "pizza", "mug", "curtain")
+REGIONS = 20  # of each word
+
+
+def lift_with(features: np.ndarray, has_feature: np.ndarray | None = None) -> lc.LiftResult:
+    """Return a lift with features [P, F], and total weights from one to nine where splats have one."""
+    has_feature = np.ones(len(features), bool) if has_feature is None else has_feature
+    lift = scene_with(features[:12]).lift
+    rows, weights = torch.from_numpy(features).half(), torch.linspace(1.0, 9.0, len(features))
+    columns = {"total_weight": weights * torch.from_numpy(has_feature), "confidence": weights / 10}
+    columns |= {"features": rows, "has_feature": torch.from_numpy(has_feature)}
+    metadata = lift.metadata.model_copy(update={"landmarks": ()})
+    return lc.LiftResult.of(replace(lift, **columns, metadata=metadata))
+
+
+@pytest.fixture(scope="module")
+def exact() -> lc.LiftResult:
+    """A lift of masks: each splat has a mixture of two of its thing's regions; a hundredth has no feature."""
+    rng = np.random.default_rng(1)
+    clusters = rng.integers(0, len(WORDS), COUNT)
+    regions = photo_vectors([word for word in WORDS for _ in range(REGIONS)], 0.3).reshape(len(WORDS), REGIONS, -1)
+    first, second = (regions[clusters, rng.integers(0, REGIONS, COUNT)] for _ in range(2))
+    share, has_feature = rng.choice([0.0, 0.3, 0.5], (COUNT, 1)), np.arange(COUNT) % 100 != 7
+    return lift_with(np.where(has_feature[:, None], (1 - share) * first + share * second, 0.0), has_feature)
+
+
+@pytest.fixture(scope="module")
+def coded(exact: lc.LiftResult) -> lc.LiftResult:
+    return exact.as_codes()
+
+
+def test_codes_answer_as_exact_features_do(exact: lc.LiftResult, coded: lc.LiftResult) -> None:
+    assert coded.code is not None and coded.code.dtype == torch.uint16
+    facts = coded.diagnostics["codes"]
+    assert facts["rows"] == len(coded.features) <= 8_192 and facts["loss"] < 0.05
+    assert len(coded) == COUNT and f"{COUNT} splats" in repr(coded)
+    for word in (*WORDS, "sofa", "zebra"):
+        exact_answer, answer, expanded = (
+            lift.query(word, encoder="lvis") for lift in (exact, coded, coded.with_exact_features())
+        )
+        assert np.array_equal(answer.selected, expanded.selected) and answer.threshold == expanded.threshold
+        assert answer.present == exact_answer.present, word
+        assert (answer.selected != exact_answer.selected).mean() < 0.02, word
+        assert answer.count == exact_answer.count == 0 or word in WORDS
+    scores = coded.query("cat", encoder="lvis").scores
+    assert np.abs(scores - exact.query("cat", encoder="lvis").scores)[exact.has_feature.numpy()].max() < 0.1
+    assert (scores[~exact.has_feature.numpy()] == -1).all()
+
+
+def test_codes_have_the_same_bits_for_any_threads(exact: lc.LiftResult, coded: lc.LiftResult) -> None:
+    threads = torch.get_num_threads()
+    for count in (1, 3):
+        torch.set_num_threads(count)
+        repeated = exact.as_codes()
+        torch.set_num_threads(threads)
+        for name in ("code", "features"):
+            assert np.array_equal(repeated.arrays()[name], coded.arrays()[name])
+
+
+def test_codes_are_saved_read_cropped_and_moved_as_codes(
+    coded: lc.LiftResult, exact: lc.LiftResult, tmp_path: Path
+) -> None:
+    for name, lift in (("coded", coded), ("exact", exact)):
+        lift.save(tmp_path / f"{name}.safetensors", features="codes")
+    read = lc.load_lift(tmp_path / "coded.safetensors")
+    assert (tmp_path / "coded.safetensors").read_bytes() == (tmp_path / "exact.safetensors").read_bytes()
+    for name, column in coded.arrays().items():
+        assert np.array_equal(read.arrays()[name], column) and read.arrays()[name].dtype == column.dtype, name
+    code = coded.arrays()["code"]
+    assert np.array_equal(lc.Scene(tmp_path / "coded.safetensors").features.code, code)
+    for lift in (read, coded):
+        cropped = lift[100:700]
+        assert np.array_equal(cropped.arrays()["code"], code[100:700]) and len(cropped) == 600
+    moved = read.transformed(np.diag([2.0, 2.0, 2.0, 1.0]))
+    assert np.array_equal(moved.arrays()["code"], code)
+
+
+def test_codes_are_saved_as_exact_features_where_these_are_wanted(
+    coded: lc.LiftResult, exact: lc.LiftResult, tmp_path: Path
+) -> None:
+    expected = coded.features[coded.code.long()] if coded.code is not None else exact.features
+    coded.save(tmp_path / "exact.safetensors", features="exact")
+    coded.save(tmp_path / "folder.shards")
+    for name in ("exact.safetensors", "folder.shards"):
+        read = lc.load_lift(tmp_path / name)
+        assert read.code is None and torch.equal(read.features, expected)
+    coded.save(tmp_path / "coded.safetensors")
+    sizes = [(tmp_path / f"{name}.safetensors").stat().st_size for name in ("coded", "exact")]
+    assert sizes[0] < sizes[1] / 2
+    with pytest.raises(lc.InvalidInput, match="codes"):
+        coded.save(tmp_path / "other.safetensors", features="small")  # pyright: ignore[reportArgumentType]
+
+
+def test_an_edited_copy_of_the_splats_takes_their_codes(coded: lc.LiftResult) -> None:
+    old = row_of_splats(COUNT)
+    keep = np.arange(COUNT) % 3 > 0
+    moved = coded.transferred(old, old[keep])
+    assert np.array_equal(moved.arrays()["code"], coded.arrays()["code"][keep])
+
+
+def test_features_that_share_nothing_stay_exact() -> None:
+    rng = np.random.default_rng(0)
+    for features in (rng.normal(size=(COUNT, 64)), rng.normal(size=(40, 64))):
+        lift = lift_with(features)
+        saved_lift = lift.as_codes()
+        assert saved_lift.code is None and torch.equal(saved_lift.features, lift.features)
+        assert saved_lift.diagnostics["codes"]["reason"].startswith("Features are exact: ")
