@@ -66,7 +66,7 @@ def test_splats_without_weight_do_not_decide_the_threshold(exact: Scene) -> None
     weights = torch.cat([torch.ones(COUNT), torch.full((COUNT,), 1e-4)])
     crowd = of(
         exact,
-        np.concatenate([exact.features, outliers]),
+        np.concatenate([exact.features.rows, outliers]),
         total_weight=weights,
     )
     answer = ask(crowd, "x", Axes())
