@@ -31,7 +31,6 @@ from liftcore.lifting.planning.plan import Plan as Plan
 from liftcore.query.catalogue import Catalogue as Catalogue
 from liftcore.query.directions import read_example as read_example
 from liftcore.query.question import Answer as Answer
-from liftcore.query.question import CoveringRegion as CoveringRegion
 from liftcore.query.question import NamedSplats as NamedSplats
 from liftcore.query.question import Objects as Objects
 from liftcore.query.question import Picture as Picture

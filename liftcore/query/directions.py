@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -17,12 +17,14 @@ from liftcore.query.areas import area_feature
 from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.presence import references_of
 from liftcore.query.question import Query, SuggestedWord, SuggestedWords
-from liftcore.query.regions import codebook_row, regions_of
 from liftcore.query.terms import Area, Example, Region, SplatSet, SplatTerm, Term, Vector, parse_example
 from liftcore.text import CachingEncoder, TextEncoder, check_texts
 from liftcore.text.phrases import PartPhrase, part_phrases, read_phrase
 from liftcore.text.table import TableEncoder
 from liftcore.text.wording import Wording, shipped_words
+
+if TYPE_CHECKING:
+    from liftcore.values.views import Regions
 
 
 class ReadQuery(NamedTuple):
@@ -251,8 +253,8 @@ def _regions(scene: OpenedLift, query: Query, term_names: _Names) -> dict[int, n
         regions = None  # one view at a time: maps are large
         for _, place, term in of_view:
             with term_names(place):
-                regions = regions or regions_of(scene, term.view, str(term))
-                rows[place] = _unit(codebook_row(regions, term), str(term))
+                regions = regions or _regions_of(scene, term.view, str(term))
+                rows[place] = _unit(_codebook_row(regions, term), str(term))
     return rows
 
 
@@ -272,6 +274,33 @@ def _feature(scene: OpenedLift, example: Area | SplatTerm | SplatSet | Vector) -
     if example.splat >= count:
         raise InvalidQuery(str(example), expected=f"a splat in 0..{count - 1}", got=str(example.splat))
     return scene.features[example.splat]
+
+
+def _regions_of(scene: OpenedLift, view: str, argument: str) -> Regions:
+    """Return the regions of a view in the packs, by its name in the pack or that of its camera."""
+    from liftcore.scene.views import cameras_of_views
+    from liftcore.values.views import Regions
+
+    packs = scene.packs
+    name = cameras_of_views([view], packs.views).get(view)
+    if name is None:
+        raise NotFound(argument, expected="a view of the lift's feature packs", got=repr(view))
+    view_regions = packs[name]
+    if not isinstance(view_regions, Regions):
+        hint = "ask by a pixel, VIEW:x,y"
+        raise InvalidQuery(argument, expected="a view with regions", got="a feature grid", hint=hint)
+    return view_regions
+
+
+def _codebook_row(regions: Regions, example: Region) -> np.ndarray:
+    """Return the vector of a region, [F]."""
+    levels = regions.labels.shape[0]
+    if example.level >= levels:
+        raise NotFound(str(example), expected=f"a level in 0..{levels - 1}", got=str(example.level))
+    if not (as_numpy(regions.labels[example.level]) == example.region).any():
+        expected = f"a label of level {example.level} in view {example.view!r}"
+        raise NotFound(str(example), expected=expected, got=str(example.region))
+    return as_numpy(regions.codebook[example.region])
 
 
 def _unit(vector: np.ndarray, name: str) -> np.ndarray:

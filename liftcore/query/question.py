@@ -600,16 +600,6 @@ class SceneTree(WithUnits):
     nodes: tuple[SceneNode, ...]
 
 
-class CoveringRegion(Value):
-    """A region that covers a pixel."""
-
-    example: str = Field(description="its notation, for like and unlike")
-    view: str
-    level: int = Field(description="of the view's label map")
-    region: int = Field(description="its label there")
-    share: float = Field(description="of the view's pixels that it covers")
-
-
 def page_fields() -> dict[str, Any]:
     """Return the JSON schema of each field that decides the answer, for the page."""
     fields = Query.model_json_schema()["properties"]

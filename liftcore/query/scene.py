@@ -21,7 +21,6 @@ if TYPE_CHECKING:  # these load torch
     from liftcore.query.question import (
         Answer,
         BestWord,
-        CoveringRegion,
         Objects,
         Query,
         SceneTree,
@@ -306,24 +305,6 @@ class Scene(OpenedLift):
         from liftcore.query.directions import askable_words
 
         return askable_words(self, self.encoder(encoder), text, count)
-
-    def regions(self, view: str, x: int, y: int) -> tuple[CoveringRegion, ...]:
-        """Return the regions of the lift's feature packs that cover a pixel of a view's photo, the smallest first."""
-        from liftcore.query.regions import regions_at
-
-        return regions_at(self, view, x, y)
-
-    def region_mask(self, view: str, level: int, region: int) -> np.ndarray:
-        """Return the pixels of a view's photo that a region of its feature pack covers, [H, W] bool.
-
-        Raises:
-            NotFound: there is no such view, level or region.
-            InvalidQuery, InvalidLift: the view has a grid, or the packs moved or changed since the lift.
-        """
-        from liftcore.query.regions import region_mask
-        from liftcore.query.terms import Region
-
-        return region_mask(self, Region(view, level, region))
 
     def colours(self, what: str) -> np.ndarray:
         """Return [P, 3] u8 sRGB of splats by a layer.
