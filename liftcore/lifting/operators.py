@@ -14,7 +14,7 @@ from liftcore.lifting.geometry import weigh_views
 from liftcore.lifting.inputs import LiftInputs
 from liftcore.raster import check_splats_and_threads, open_raster
 from liftcore.raster.base import Raster
-from liftcore.runtime.device import choose_device
+from liftcore.runtime.device import CPU, choose_device
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, shown_progress
 from liftcore.runtime.torch_modes import callers_modes, default_modes
@@ -34,7 +34,6 @@ def render(
     params: CompositingParams | None = None,
     *,
     normalise: bool = False,
-    device: str | torch.device = "auto",
     threads: int | None = None,
 ) -> Tensor:
     """Composite values on splats front to back, as a rasterizer does colours: ``A X``.
@@ -44,8 +43,7 @@ def render(
         params: of compositing; None: those of the splats' training (`Splats.antialiased`), with the usual constants.
             The scale of the opacity logits is 1; the background is zero.
         normalise: True divides pixels by the sum of their weights, where it is not zero.
-        device: ``auto``, ``cpu`` or ``cuda``; also ``cuda:0``, if that GPU is the current device. threads: of the
-            CPU; the result is bitwise identical for any number.
+        threads: None uses all cores; the result is bitwise identical for any number.
 
     Returns:
         [H, W] or [H, W, F] f32, on the CPU.
@@ -54,15 +52,14 @@ def render(
         InvalidSplats, InvalidCameras: splats or camera are of another type, such as a path or a name.
         InvalidSettings: values have another number of rows than there are splats, or a gradient, or threads are no
             number.
-        Unavailable: the device does not exist.
     """
-    raster, params = _open_view(splats, camera, params, device, threads)
+    raster, params = _open_view(splats, camera, params, threads)
     rows = _rows(raster.splats, values)
     image = raster.render(camera, rows if rows.ndim == 2 else rows[:, None], params)
     if normalise:
         sums = raster.row_sums(camera, params)[:, :, None]
         image = torch.where(sums > 0, image / sums.clamp_min(torch.finfo(torch.float32).tiny), 0.0)
-    return (image if rows.ndim == 2 else image[:, :, 0]).cpu()
+    return image if rows.ndim == 2 else image[:, :, 0]
 
 
 @default_modes()
@@ -72,7 +69,6 @@ def weights_at(
     pixels: Tensor | np.ndarray | Sequence[tuple[int, int]],
     params: CompositingParams | None = None,
     *,
-    device: str | torch.device = "auto",
     threads: int | None = None,
 ) -> list[tuple[Tensor, Tensor]]:
     """Find the splats that make pixels, with their weights: the entries of rows of A that are not zero.
@@ -80,7 +76,7 @@ def weights_at(
     The weights of a pixel multiply the colours of its splats; what they leave of 1 is background.
 
     Args:
-        pixels: [n, 2] integers (x, y), from 0 at the top left. params, device, threads: as in `render`.
+        pixels: [n, 2] integers (x, y), from 0 at the top left. params, threads: as in `render`.
 
     Returns:
         A pair for each pixel, in their order: numbers of splats [k] i64, near to far, and their weights [k] f32, on
@@ -89,9 +85,8 @@ def weights_at(
     Raises:
         InvalidSplats, InvalidCameras: as in `render`.
         InvalidSettings: pixels are no pairs of integers, or lie outside the image; or threads are no number.
-        Unavailable: the device does not exist.
     """
-    raster, params = _open_view(splats, camera, params, device, threads)
+    raster, params = _open_view(splats, camera, params, threads)
     try:
         places, size = np.asarray(pixels), (camera.width, camera.height)
     except (TypeError, ValueError) as error:  # ragged lists, tensors of a GPU
@@ -106,14 +101,13 @@ def weights_at(
         raise InvalidSettings("pixels", expected=expected, got=str(tuple(outside[0].tolist())))
     rows = raster.ray_rows(camera, torch.from_numpy(places.astype(np.int32)), params)
     counts = rows.indptr.diff().tolist()
-    return list(zip(rows.splats.cpu().long().split(counts), rows.weights.cpu().split(counts), strict=True))
+    return list(zip(rows.splats.long().split(counts), rows.weights.split(counts), strict=True))
 
 
 def _open_view(
     splats: Splats,
     camera: Camera,
     params: CompositingParams | None,
-    device: str | torch.device,
     threads: int | None,
 ) -> tuple[Raster, CompositingParams]:
     """Check the arguments of `render`, and return the raster of the splats with the parameters of compositing."""
@@ -125,7 +119,7 @@ def _open_view(
     if not isinstance(camera, Camera):
         got, hint = repr(camera)[:80], "cameras[name] is the camera of a view"
         raise InvalidCameras("camera", expected="a Camera", got=got, hint=hint)
-    return open_raster(splats, choose_device(device), threads), params
+    return open_raster(splats, CPU, threads), params
 
 
 def _rows(splats: Splats, values: Tensor | np.ndarray) -> Tensor:

@@ -74,10 +74,9 @@ class OpenedLift:
         cameras: Mapping[str, Camera] | Path | str | None = None,
         packs: Views | None = None,
         *,
-        device: str = "cpu",
         world: WorldFrame = UNKNOWN,
     ) -> None:
-        self.device, self._world_override = device, world
+        self._world_override = world
         self.labelled: tuple[Any, Any] | None = None  # the last exported source and its `Labels`, for the next file
         self.selections: dict[str, Any] = {}  # of `liftcore.query.selections` by their names
         self.node_boxes: dict[tuple[int, int], Box] = {}  # of listed nodes, by their ids and numbers of splats
@@ -469,11 +468,11 @@ class OpenedLift:
 
     @cached_property
     def raster(self) -> Raster:
-        """A for this scene, on the device that renders."""
+        """A for this scene."""
         from liftcore.raster import open_raster
-        from liftcore.runtime.device import choose_device
+        from liftcore.runtime.device import CPU
 
-        return open_raster(self.splats, choose_device(self.device))
+        return open_raster(self.splats, CPU)
 
     @property
     def compositing(self) -> CompositingParams:

@@ -36,23 +36,21 @@ class LiftResult(Lift):
         """Return a result with the values of a lift, which can be queried."""
         return cls(**{field.name: getattr(lift, field.name) for field in fields(lift)})
 
-    def scene(
-        self, splats: Splats | None = None, cameras: Mapping[str, Camera] | None = None, *, device: str = "cpu"
-    ) -> Scene:
-        """Open the lift for queries (`liftcore.Scene`); cached while splats, cameras and device are the same.
+    def scene(self, splats: Splats | None = None, cameras: Mapping[str, Camera] | None = None) -> Scene:
+        """Open the lift for queries (`liftcore.Scene`); cached while splats and cameras are the same.
 
         Args:
             splats: that were lifted. cameras: of its views. Both may be left out if the lift was made of files that
-                are still in place. device: that renders.
+                are still in place.
         """
         from liftcore.query.scene import Scene
 
-        parts = (splats, cameras, device)
+        parts = (splats, cameras)
         cached = self.__dict__.get("_scene")  # no field, so that copies with other values do not have it
         if cached is None or any(a is not b for a, b in zip(cached[0], parts, strict=True)):
             if isinstance(splats, str | Path):  # a result takes values alone: a file may be of another scene
                 self.require_splats(splats)
-            cached = self.__dict__["_scene"] = parts, Scene(self, splats, cameras, device=device)
+            cached = self.__dict__["_scene"] = parts, Scene(self, splats, cameras)
         return cached[1]
 
     def query(

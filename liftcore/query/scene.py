@@ -50,7 +50,6 @@ class Scene(OpenedLift):
         source: the lift, or the path of its file, which is mapped and not read.
         splats: that were lifted, or their new path if they moved. cameras: of the scene, or their path.
         packs: that were lifted.
-        device: that renders: cpu, cuda or auto. Scores are computed on the CPU.
         world: up axis and length unit, if the lift has none, or wrong ones.
 
     Raises:

@@ -100,7 +100,7 @@ class RealScene:
 
     def render(self, camera: lc.Camera, values: torch.Tensor, lift: lc.LiftResult) -> torch.Tensor:
         """Render values [P, F] as the lift composites: [H, W, F] f32."""
-        return lc.render(self.splats, camera, values, lift.settings.compositing, device="cpu")
+        return lc.render(self.splats, camera, values, lift.settings.compositing)
 
 
 def digest(*arrays: Any) -> str:

@@ -74,7 +74,7 @@ def test_what_follows_a_lift_takes_it_from_the_card(paths: list[Path], tmp_path:
         assert np.array_equal(result.query(views).selected, answer.selected)
     assert result.segment(WORDS, vectors, splats).labels.tolist() == [number // 20 for number in range(60)]
     assert len(result.objects(splats, WORDS, vectors.to("cuda")).objects) == 3
-    image = lc.render(splats, cameras["middle"], result.features, device="cuda")
+    image = lc.render(splats, cameras["middle"], result.features)
     assert image.shape == (24, 32, 8)
     lc.region_weights(splats, cameras, lc.read_features(paths[2]), device="cuda").matrix(splats.count)
     result.save(tmp_path / "made.safetensors")
@@ -107,10 +107,10 @@ def test_tensors_of_a_card_come_in(paths: list[Path]) -> None:
         assert torch.equal(result.cpu().features, expected.features)
         assert lc.lift(splats, cameras, iter([("middle", grid)]), device=device, **FEW).has_feature.any()
         assert lc.lift(splats, cameras, {"middle": grid}, "default", device=device, **FEW).has_feature.any()
-        ones = lc.render(splats, cameras["middle"], torch.ones(60).to("cuda"), device=device)
-        assert torch.equal(ones, lc.render(splats_on_cpu, camera, torch.ones(60), device=device))
         lc.region_weights(splats, cameras, {"middle": regions}, device=device)
         assert lc.plan(splats, {"middle": corner}, {"middle": few}, device=device).views == ("middle",)
+    ones = lc.render(splats, cameras["middle"], torch.ones(60).to("cuda"))
+    assert torch.equal(ones, lc.render(splats_on_cpu, camera, torch.ones(60)))
     assert result.segment(WORDS, torch.eye(3, 8).to("cuda"), splats).labels.max() >= 0
     answer = result.query(torch.eye(8)[0].to("cuda"), splats=splats)
     assert splats.means[answer.selected].shape[1] == 3
