@@ -7,8 +7,10 @@ from copy import copy
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from shutil import rmtree
+from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Any, Literal, Self
+from weakref import finalize
 
 import numpy as np
 
@@ -386,10 +388,10 @@ class OpenedLift:
         if not self.metadata.splats.path and "splats" in self.__dict__:
             from liftcore.io.splats import write_splats
 
-            self._folder = TemporaryDirectory(prefix="splatlift-", ignore_cleanup_errors=True)
-            path = Path(self._folder.name) / "splats.ply"
-            write_splats(path, self.splats)
-            return path
+            folder = Path(mkdtemp(prefix="splatlift-"))
+            finalize(self, rmtree, folder, ignore_errors=True)
+            write_splats(folder / "splats.ply", self.splats)
+            return folder / "splats.ply"
         path = self._verified_input("splats", self.metadata.splats)
         self._require_rows(quick_count(path))
         return path
