@@ -48,7 +48,7 @@ def test_maps_that_may_be_crops_or_have_another_shape_give_a_warning(
     assert f"{cells[1]}x{cells[0]} for {size[0]}x{size[1]}" in warning
     if (cells, size) in CROPS:
         assert "1 of 1 views have maps of another aspect than their images" in warning
-        assert "stretched the photos, or did pad or crop them" in warning
+        assert "stretched the photos, or did pad, pad-end or crop them" in warning
 
 
 def test_the_pack_warns_of_channels_that_come_first(tmp_path: Path) -> None:
