@@ -2,6 +2,7 @@
 
 from liftcore.query.edits import Edit
 from liftcore.query.question import (
+    VIEW_CHARACTERS,
     BestWords,
     Box,
     LabelSummary,
@@ -18,6 +19,6 @@ from liftcore.query.terms import NOTATIONS
 from liftcore.runtime.fields import Body, NoBoolean, takes
 
 __all__ = [
-    "NOTATIONS", "BestWords", "Body", "Box", "Edit", "LabelSummary", "ListedObjects", "NoBoolean",
+    "NOTATIONS", "VIEW_CHARACTERS", "BestWords", "Body", "Box", "Edit", "LabelSummary", "ListedObjects", "NoBoolean",
     "Notation", "OwnCamera", "SceneTree", "SelectionSummary", "SuggestedWords", "Viewpoint", "page_fields", "takes",
 ]  # fmt: skip

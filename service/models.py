@@ -12,6 +12,7 @@ from liftcore import Answer, LiftSettings, Objects, Picture, Query, SceneObject,
 from liftcore.errors import InvalidSettings
 from liftcore.models import (
     NOTATIONS,
+    VIEW_CHARACTERS,
     BestWords,
     Body,
     Box,
@@ -31,7 +32,6 @@ from liftcore.models import (
 # Limits of one file or request. JSON is parsed in the event loop, where each megabyte may take .3 s.
 BODY_BYTES = 256 << 10
 BITS_BYTES = 1 << 20  # of a body with a bit a splat
-VIEW_CHARACTERS = 500  # of a view's name, so that it fits a query string
 WORD_CHARACTERS = 1000  # of a word, of a query's text, and of a pack's names
 FILE_CHARACTERS = 4 << 20  # of all names, or all words, of a file: a hundred thousand of 40
 NAME_CHARACTERS = 100  # that people give to lifts, selections and keys

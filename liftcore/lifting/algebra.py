@@ -156,7 +156,7 @@ class Algebra:
         sums = np.zeros((2, codebook.regions))
         for turn, regions in enumerate(steps.compared_regions(scene)):
             self.scene = replace(scene, turn=turn)
-            self.run("robust", steps.compare, scene.splat_pieces)
+            self.run("reweight", steps.compare, scene.splat_pieces)
             table = scene.table(f"cosines-{turn}", (2, codebook.regions + 1))
             sums += table[:, :-1]
             consistency = SceneConsistency.of(table, None if masks is None else masks & torch.from_numpy(regions))

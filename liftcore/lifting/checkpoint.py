@@ -5,9 +5,10 @@ a checkpoint is a folder of the raster's answers, one file a view. Sums over vie
 numbers in the same order: a resumed lift is bitwise identical. A file is complete or absent; views in progress when a
 lift ends are rasterized again.
 
-An answer is named by the digest of its request: the splats, and of a view its camera, its regions, its rays and the
-compositing parameters. Features are not part of it (``A^T B = W E``). So a lift resumes from the answers of another
-one that differs in features alone (another encoder, the same regions), in the choice of views, or in later steps.
+An answer is named by the digest of its request: the splats, and of a view its camera, its regions, its rays, with
+those that the diagnostics sample of all views, and the compositing parameters. Features are not part of it
+(``A^T B = W E``). So a lift resumes from the answers of another one that differs in features alone (another encoder,
+the same regions) or in later steps.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
     from liftcore.raster.base import Raster, ViewRequest
     from liftcore.scene.splats import Splats
 
-_ANSWER = re.compile(r"\.?([0-9a-f]{64}|\d{6,})\.safetensors(\.[0-9a-f]+\.part)?")  # and its unfinished files
+_ANSWER = re.compile(r"\.?[0-9a-f]{64}\.safetensors(\.[0-9a-f]+\.part)?")  # and its unfinished files
 _ROWS = {"indptr": "rows/indptr", "splats": "rows/splats", "weights": "rows/weights"}  # of RayRows, beside W
 
 

@@ -168,7 +168,7 @@ def _solve(
         if statistics.masks:
             with timings.stage("consensus"):
                 algebra.compare_masks()
-        with timings.stage("robust"):
+        with timings.stage("reweight"):
             reliability = algebra.reweight(levels_apart)
     with timings.stage("solve"):
         X, support = algebra.solve()
@@ -193,7 +193,7 @@ def _solve(
         facts["reweighting"] = reweighting_facts(statistics.levels, reliability, support.confidence, levels_apart)
     if objects and node_vectors:
         facts["objects"] = object_facts(objects, node_vectors)
-    with timings.step("certify"):
+    with timings.step("diagnose"):
         diagnostics = diagnose(inputs, statistics, X.dtype, support, algebra.measure(X), facts)
     table = views.features.table
     return LiftResult(

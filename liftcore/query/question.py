@@ -1,7 +1,7 @@
 """Models of queries of a lift and of their answers, for Python, the command line and HTTP.
 
-The fields of `Query` are the parameters and bodies of HTTP, the frames of its worker and the options of the command
-line; those of `Answer` are HTTP's replies, and ``answer`` of ``--json``. A field is declared here alone.
+The fields of `Query` are the parameters and bodies of HTTP, the JSON lines of its worker and the options of the
+command line; those of `Answer` are HTTP's replies, and ``answer`` of ``--json``. A field is declared here alone.
 Nothing here imports numpy or torch, which help and the HTTP process do not need.
 """
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 MOST_TERMS = 64  # for and against together
 MOST_INSTANCES = 100
-VIEW_CHARACTERS = 500  # of a view's name
+VIEW_CHARACTERS = 500  # of a view's name, so that it fits a query string
 Point = tuple[float, float, float]  # x y z, world frame, scene units
 
 

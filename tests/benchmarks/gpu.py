@@ -121,7 +121,7 @@ def main() -> int:
     if options.look:
         return 0
     broken = list[str]()
-    for preset in ("tikhonov", "default"):  # the latter has the stages of masks: objects, consensus, robust
+    for preset in ("tikhonov", "default"):  # the latter has the stages of masks: objects, consensus, reweight
         rows, differences = whole_lift(LARGE, device, preset)
         broken += differences
         title = f"A whole lift by {preset}, files to file ({LARGE}); tensors that differ when repeated"

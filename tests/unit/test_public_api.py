@@ -115,10 +115,10 @@ def test_stages_are_reported_in_order_and_the_plan_after_the_first_views(tmp_pat
     [(plan, before)] = plans
     assert before == {"read": 1, "digest": 1, "compile": 1, "plan": 1, "geometry": 3}
     assert plan.facts() == result.metadata.diagnostics["plan"]
-    for stage in ("read", "digest", "compile", "plan", "certify"):
+    for stage in ("read", "digest", "compile", "plan", "diagnose"):
         assert [call for call in calls if call[0] == stage] == [(stage, 0, 1, "steps"), (stage, 1, 1, "steps")]
     order = list(dict.fromkeys(stage for stage, *_ in calls))
-    before, after = ["read", "digest", "compile", "plan", "geometry"], ["robust", "solve", "certify"]
+    before, after = ["read", "digest", "compile", "plan", "geometry"], ["reweight", "solve", "diagnose"]
     assert order == [*before, "objects", "consensus", *after]
     assert set(order) <= result.metadata.timings.keys()
     for stage in order:

@@ -15,7 +15,7 @@ const FINAL_STATES = ["succeeded", "failed", "canceled"];
 const REQUIRED_KINDS = { splats: "Splats", cameras: "Cameras", features: "Features" };
 const FORMATS = { splats: suffixes("splats"), cameras: "cameras.json, transforms.json, or a COLMAP model: its folder or a .zip", features: `${suffixes("features")} packs` };
 const STAGES = { read: "Reading files", digest: "Reading files", compile: "Compiling kernels", plan: "Planning", geometry: "Rasterizing the views",
-  solve: "Solving", robust: "Comparing views", smooth: "Smoothing", certify: "Checking the result", save: "Saving" };
+  solve: "Solving", reweight: "Comparing views", smooth: "Smoothing", diagnose: "Checking the result", save: "Saving" };
 
 export class UploadPanel {
   // onOpen(id): open a lift. onDelete(): after lifts were deleted. openLiftId(): the id of the open lift, or null.

@@ -162,7 +162,7 @@ def test_other_engines_go_on_from_the_pieces_of_each_stage(scene: dict[str, Any]
     stored = {**scene, "views": lc.read_features(tmp_path / "pack.safetensors")}
     folder, settings = tmp_path / "work", LiftSettings.of(preset="default")
     stopped_stages = []
-    for number, stage in enumerate(("geometry", "gather", "objects", "consensus", "robust", "solve")):
+    for number, stage in enumerate(("geometry", "gather", "objects", "consensus", "reweight", "solve")):
 
         def stop(name: str, completed: int, total: int, unit: str, at: str = stage) -> None:
             if name == at and completed >= 1:
@@ -171,7 +171,7 @@ def test_other_engines_go_on_from_the_pieces_of_each_stage(scene: dict[str, Any]
 
         with pytest.raises(InterruptedError):
             in_blocks((LocalEngine(1), Shuffled(2))[number % 2], stored, settings, folder=folder, progress=stop)
-    assert stopped_stages == ["geometry", "gather", "objects", "consensus", "robust", "solve"]
+    assert stopped_stages == ["geometry", "gather", "objects", "consensus", "reweight", "solve"]
     result = in_blocks(Shuffled(2), stored, settings, folder=folder)
     expected = lc.lift(**scene, preset=settings)
     assert_same(result, expected)
