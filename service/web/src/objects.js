@@ -45,9 +45,14 @@ export class ObjectList {
     }
   }
 
-  // The names that people gave to objects: {word, term}. Selections are left out: one that corrects a word has its name.
+  // The names that people gave to objects and selections: {word, term}. A selection that corrects a word answers for it.
   ownNames() {
-    return this.items.filter(({ name, score }) => name && score === null).map(object => ({ word: object.name, term: term(object) }));
+    const objects = this.items.filter(({ name, score }) => name && score === null).map(object => ({ word: object.name, term: term(object) }));
+    return [...objects, ...this.selections.map(({ id, name }) => ({ word: name, term: `selection:${id}` }))];
+  }
+
+  hiddenSets() {
+    return this.items.filter(({ hidden }) => hidden).map(term);
   }
 
   // Fetch which splats are hidden.
