@@ -437,6 +437,7 @@ class RenderRequest(Picture):
 
     model_config = BODY_CONFIG
     lift: JobId | None = Field(None, description=THE_LIFT)
+    hide: list[str] = Field([], max_length=1000, description="sets of splats that are left out, as `sets` of a query")
 
 
 class RenderParameters(RenderRequest):

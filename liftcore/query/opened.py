@@ -335,6 +335,22 @@ class OpenedLift:
             raise NotFound("selection", expected=f"a selection of the scene: {names}", got=repr(splat_set.name))
         return selection.splats
 
+    def without(self, sets: Sequence[str]) -> Self:
+        """Return a copy for pictures, in which splats of sets (``object:N``, ``selection:NAME``) are unseen."""
+        import torch
+
+        from liftcore.query.terms import parse_set
+
+        if not sets:
+            return self
+        members = [self.set_members(parse_set(notation, f"hide.{place}")) for place, notation in enumerate(sets)]
+        unseen = torch.from_numpy(np.logical_or.reduce(members)).to(self.splats.opacity_logits.device)
+        splats, shown = copy(self.splats), copy(self)
+        object.__setattr__(splats, "opacity_logits", splats.opacity_logits.masked_fill(unseen, -torch.inf))
+        shown.__dict__.pop("raster", None)
+        shown.__dict__["splats"] = splats
+        return shown
+
     def within(self, members: np.ndarray) -> Self:
         """Return a copy of the lift in which only some splats [P] bool have features, with nodes as its objects.
 

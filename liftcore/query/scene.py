@@ -185,17 +185,19 @@ class Scene(OpenedLift):
         self.selections[name] = selection
         return selection
 
-    def render(self, view: str | Camera, channel: str = "rgb") -> np.ndarray:
+    def render(self, view: str | Camera, channel: str = "rgb", hide: Sequence[str] = ()) -> np.ndarray:
         """Render a view: ``rgb``, ``pca``, ``cluster`` or ``confidence``, [H, W, 3] u8 sRGB; ``depth``, [H, W] f32.
 
-        Depths are expected ones, in scene units, 0 where no splat is.
+        Depths are expected ones, in scene units, 0 where no splat is. Splats of the sets ``hide`` (``object:N``,
+        ``selection:NAME``) are left out.
 
         Raises:
             NotFound, InvalidQuery, InvalidLift: as `liftcore.query.render.render`.
         """
         from liftcore.query.render import expected_depth, render
 
-        return expected_depth(self, view)[0] if channel == "depth" else render(self, view, channel)
+        shown = self.without(hide)
+        return expected_depth(shown, view)[0] if channel == "depth" else render(shown, view, channel)
 
     def objects(self, query: Query | str | Answer, *, encoder: TextEncoder | str | Path | None = None) -> Objects:
         """Group the splats of an answer to objects of touching splats with boxes (`liftcore.query.objects`)."""

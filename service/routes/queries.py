@@ -134,16 +134,20 @@ def query_request(operation: str, question: Question, lift: models.Lift, deps: P
     """Return the request of a question: with the encoder of its texts, its selections, the packs of its regions."""
     work = scene_request(operation, lift, deps)
     examples = [str(item) for item in (*question.sets, *question.like, *question.unlike)]
-    selections = {item.removeprefix(SELECTION) for item in examples if item.startswith(SELECTION)}
-    if selections:
-        work["selections"] = {
-            name: bits_text(bits_of_selection(deps.store, get_selection(deps.store, lift.id, name)))
-            for name in sorted(selections)
-        }
+    work |= with_selections(examples, lift, deps)
     work = with_encoder(work, question, lift, deps, owner) if question.texts else work | NO_ENCODER
     if any(item.startswith(REGION) for item in examples):
         work = with_packs(work, lift, deps, "like")
     return work | {"query": question.model_dump(mode="json", include=set(Query.deciding()))}
+
+
+def with_selections(sets: list[str], lift: models.Lift, deps: Parts) -> dict[str, Any]:
+    """Return the selections among sets, if there are any, as a field for the query process."""
+    names = sorted({item.removeprefix(SELECTION) for item in sets if item.startswith(SELECTION)})
+    selections = {
+        name: bits_text(bits_of_selection(deps.store, get_selection(deps.store, lift.id, name))) for name in names
+    }
+    return {"selections": selections} if selections else {}
 
 
 def bits_text(bits: bytes) -> str:
@@ -347,4 +351,5 @@ def render(question: RenderRequest, request: Request, deps: Deps, owner: Caller)
     """
     lift = deps.store.lift(owner, question.lift)
     work = scene_request("render", lift, deps) | seen_from(question) | {"channel": question.channel}
+    work |= {"hide": question.hide} | with_selections(question.hide, lift, deps)
     return respond(request, deps, work, PNG)

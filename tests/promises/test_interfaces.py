@@ -269,6 +269,20 @@ def test_renders_of_each_channel_are_the_same_pictures(interfaces: Interfaces, c
         assert np.array_equal(picture, interfaces.scene.render("middle", channel))
 
 
+def test_hidden_objects_are_left_out_of_pictures(interfaces: Interfaces) -> None:
+    whole, picture = (interfaces.scene.render("middle", hide=hide) for hide in ((), ["object:0"]))
+    scene = interfaces.scene
+    hidden = scene.ask(lc.Query(sets=("object:0",))).selected
+    drawn, rest = (
+        lc.render(splats, scene.cameras["middle"], np.ones((splats.count, 1), np.float32)).numpy()[..., 0] > 0
+        for splats in (scene.splats[hidden], scene.splats[~hidden])
+    )
+    assert np.array_equal(picture[~drawn], whole[~drawn]) and not np.array_equal(picture[drawn], whole[drawn])
+    assert np.array_equal(scene.render("middle", "depth", hide=["object:0"]) > 0, rest)
+    for send in (interfaces.get, interfaces.post):
+        assert np.array_equal(pixels_of(send("/render", view="middle", hide=["object:0"]).content), picture)
+
+
 def test_splats_of_an_answer_are_the_same_files(interfaces: Interfaces) -> None:
     fields = {"text": ["lamp"], "threshold": 0.5}
     answer, words = interfaces.ask(fields), [*words_of(fields), *encoder_of(interfaces, fields)]

@@ -33,6 +33,7 @@ const query = new QueryPanel({ onChange: onQueryChange, ownNames: () => objects.
 const layers = new LayerPanel({
   onChange: () => { repaint(); link(); },
   flyToView: view => viewer?.goToView(view),
+  hiddenSets: () => objects.hiddenSets(),
   onExample: (term, less) => query.askExample(term, less),
   onPlace: (term, shift, alt) => clickExample(term, shift, alt),
   fallback: !webgl(),
@@ -45,7 +46,7 @@ const labels = new LabelPanel({
 let hiddenSplats = null; // of objects that are hidden
 const objects = new ObjectList({
   namesByTerm,
-  onHide: splats => { hiddenSplats = splats; if (viewer?.mesh) viewer.hide(splats); },
+  onHide: splats => { hiddenSplats = splats; if (viewer?.mesh) viewer.hide(splats); layers.drawView(); },
   selectedSets: () => query.sets,
   selectSets: (sets, word) => query.askSets(sets, word),
   flyToBox: (box, view) => (layers.mode === "view" ? layers.goToView(view) : viewer?.toBox(box, layers.views.find(({ name }) => name === view))),

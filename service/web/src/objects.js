@@ -58,7 +58,7 @@ export class ObjectList {
   // Fetch which splats are hidden.
   async hideSplats() {
     const { lift } = this;
-    const sets = this.items.filter(({ hidden }) => hidden).map(term);
+    const sets = this.hiddenSets();
     try {
       const splats = sets.length ? readNpy(await fetchBytes(`/query/selection?${queryString({ lift: lift.id, sets })}`)) : null;
       if (lift === this.lift) this.onHide(splats);
