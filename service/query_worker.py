@@ -312,8 +312,8 @@ class Answers:
             view_mask = self._view_mask(request) if operation in ("mask", "attention") else None
             kind = SPLATS_FILES[request["what"]] if operation == "splats" else operation
             return scene.blocks_of(self._answer(request), kind, view=view, view_mask=view_mask)
-        shown = scene.without(request.get("hide", ()))
-        blocks = shown.blocks_of(None, request.get("channel", "splats"), view=view)
+        scene = scene.without(request.get("hide", ()))
+        blocks = scene.blocks_of(None, request.get("channel", "splats"), view=view)
         return compressed(blocks) if request.get("compressed") else blocks
 
     def _export(self, request: Request) -> Iterable[bytes]:

@@ -345,11 +345,11 @@ class OpenedLift:
             return self
         members = [self.set_members(parse_set(notation, f"hide.{place}")) for place, notation in enumerate(sets)]
         unseen = torch.from_numpy(np.logical_or.reduce(members)).to(self.splats.opacity_logits.device)
-        splats, shown = copy(self.splats), copy(self)
+        splats, scene = copy(self.splats), copy(self)
         object.__setattr__(splats, "opacity_logits", splats.opacity_logits.masked_fill(unseen, -torch.inf))
-        shown.__dict__.pop("raster", None)
-        shown.__dict__["splats"] = splats
-        return shown
+        scene.__dict__.pop("raster", None)
+        scene.__dict__["splats"] = splats
+        return scene
 
     def within(self, members: np.ndarray) -> Self:
         """Return a copy of the lift in which only some splats [P] bool have features, with nodes as its objects.

@@ -196,8 +196,8 @@ class Scene(OpenedLift):
         """
         from liftcore.query.render import expected_depth, render
 
-        shown = self.without(hide)
-        return expected_depth(shown, view)[0] if channel == "depth" else render(shown, view, channel)
+        scene = self.without(hide)
+        return expected_depth(scene, view)[0] if channel == "depth" else render(scene, view, channel)
 
     def objects(self, query: Query | str | Answer, *, encoder: TextEncoder | str | Path | None = None) -> Objects:
         """Group the splats of an answer to objects of touching splats with boxes (`liftcore.query.objects`)."""

@@ -81,8 +81,8 @@ def test_codes_are_saved_read_cropped_and_moved_as_codes(
     assert (tmp_path / "coded.safetensors").read_bytes() == (tmp_path / "exact.safetensors").read_bytes()
     for name, column in coded.arrays().items():
         assert np.array_equal(read.arrays()[name], column) and read.arrays()[name].dtype == column.dtype, name
-    code, opened = coded.arrays()["code"], lc.Scene(tmp_path / "coded.safetensors").features.code
-    assert opened is not None and np.array_equal(opened, code)
+    code, read_code = coded.arrays()["code"], lc.Scene(tmp_path / "coded.safetensors").features.code
+    assert read_code is not None and np.array_equal(read_code, code)
     for lift in (read, coded):
         cropped = lift[100:700]
         assert np.array_equal(cropped.arrays()["code"], code[100:700]) and len(cropped) == 600

@@ -270,14 +270,14 @@ def test_renders_of_each_channel_are_the_same_pictures(interfaces: Interfaces, c
 
 
 def test_hidden_objects_are_left_out_of_pictures(interfaces: Interfaces) -> None:
-    whole, picture = (interfaces.scene.render("middle", hide=hide) for hide in ((), ["object:0"]))
+    usual, picture = (interfaces.scene.render("middle", hide=hide) for hide in ((), ["object:0"]))
     scene = interfaces.scene
-    hidden = scene.ask(lc.Query(sets=("object:0",))).selected
-    drawn, rest = (
+    members = scene.ask(lc.Query(sets=["object:0"])).selected
+    pixels, rest = (
         lc.render(splats, scene.cameras["middle"], np.ones((splats.count, 1), np.float32)).numpy()[..., 0] > 0
-        for splats in (scene.splats[hidden], scene.splats[~hidden])
+        for splats in (scene.splats[members], scene.splats[~members])
     )
-    assert np.array_equal(picture[~drawn], whole[~drawn]) and not np.array_equal(picture[drawn], whole[drawn])
+    assert np.array_equal(picture[~pixels], usual[~pixels]) and not np.array_equal(picture[pixels], usual[pixels])
     assert np.array_equal(scene.render("middle", "depth", hide=["object:0"]) > 0, rest)
     for send in (interfaces.get, interfaces.post):
         assert np.array_equal(pixels_of(send("/render", view="middle", hide=["object:0"]).content), picture)
