@@ -45,10 +45,9 @@ export class ObjectList {
     }
   }
 
-  // The names that people gave to objects and selections: {word, term}. A selection that corrects a word answers for it.
+  // The names that people gave to objects: {word, term}. Selections are left out: one that corrects a word has its name.
   ownNames() {
-    const objects = this.items.filter(({ name, score }) => name && score === null).map(object => ({ word: object.name, term: term(object) }));
-    return [...objects, ...this.selections.map(({ id, name }) => ({ word: name, term: `selection:${id}` }))];
+    return this.items.filter(({ name, score }) => name && score === null).map(object => ({ word: object.name, term: term(object) }));
   }
 
   hiddenSets() {
