@@ -482,7 +482,7 @@ def _is_one_thing(scene: OpenedLift, example: np.ndarray) -> bool:
     rows = np.flatnonzero(scene.has_feature)
     rows = rows[:: -(-len(rows) // MOST_COMPARED) or 1]
     similar = products(scene.features[rows], scene.norms[rows], example[None], example[None])[0][:, 0]
-    if similar.min(initial=1.0) < SAME_AS_EXAMPLE:
+    if not len(rows) or similar.min() < SAME_AS_EXAMPLE:
         return False
     others = np.argsort(similar, kind="stable")[:-1]
     values, weights = similar[others], scene.total_weight[rows[others]]

@@ -59,6 +59,13 @@ def test_one_word_written_twice_does_not_compete_with_itself(words: list[str], t
     assert np.array_equal(answer.selected, np.arange(80) < 40)
 
 
+def test_scene_without_a_feature_selects_nothing_by_an_example() -> None:
+    answer = scene_with(np.zeros((12, 4)), weights=np.zeros(12)).ask(
+        lc.Query.model_validate({"like": [[1, 0, 0, 0]]})
+    )
+    assert answer.count == 0 and not answer.selected.any()
+
+
 def test_scores_are_cosines_and_negatives_only_take_away(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     rows, vectors = rng.normal(size=(30, 16)), rng.normal(size=(2, 16))
