@@ -437,7 +437,9 @@ class RenderRequest(Picture):
 
     model_config = BODY_CONFIG
     lift: JobId | None = Field(None, description=THE_LIFT)
-    hide: list[str] = Field([], max_length=1000, description="sets of splats that are left out, as `sets` of a query")
+    hide: list[str] | None = Field(
+        None, max_length=1000, description="sets of splats left out, as `sets` of a query; default: hidden objects"
+    )
 
 
 class RenderParameters(RenderRequest):
@@ -546,7 +548,7 @@ class ObjectLabelChange(Body):
 
     model_config = BODY_CONFIG
     name: Name | None = Field(None, description="your own name; null for the nearest word")
-    hidden: bool = Field(False, description="true if lists leave it out")
+    hidden: bool = Field(False, description="true if lists and pictures leave it out")
 
 
 class ObjectLabel(BaseModel):

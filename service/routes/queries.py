@@ -351,5 +351,8 @@ def render(question: RenderRequest, request: Request, deps: Deps, owner: Caller)
     """
     lift = deps.store.lift(owner, question.lift)
     work = scene_request("render", lift, deps) | seen_from(question) | {"channel": question.channel}
-    work |= {"hide": question.hide} | with_selections(question.hide, lift, deps)
+    hide = question.hide
+    if hide is None:
+        hide = [f"object:{label.id}" for label in object_labels(deps.store, lift.id) if label.hidden]
+    work |= {"hide": hide} | with_selections(hide, lift, deps)
     return respond(request, deps, work, PNG)

@@ -118,12 +118,16 @@ def test_objects_are_there_without_words_and_words_name_them(client: httpx.Clien
 
 def test_object_takes_a_name_and_is_hidden(client: httpx.Client, lift: dict[str, Any]) -> None:
     path = lift["links"]["objects"]
+    view = {"lift": lift["id"], "view": client.get(lift["links"]["views"]).json()["views"][0]["name"]}
+    rest = client.get("/render", params=view | {"hide": "object:0"}).content
     before = client.get(path).json()["objects"]
     assert client.patch(f"{path}/0", json={"name": "the mug", "hidden": True}).status_code == 200
     first = client.get(path).json()["objects"][0]
     assert (first["name"], first["hidden"]) == ("the mug", True)
+    assert client.get("/render", params=view).content == rest
     assert client.patch(f"{path}/0", json={"name": None, "hidden": False}).status_code == 200
     assert client.get(path).json()["objects"] == before
+    assert client.get("/render", params=view).content != rest
     assert_problem(client.patch(f"{path}/99", json={"hidden": True}), 404)
 
 

@@ -18,9 +18,9 @@ const CLICK_DISTANCE = 5; // pixels that the pointer may move during a click
 
 export class LayerPanel {
   // onChange(): colours or the link must be updated. flyToView(view): move the camera. onExample(term, less): a box or a
-  // stroke as an example. onPlace(term, shift, alt): a click, which may select an object. hiddenSets(): sets that pictures leave out.
-  constructor({ onChange, flyToView, onExample, onPlace, hiddenSets, fallback }) {
-    Object.assign(this, { onChange, flyToView, onExample, onPlace, hiddenSets, views: [], view: null, colourCache: new Map(), layerColours: null, requestNumber: 0, mode: fallback ? "view" : "scene" });
+  // stroke as an example. onPlace(term, shift, alt): a click, which may select an object.
+  constructor({ onChange, flyToView, onExample, onPlace, fallback }) {
+    Object.assign(this, { onChange, flyToView, onExample, onPlace, views: [], view: null, colourCache: new Map(), layerColours: null, requestNumber: 0, mode: fallback ? "view" : "scene" });
     this.fallback = fallback;
     for (const input of document.querySelectorAll("input[name=layer]")) input.addEventListener("change", () => this.setLayer(input.value));
     for (const input of document.querySelectorAll("input[name=mode]")) input.addEventListener("change", () => this.setMode(input.value));
@@ -134,7 +134,7 @@ export class LayerPanel {
       if (loaded) image.src = loaded.src; else image.removeAttribute("src");
       image.hidden = !loaded;
     };
-    const address = queryString({ lift: this.lift.id, view: this.view.name, hide: this.hiddenSets() });
+    const address = queryString({ lift: this.lift.id, view: this.view.name });
     const overlay = this.layerName === "photo" ? this.view.photo && `/lifts/${this.lift.id}/photo?view=${encodeURIComponent(this.view.name)}`
       : this.layerName !== "rgb" ? `/render?${address}&channel=${this.layerName}` : null;
     byId("layer-words").textContent = this.layerName === "photo" && !this.view.photo ? "This view has no photo." : LAYERS[this.layerName];

@@ -33,7 +33,6 @@ const query = new QueryPanel({ onChange: onQueryChange, ownNames: () => objects.
 const layers = new LayerPanel({
   onChange: () => { repaint(); link(); },
   flyToView: view => viewer?.goToView(view),
-  hiddenSets: () => objects.hiddenSets(),
   onExample: (term, less) => query.askExample(term, less),
   onPlace: (term, shift, alt) => clickExample(term, shift, alt),
   fallback: !webgl(),

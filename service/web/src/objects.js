@@ -50,14 +50,10 @@ export class ObjectList {
     return this.items.filter(({ name, score }) => name && score === null).map(object => ({ word: object.name, term: term(object) }));
   }
 
-  hiddenSets() {
-    return this.items.filter(({ hidden }) => hidden).map(term);
-  }
-
   // Fetch which splats are hidden.
   async hideSplats() {
     const { lift } = this;
-    const sets = this.hiddenSets();
+    const sets = this.items.filter(({ hidden }) => hidden).map(term);
     try {
       const splats = sets.length ? readNpy(await fetchBytes(`/query/selection?${queryString({ lift: lift.id, sets })}`)) : null;
       if (lift === this.lift) this.onHide(splats);
