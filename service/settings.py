@@ -78,7 +78,7 @@ def variables() -> Iterator[tuple[str, str, str]]:
     """Yield the environment variable, default and description of each setting, in order."""
     for name, field in ServiceSettings.model_fields.items():
         default = field.default
-        text = "not set" if default in (None, (), "") else str(default)
+        text = "" if default in (None, ()) else str(default)
         if isinstance(default, int) and name.endswith("bytes"):
             text = f"{default} ({default // MiB} MiB)"
         yield f"SPLATLIFT_{name.upper()}", text, field.description or ""

@@ -13,7 +13,6 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
-from textwrap import fill
 from types import FrameType
 
 import anyio
@@ -61,21 +60,21 @@ class AnnouncingServer(uvicorn.Server):
 
 
 def add_arguments(parser: Parser) -> None:
-    """Add the options of the command; the end of its help lists all settings."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    rows = (
-        f"  {name}, default {default}\n{fill(meaning, 78, initial_indent=' ' * 6, subsequent_indent=' ' * 6)}"
-        for name, default, meaning in variables()
-    )
-    parser.epilog = "\n".join(("environment variables; options win, and an empty variable is not set:", *rows))
+    """Add the options of the command."""
     parser.add_argument("--host", help="the address to bind; beyond loopback only with keys")
     parser.add_argument("--port", type=int, help="the port to bind; 0 picks a free one")
     parser.add_argument("--data", type=Path, metavar="DIR", help="the directory for the database and all files")
     parser.add_argument("--encoder", metavar="SPEC", help="the default text encoder: lvis, table:FILE, ...")
+    parser.add_argument("--settings", action="store_true", help="list all environment variables, and exit")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the service until it is stopped."""
+    """Run the service until it is stopped, or list its settings."""
+    if options.settings:
+        rows = list(variables())
+        lines = (f"{name}={default}\n    {meaning}" for name, default, meaning in rows)
+        print(json.dumps({"settings": rows}) if options.json else "\n".join(lines))
+        return 0
     settings = read_settings(**{name: getattr(options, name) for name in ("host", "port", "data", "encoder")})
     require_keys(settings)
     require_encoder_files(settings)

@@ -92,7 +92,7 @@ def delete_selection(lift: str, selection: SelectionId, deps: Deps, owner: Calle
 def change_object_label(
     lift: str, object_id: ObjectId, change: models.ObjectLabelChange, deps: Deps, owner: Caller
 ) -> models.ObjectLabel:
-    """Give an object of a lift a name of your own, or hide it from lists and pictures; fields that are left out stay."""
+    """Give an object of a lift a name of your own, or hide it from lists and pictures; other fields stay."""
     record = deps.store.lift(owner, lift)
     count = deps.queries.call(scene_request("count_objects", record, deps))["value"]["count"]
     if object_id >= count:
