@@ -69,7 +69,7 @@ export class SelectionEditor {
     if (!now?.answer) return;
     const { lift, ...query } = this.query.requestBody(now);
     try {
-      this.setSelection(await post(`/lifts/${lift}/selections`, { name: this.questionLabel(now).slice(0, 100), edit: { operation: "set", query } }));
+      this.setSelection(await post(`/lifts/${lift}/selections`, { name: `${this.questionLabel(now).slice(0, 90)} by hand`, edit: { operation: "set", query } }));
       this.setOpen(true);
       this.setTool("brush");
       await this.query.askSets([`selection:${this.selection.id}`]);

@@ -35,7 +35,7 @@ export class ExportPanel {
     try {
       await download("/query/export", "labels", body).catch(problem => (problem.argument === "encoder" ? download("/query/export", "labels", { lift: lift.id, format, of: "objects" }) : Promise.reject(problem)));
       const hidden = this.objects.items.filter(object => object.hidden).length;
-      const rest = !ofObjects ? "" : body.of === "questions" ? ` Left out: the background${hidden ? ` and ${plural(hidden, "hidden object")}` : ""}.` : hidden ? ` ${plural(hidden, "hidden object")} included.` : "";
+      const rest = !ofObjects ? "" : body.of === "questions" ? ` Selections have the splats that they share with objects. Left out: the background${hidden ? ` and ${plural(hidden, "hidden object")}` : ""}.` : hidden ? ` ${plural(hidden, "hidden object")} included.` : "";
       notify(`The file is saved.${rest}`);
     } catch (problem) {
       notify(problemText(problem), true);

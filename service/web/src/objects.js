@@ -45,9 +45,10 @@ export class ObjectList {
     }
   }
 
-  // The names that people gave to objects: {word, term}. Selections are left out: one that corrects a word has its name.
+  // The names that people gave to objects and selections: {word, term}.
   ownNames() {
-    return this.items.filter(({ name, score }) => name && score === null).map(object => ({ word: object.name, term: term(object) }));
+    return [...this.items.filter(({ name, score }) => name && score === null).map(object => ({ word: object.name, term: term(object) })),
+      ...this.selections.map(({ id, name }) => ({ word: name, term: `selection:${id}` }))];
   }
 
   // Fetch which splats are hidden.
