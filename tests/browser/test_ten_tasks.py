@@ -87,6 +87,8 @@ def test_ten_tasks_are_done_without_a_manual(
     page.until(f"splatlift.editor.selection.step === 0 && !splatlift.editor.isBusy && {FIND_COLOUR}")
     assert page.value("splatlift.query.current.count") == 20
     object_id = page.value("splatlift.objects.selections[0].id")
+    ask(page, "Lamp and a bit")  # find it by its name
+    assert page.value("splatlift.query.current.sets") == [f"selection:{object_id}"]
     ask(page, "lamp")  # compare two words
     page.until("!document.querySelector('#by-hand').hidden")  # the answer is listed: nothing moves any more
     page.press("#panel-ask [data-compare]")
