@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from liftcore import Scene
 
 MAX_ITEMS = 6  # of a list, in text
-MAX_FOLDERS = 8
-LARGE = 1e4  # from here on numbers have about three decimals, as map coordinates share their first digits
+LARGE = 1e4  # from here on numbers may share their first digits
 MAX_DIGITS = 15
 
 
@@ -131,11 +130,11 @@ def _entries(document: Mapping[str, Any]) -> Iterable[str]:
             yield f"{str(key).replace('_', ' '):<{width}}  {short_text(value)}"
 
 
-def short_text(value: Any) -> str:
-    """Format a value as short text."""
+def short_text(value: Any, digits: int = 6) -> str:
+    """Format a value as short text; large numbers, as map coordinates, with about three decimals."""
     if isinstance(value, float):
         is_large = LARGE <= abs(value) < math.inf
-        return f"{value:.{min(MAX_DIGITS, 4 + int(math.log10(abs(value)))) if is_large else 6}g}"
+        return f"{value:.{min(MAX_DIGITS, 4 + int(math.log10(abs(value)))) if is_large else digits}g}"
     if isinstance(value, Mapping):
         return ", ".join(f"{key} {_nested(item)}" for key, item in value.items()) or "-"
     if isinstance(value, list | tuple):
@@ -149,10 +148,8 @@ def _nested(value: Any) -> str:
 
 
 def place_of(point: tuple[float, ...]) -> str:
-    """Format a point with four digits, or with about three decimals for large map coordinates."""
-    reach = max(map(abs, point))
-    digits = 4 if reach < LARGE else 4 + int(math.log10(reach))
-    return f"({', '.join(f'{value:.{digits}g}' for value in point)})"
+    """Format a point."""
+    return f"({', '.join(short_text(value, digits=4) for value in point)})"
 
 
 def smoothing_line(facts: Mapping[str, Any]) -> str:
@@ -160,13 +157,12 @@ def smoothing_line(facts: Mapping[str, Any]) -> str:
     shift = "not at all" if facts["moved"] is None else f"by {facts['moved']:.1%} of their length"
     neighbourhood = "position and colour" if facts["colours"] else "position only, as the splats have no colours"
     return (
-        f"smoothness {facts['smoothness']:g}: features moved {shift} towards their neighbours' in "
-        f"{neighbourhood} "
+        f"smoothness {facts['smoothness']:g}: features moved {shift} towards their neighbours' in {neighbourhood} "
         f"({facts['steps']} steps, {facts['residual']:.1g} of the gradient remaining)"
     )
 
 
 def list_folders(folders: Sequence[str]) -> list[str]:
     """Return a line about the folders of views, if there are any."""
-    names = ", ".join(folders[:MAX_FOLDERS]) + (" ..." if len(folders) > MAX_FOLDERS else "")
+    names = ", ".join(folders[:MAX_ITEMS]) + (" ..." if len(folders) > MAX_ITEMS else "")
     return [f"  names of views include their sub-folders: {names}"] if folders else []
