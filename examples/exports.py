@@ -20,7 +20,7 @@ SUFFIXES = (".glb", ".ply", ".json")
 def main(lift: str, table: str, out: str) -> None:
     """Write ``out/things`` with each of the suffixes."""
     scene, encoder = lc.Scene(lift), f"table:{table}"
-    objects = scene.catalogue(scene.words(encoder), encoder=encoder)
+    objects = scene.tree(scene.words(encoder), encoder=encoder)
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     for suffix in SUFFIXES:

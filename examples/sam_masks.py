@@ -30,7 +30,7 @@ def main(splats_path: str, cameras_path: str, masks_path: str, out: str) -> None
     splats, cameras = lc.read_splats(splats_path), lc.read_cameras(cameras_path)
     result = lc.lift(splats, cameras, views_of(Path(masks_path)))
     scene = result.scene(splats, cameras)
-    objects = scene.catalogue()
+    objects = scene.tree()
     print(objects.explanation)
     for item in objects.objects:
         print(f"object {item.id}: {item.splats} splats about {', '.join(f'{c:.2f}' for c in item.centre)}")

@@ -23,7 +23,7 @@ def main(splats_path: str, cameras_path: str, features_path: str, out: str) -> N
         print(f"{file.name}: {file.stat().st_size} bytes")
 
     scene = lc.Scene(lift)
-    objects = scene.catalogue()
+    objects = scene.tree()
     print(objects.explanation)
 
 

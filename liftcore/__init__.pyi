@@ -28,14 +28,13 @@ from liftcore.lifting.operators import weights_at as weights_at
 from liftcore.lifting.pipeline import lift as lift
 from liftcore.lifting.pipeline import plan as plan
 from liftcore.lifting.planning.plan import Plan as Plan
-from liftcore.query.catalogue import Catalogue as Catalogue
 from liftcore.query.directions import read_example as read_example
 from liftcore.query.question import Answer as Answer
 from liftcore.query.question import NamedSplats as NamedSplats
 from liftcore.query.question import Objects as Objects
 from liftcore.query.question import Picture as Picture
 from liftcore.query.question import Query as Query
-from liftcore.query.question import SceneObject as SceneObject
+from liftcore.query.question import SceneNode as SceneNode
 from liftcore.query.question import SelectedObject as SelectedObject
 from liftcore.query.render import ViewMask as ViewMask
 from liftcore.query.result import LiftResult as LiftResult

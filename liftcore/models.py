@@ -6,19 +6,19 @@ from liftcore.query.question import (
     BestWords,
     Box,
     LabelSummary,
-    ListedObjects,
     Notation,
     OwnCamera,
     SceneTree,
     SelectionSummary,
     SuggestedWords,
     Viewpoint,
+    WithUnits,
     page_fields,
 )
 from liftcore.query.terms import NOTATIONS
 from liftcore.runtime.fields import Body, NoBoolean, takes
 
 __all__ = [
-    "NOTATIONS", "VIEW_CHARACTERS", "BestWords", "Body", "Box", "Edit", "LabelSummary", "ListedObjects", "NoBoolean",
-    "Notation", "OwnCamera", "SceneTree", "SelectionSummary", "SuggestedWords", "Viewpoint", "page_fields", "takes",
+    "NOTATIONS", "VIEW_CHARACTERS", "BestWords", "Body", "Box", "Edit", "LabelSummary", "NoBoolean", "Notation",
+    "OwnCamera", "SceneTree", "SelectionSummary", "SuggestedWords", "Viewpoint", "WithUnits", "page_fields", "takes",
 ]  # fmt: skip

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, computed_field
 from pydantic_core import PydanticCustomError
 
-from liftcore import Answer, LiftSettings, Objects, Picture, Query, SceneObject, WorldFrame
+from liftcore import Answer, LiftSettings, Objects, Picture, Query, SceneNode, WorldFrame
 from liftcore.errors import InvalidSettings
 from liftcore.models import (
     NOTATIONS,
@@ -18,7 +18,6 @@ from liftcore.models import (
     Box,
     Edit,
     LabelSummary,
-    ListedObjects,
     NoBoolean,
     Notation,
     OwnCamera,
@@ -26,6 +25,7 @@ from liftcore.models import (
     SelectionSummary,
     SuggestedWords,
     Viewpoint,
+    WithUnits,
     takes,
 )
 
@@ -253,7 +253,6 @@ class Lift(BaseModel):
     created: Seconds
     file: Path = Field(exclude=True)
     parameters: dict[str, Any] = Field(exclude=True)
-    pack_count: int = Field(exclude=True)  # of the packs that it was made of; `features` are those that are here
 
     @computed_field
     @property
@@ -268,7 +267,7 @@ class Lift(BaseModel):
         """Return the lift of a row, in which the metadata of its file stand beside its own columns."""
         metadata, world = row["metadata"], row["world"]
         world = metadata.get("world") or {} if world is None else world
-        return cls(**metadata | row | {"pack_count": len(metadata["features"]), "world": world})
+        return cls(**metadata | row | {"world": world})
 
 
 class WorldUpdate(WorldFrame):
@@ -500,16 +499,18 @@ class LiftTree(SceneTree, OfLift):
     next: NextNumber
 
 
-class NamedObject(SceneObject):
+class NamedObject(SceneNode):
     """An object of a lift, with its name if a user gave it one."""
 
     hidden: bool = Field(description="true if a user hid it")
 
 
-class SceneObjects(ListedObjects, OfLift):
+class SceneObjects(WithUnits, OfLift):
     """Some of the objects of a lift, those with the largest total weight first."""
 
-    objects: tuple[NamedObject, ...]  # pyright: ignore[reportIncompatibleVariableOverride]
+    explanation: str = Field(description="why there are so many; or why there are none")
+    count: int = Field(description="of all pages")
+    objects: tuple[NamedObject, ...]
     encoder: str | None = Field(description="the text encoder of their names, without its file; null if unnamed")
     next: NextNumber
 

@@ -17,7 +17,6 @@ import threading
 import traceback
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import urlencode
@@ -27,7 +26,6 @@ import zstandard
 from liftcore import (
     Answer,
     Camera,
-    Catalogue,
     Kernel,
     Query,
     Scene,
@@ -144,8 +142,6 @@ class Answers:
             scene.world = world
         for name, bits in request.get("selections", {}).items():
             _select(scene, name, bits)
-        if "features" in request:
-            scene.find_packs([Path(pack) for pack in request["features"]])
         return scene
 
     def _warm_kernel(self, kernel: Kernel) -> None:
@@ -176,7 +172,7 @@ class Answers:
         def make() -> Answer:
             spec, scene = request["encoder"], self._scene(request)
             encoder = None if spec in (None, OWN_WORDS) else self._encoder(spec, request["encoder_version"])
-            return scene.answer([scene.prepare(Query(**request["query"]), encoder)])[0]
+            return scene.ask(Query(**request["query"]), encoder=encoder, places=False)
 
         return self._cache.get(_key(request, "query"), make)
 
@@ -203,12 +199,6 @@ class Answers:
             return self._scene(request).segment(words, encoder=encoder)
 
         return self._cache.get(_key(request, "words"), make)
-
-    def _named_objects(self, request: Request) -> Catalogue:
-        words, encoder = self._words(request)
-        return self._cache.get(
-            _key(request, "world", "catalogue"), lambda: self._scene(request).catalogue(words, encoder=encoder)
-        )
 
     def _named_tree(self, request: Request) -> SceneTree:
         words, encoder = self._words(request)
@@ -251,17 +241,15 @@ class Answers:
         return words.model_dump(mode="json")
 
     def _catalogue(self, request: Request) -> dict[str, Any]:
-        catalogue = self._named_objects(request)
-        count = len(catalogue.objects)
+        tree, labels = self._named_tree(request), request["object_labels"]
         first, last = request["first"], request["first"] + request["count"]
-        labels = request["object_labels"]
         objects = [
             item.model_dump(mode="json") | {"hidden": False} | _object_label(labels.get(str(item.id)))
-            for item in catalogue.objects[first:last]
+            for item in tree.objects[first:last]
         ]
-        world = {"world": catalogue.world.model_dump(mode="json"), "unit": catalogue.world.unit}
-        following = last if last < count else None
-        return {"explanation": catalogue.explanation, "count": count, "next": following, **world, "objects": objects}
+        count = len(tree.objects)
+        head = tree.model_dump(mode="json", exclude={"nodes"})
+        return head | {"count": count, "next": last if last < count else None, "objects": objects}
 
     def _tree(self, request: Request) -> dict[str, Any]:
         tree, first, last = self._named_tree(request), request["first"], request["first"] + request["count"]
@@ -336,13 +324,9 @@ class Answers:
             source = self._labelled_objects(request)
         return scene.blocks_of(source, request["what"], view=request["of_view"], suffix=request["suffix"])
 
-    def _labelled_objects(self, request: Request) -> Catalogue | SceneTree:
-        """Return the named objects of a lift by the names that people gave, with their parts."""
+    def _labelled_objects(self, request: Request) -> SceneTree:
+        """Return the tree of a lift with the names that people gave."""
         labels = {int(number): {"name": name} for number, (name, _) in request["object_labels"].items() if name}
-        if self._scene(request).node is None:
-            catalogue = self._named_objects(request)
-            objects = tuple(item.model_copy(update=labels.get(item.id)) for item in catalogue.objects)
-            return replace(catalogue, objects=objects)
         tree = self._named_tree(request)
         return tree.model_copy(
             update={"nodes": tuple(item.model_copy(update=labels.get(item.id)) for item in tree.nodes)}

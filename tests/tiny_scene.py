@@ -18,6 +18,7 @@ from safetensors.numpy import save
 
 WORDS = ("apple", "book", "lamp")
 CHANNELS = 8
+AXES = np.eye(3, CHANNELS).tolist()  # the vectors of the words
 SPLATS_A_CLUSTER = 20
 WIDTH, HEIGHT, FOCAL, DISTANCE = 32, 24, 30.0, 4.0
 VIEWS = {"left": -0.1, "middle": 0.0, "right": 0.1}  # name -> the camera's x

@@ -14,7 +14,7 @@ from liftcore.cli.segment import encoder_and_words
 from liftcore.errors import InvalidInput, InvalidQuery
 
 if TYPE_CHECKING:
-    from liftcore import Answer, Catalogue, Scene, Segmentation
+    from liftcore import Answer, Scene, Segmentation
     from liftcore.models import SceneTree
 
 CONTENT_BY_SUFFIX = {".json": "masks"}  # other suffixes: splats with labels
@@ -96,7 +96,7 @@ def run_render(options: argparse.Namespace) -> int:
     return 0
 
 
-def _source(options: argparse.Namespace, scene: Scene) -> Answer | Segmentation | Catalogue | SceneTree | int | None:
+def _source(options: argparse.Namespace, scene: Scene) -> Answer | Segmentation | SceneTree | int | None:
     from liftcore import Query
 
     if options.object is not None:
@@ -107,4 +107,4 @@ def _source(options: argparse.Namespace, scene: Scene) -> Answer | Segmentation 
     if options.words is not None or options.all_words:
         encoder, words = encoder_and_words(options, scene, options.words)
         return scene.segment(words, encoder=encoder, progress=True)
-    return None if scene.object is None else named_tree(options, scene)
+    return None if scene.object is None else named_tree(options, scene)[1]

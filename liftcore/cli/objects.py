@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 from liftcore.cli.options import Parser, add_encoder, add_splats, add_world, world_of
 from liftcore.cli.reply import check_outputs, lines_of, outputs_of, reply, write_files
 from liftcore.cli.segment import encoder_and_words
-from liftcore.errors import InvalidQuery
 
 if TYPE_CHECKING:
-    from liftcore import Catalogue, Scene, TextEncoder
+    from liftcore import Scene, TextEncoder
     from liftcore.models import SceneTree
 
 
@@ -24,47 +23,38 @@ def add_arguments(parser: Parser) -> None:
     add_encoder(parser)
     parser.add_argument("--tree", action="store_true", help="list parts and groups too")
     add_world(parser)
-    parser.add_argument("--features", action="store_true", help="with --json: mean features of objects")
-    parser.add_argument("--csv", type=Path, metavar="CSV", help="write the list as a table")
+    parser.add_argument("--csv", type=Path, metavar="CSV", help="write the objects as a table")
     parser.add_argument("--into", type=Path, metavar="FOLDER", help="write a PLY of each object")
     add_splats(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     """List the objects, or all nodes of the tree, and write the requested files."""
-    if options.tree and (options.csv or options.features):
-        option = "--csv" if options.csv else "--features"
-        raise InvalidQuery(option, expected="the list of objects", got="--tree", hint="--json has the tree")
     files = outputs_of(options)
     from liftcore import Scene
 
     scene = Scene(options.lift, splats=options.splats, world=world_of(options))
     check_outputs(files, options, scene)
-    encoder, words = _vocabulary(options, scene)
-    exports: dict[str, Any] = {}
-    if options.tree:
-        answer = scene.tree(words, encoder=encoder)
-        names = {node.id: "-".join(["object", *map(str, node.path)]) for node in answer.nodes}
-    else:
-        catalogue = scene.catalogue(words, encoder=encoder)
-        answer = catalogue.summary(features=options.features)
-        names = {entry.id: f"object-{entry.id}" for entry in catalogue.objects}
-        exports["csv"] = partial(scene.export, source=catalogue)
+    encoder, tree = named_tree(options, scene)
+    exports: dict[str, Any] = {"csv": partial(scene.export, source=tree, what="csv")}
+    if not options.tree:
+        tree = tree.model_copy(update={"count": len(tree.objects), "nodes": tree.objects})
+    names = {node.id: "-".join(["object", *map(str, node.path)]) for node in tree.nodes}
     if options.into:
         files |= {name: options.into / f"{name}.ply" for name in names.values()}
         exports |= {name: partial(scene.export, source=number) for number, name in names.items()}
         check_outputs(files, options, scene)
     document: dict[str, Any] = {"encoder": None if encoder is None else encoder.name}
-    document |= {"answer": answer.model_dump(mode="json"), "files": write_files(files, exports)}
+    document |= {"answer": tree.model_dump(mode="json"), "files": write_files(files, exports)}
     lines = [document["answer"]["explanation"], *lines_of(document)]
     reply(document, as_json=options.json, lines=lines)
     return 0
 
 
-def named_tree(options: argparse.Namespace, scene: Scene) -> Catalogue | SceneTree:
-    """Return the named objects of a lift, with parts and groups if the lift has them."""
+def named_tree(options: argparse.Namespace, scene: Scene) -> tuple[TextEncoder | None, SceneTree]:
+    """Return the encoder of the names, None without names; and the lift's objects with parts and groups."""
     encoder, words = _vocabulary(options, scene)
-    return (scene.catalogue if scene.node is None else scene.tree)(words, encoder=encoder)
+    return encoder, scene.tree(words, encoder=encoder)
 
 
 def _vocabulary(options: argparse.Namespace, scene: Scene) -> tuple[TextEncoder | None, list[str]]:

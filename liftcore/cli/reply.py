@@ -88,14 +88,13 @@ def lines_of(document: Mapping[str, Any]) -> Iterable[str]:
     for entry in answer.get("named_words", ()):
         yield f"  {entry['value']} {entry['word']}: {_facts(entry)}"
     for number, entry in enumerate(answer.get("objects", ()), 1):
-        head = f"  {entry['id']}{_name(entry)}" if "id" in entry else f"  object {number}"
-        yield f"{head}: {_facts(entry, unit, 'total weight' if 'id' in entry else 'selection')}"
+        yield f"  object {number}: {_facts(entry, unit, 'selection')}"
     nodes = {node["id"]: node for node in answer.get("nodes", ())}
-    stack = [node["id"] for node in nodes.values() if node["parent"] is None][::-1]
+    stack = [node["id"] for node in nodes.values() if node["parent"] not in nodes][::-1]
     while stack:
         node = nodes[stack.pop()]
         yield f"{'  ' * len(node['path'])}{node['id']}{_name(node)}, {node['kind']}: {_facts(node, unit)}"
-        stack += node["parts"][::-1]
+        stack += [part for part in node["parts"][::-1] if part in nodes]
     yield from (f"  {name.replace('_', ' ')}: {path}" for name, path in document["files"].items())
 
 

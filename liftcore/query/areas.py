@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from liftcore.errors import InvalidQuery, NotFound
-from liftcore.query.opened import OpenedLift, as_numpy
+from liftcore.query.scene import Scene, as_numpy
 from liftcore.query.scores import LEAST_LIKENESS, cosines_about, norms_of
 from liftcore.query.terms import AREAS, NOTATIONS, Area, Pixel, PixelBox, Stroke
 
@@ -29,7 +29,7 @@ BAND = 0.2  # of a box's side, on each side of it: 1.4 x 1.4 is twice the area
 REACH = 0.15  # of the band, into which the object may extend if the box is drawn too small
 
 
-def area_feature(scene: OpenedLift, area: Area) -> np.ndarray:
+def area_feature(scene: Scene, area: Area) -> np.ndarray:
     """Return the feature of an area of a camera's image, [F] f64; of a pixel as scores are rendered.
 
     Raises:
@@ -46,7 +46,7 @@ def area_feature(scene: OpenedLift, area: Area) -> np.ndarray:
     return _common(scene, rows, _rendered(scene, camera, None, around))
 
 
-def _camera(scene: OpenedLift, area: Area) -> Camera:
+def _camera(scene: Scene, area: Area) -> Camera:
     """Return the camera of an area; if no view is called "VIEW:box", `VIEW:box:x,y` is a box that lacks corners."""
     try:
         return scene.cameras[area.view]
@@ -96,7 +96,7 @@ def _line(corners: np.ndarray) -> np.ndarray:
     return np.unique(pixels, axis=1).T
 
 
-def _rendered(scene: OpenedLift, camera: Camera, area: Area | None, pixels: np.ndarray) -> np.ndarray:
+def _rendered(scene: Scene, camera: Camera, area: Area | None, pixels: np.ndarray) -> np.ndarray:
     """Compute ``sum_j A_ij x_j`` of the rays of pixels [n, 2] that hit the scene, [m, F] f64.
 
     Args:
@@ -107,7 +107,7 @@ def _rendered(scene: OpenedLift, camera: Camera, area: Area | None, pixels: np.n
     return np.stack(features) if features else np.zeros((0, scene.channels))
 
 
-def area_splats(scene: OpenedLift, area: Area) -> tuple[np.ndarray, np.ndarray]:
+def area_splats(scene: Scene, area: Area) -> tuple[np.ndarray, np.ndarray]:
     """Return the splats on the rays of an area's pixels, [n] i32 with repeats, and their weights there, [n] f32.
 
     Raises:
@@ -119,9 +119,7 @@ def area_splats(scene: OpenedLift, area: Area) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(splats), np.concatenate(weights)
 
 
-def _rays(
-    scene: OpenedLift, camera: Camera, area: Area | None, pixels: np.ndarray
-) -> list[tuple[np.ndarray, np.ndarray]]:
+def _rays(scene: Scene, camera: Camera, area: Area | None, pixels: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the splats and their weights on each ray that hits the scene; arguments as of `_rendered`."""
     import torch
 
@@ -148,7 +146,7 @@ def _rays(
     ]
 
 
-def _common(scene: OpenedLift, rows: np.ndarray, around: np.ndarray) -> np.ndarray:
+def _common(scene: Scene, rows: np.ndarray, around: np.ndarray) -> np.ndarray:
     """Return the common feature [F] f64 of the pixels [n, F] of an area, other than that of the band [m, F]."""
     lengths = np.linalg.norm(rows, axis=1, keepdims=True)
     units = (rows / np.maximum(lengths, np.finfo(np.float64).tiny)).astype(np.float32)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,7 +13,6 @@ from liftcore.errors import InvalidQuery
 from liftcore.io.json_file import finite
 from liftcore.query.candidates import candidates, parts_of
 from liftcore.query.directions import directions, part_phrase, read_query, table_of, unknown_part, wordings
-from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.presence import (
     NOT_IN_WORDS,
     References,
@@ -37,6 +35,7 @@ from liftcore.query.question import (
     TopSplat,
     WordMatch,
 )
+from liftcore.query.scene import Scene, as_numpy
 from liftcore.query.scores import LEAST_LIKENESS, LOWEST_COSINE, combine, cosines, cosines_about
 from liftcore.query.selection import (
     LEAST_FIRST,
@@ -52,7 +51,6 @@ from liftcore.query.selection import (
 )
 from liftcore.query.terms import Vector
 from liftcore.query.threshold import explain_no_selection, find_threshold, has_one_mode
-from liftcore.runtime.cores import cores
 from liftcore.runtime.one_thread import one_thread
 from liftcore.text import TextEncoder
 from liftcore.text.phrases import PartPhrase
@@ -66,8 +64,6 @@ LEAST_OF_WHOLE = 0.1  # of what a word selects in the whole scene, from which it
 SAME_AS_WORD = 0.9  # cosine of all splats to a word without competitors, from which all are of it
 SAME_AS_EXAMPLE = 0.98  # the same of an example: features of one encoder are more alike
 MOST_COMPARED = 4_096  # splats that are compared with an example
-_OF_ANSWER = ("rivals", "candidates", "threshold", "clear", "statistics", "present", "presence", "reason")
-_QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 
 
 @dataclass(frozen=True)
@@ -94,7 +90,7 @@ class PartQuery:
     part: ResolvedQuery
 
 
-def ask(scene: OpenedLift, query: Query | str, encoder: TextEncoder | None = None) -> Answer:
+def ask(scene: Scene, query: Query | str, encoder: TextEncoder | None = None) -> Answer:
     """Score every splat for a query and select those that answer it.
 
     The threshold `auto` comes from a histogram of scores, in which each splat counts by its total weight, as splats
@@ -111,23 +107,19 @@ def ask(scene: OpenedLift, query: Query | str, encoder: TextEncoder | None = Non
 
     Raises:
         InvalidQuery: a text without an encoder of the lift's space, or a term that has no feature.
-        NotFound: an example names a view or a region that does not exist.
+        NotFound: an example names a view that does not exist.
         InvalidLift: an example needs the scene's files, and they moved or changed.
     """
     query = Query.of(query) if isinstance(query, str) else query
-    return answers(scene, [resolve_query(scene, query, encoder)])[0]
+    return answer_of(scene, resolve_query(scene, query, encoder))
 
 
-def ask_vectors(
-    scene: OpenedLift, positives: Any, negatives: Any = (), references: Any = None, **fields: Any
-) -> Answer:
+def ask_vectors(scene: Scene, positives: Any, negatives: Any = (), **fields: Any) -> Answer:
     """Answer a query of vectors of the lift's text space, which count as words.
 
     Args:
         scene: an opened lift.
         positives: the target: [n, F] or [F], torch or numpy, rows of any length above zero. negatives: likewise.
-        references: [n, F], the vectors of 200 words or more, to estimate presence; None = those of the lift's text
-            space, if it has some (`liftcore.query.presence`).
         fields: of `Query`.
 
     Raises:
@@ -135,11 +127,8 @@ def ask_vectors(
     """
     query = Query.of(_vectors(positives), _vectors(negatives), **fields)
     rows = directions(scene, query, None)
-    if references is None:
-        reference_words = references_of_space(rows, scene.metadata.text_space)
-    else:
-        reference_words = References.of(references, scene.channels)
-    return answers(scene, [ResolvedQuery(query, rows, np.ones(len(rows), np.bool_), reference_words, {})])[0]
+    references = references_of_space(rows, scene.metadata.text_space)
+    return answer_of(scene, ResolvedQuery(query, rows, np.ones(len(rows), np.bool_), references, {}))
 
 
 def _vectors(values: Any) -> tuple[Vector, ...]:
@@ -153,33 +142,26 @@ def _vectors(values: Any) -> tuple[Vector, ...]:
     return tuple(Vector(tuple(row.tolist())) for row in np.atleast_2d(rows)) if rows.size else ()
 
 
-def resolve_query(
-    scene: OpenedLift, query: Query, encoder: TextEncoder | None, names: Sequence[str] = ()
-) -> ResolvedQuery:
-    """Resolve the terms of a query to directions; all errors of a query are raised here (see `ask`).
-
-    Args:
-        names: of the terms in errors; () = their own texts.
-    """
-    query, names, phrases = read_query(scene, query, encoder, names)
+def resolve_query(scene: Scene, query: Query, encoder: TextEncoder | None) -> ResolvedQuery:
+    """Resolve the terms of a query to directions; all errors of a query are raised here (see `ask`)."""
+    query, phrases = read_query(scene, query, encoder)
     phrase = part_phrase(scene, query, encoder)
     if phrase is None:
-        request = _resolve(scene, query, encoder, names)
+        request = _resolve(scene, query, encoder)
         as_typed = {
             index: Wording(typed, request.asked_as[index].word, form) for index, (typed, form) in phrases.items()
         }
         missing = unknown_part(scene, query, encoder)
         return replace(request, asked_as={**request.asked_as, **as_typed}, unknown_part=missing)
     object_query = _resolve(scene, Query(text=[phrase.object_phrase], absent=query.absent), encoder)
-    request = _resolve(scene, query, encoder, names) if not phrase.sure else replace(object_query, query=query)
-    return replace(request, part=PartQuery(phrase, object_query, _resolve(scene, query, encoder, names, phrase)))
+    request = _resolve(scene, query, encoder) if not phrase.sure else replace(object_query, query=query)
+    return replace(request, part=PartQuery(phrase, object_query, _resolve(scene, query, encoder, phrase)))
 
 
 def _resolve(
-    scene: OpenedLift,
+    scene: Scene,
     query: Query,
     encoder: TextEncoder | None,
-    names: Sequence[str] = (),
     phrase: PartPhrase | None = None,
 ) -> ResolvedQuery:
     """Resolve a query as a whole, or for the part that a phrase names.
@@ -188,10 +170,10 @@ def _resolve(
     phrase, which is more specific.
     """
     words = np.array([isinstance(term, str) for term in query.terms], np.bool_)
-    asked_as = wordings(scene, query, encoder, names)
+    asked_as = wordings(scene, query, encoder)
     if phrase is not None and table_of(encoder or scene.table) is not None:
         asked_as = asked_as | {0: Wording(query.text[0], phrase.part, "part")}
-    rows = directions(scene, query, encoder, names, asked_as)
+    rows = directions(scene, query, encoder, asked_as)
     if phrase is not None:
         asked_as = asked_as | {0: Wording(query.text[0], str(phrase), "part")}
     encoder = encoder or scene.table
@@ -203,20 +185,12 @@ def _resolve(
 
 
 @one_thread()
-def answers(scene: OpenedLift, requests: Sequence[ResolvedQuery]) -> list[Answer]:
-    """Answer several queries in one pass over the features; each to the same bits as alone."""
-    if any(request.part for request in requests):
-        return [
-            _part_answer(scene, request) if request.part else answers(scene, [request])[0] for request in requests
-        ]
-    similarities = _similarities(scene, requests)
-    if len(requests) == 1:
-        return [_answer(scene, requests[0], similarities[0])]
-    with ThreadPoolExecutor(cores()) as pool:
-        return list(pool.map(lambda request, similar: _answer(scene, request, similar), requests, similarities))
+def answer_of(scene: Scene, request: ResolvedQuery) -> Answer:
+    """Answer a resolved query."""
+    return _part_answer(scene, request) if request.part else _answer(scene, request, _similarities(scene, request))
 
 
-def _part_answer(scene: OpenedLift, request: ResolvedQuery) -> Answer:
+def _part_answer(scene: Scene, request: ResolvedQuery) -> Answer:
     """Answer a query for a part of an object: the object first, then the part among its splats and nodes alone.
 
     A phrase that may not mean a part (`PartPhrase`) is answered as a whole unless most of such a part, and a share of
@@ -224,32 +198,29 @@ def _part_answer(scene: OpenedLift, request: ResolvedQuery) -> Answer:
     """
     assert request.part is not None
     phrase, part = request.part.phrase.object_phrase, request.part.part
-    (object_answer,) = answers(scene, [request.part.whole_query])
+    object_answer = answer_of(scene, request.part.whole_query)
     if object_answer.count:
         inside = add_objects(scene, object_answer.selected)
-        (answer,) = answers(scene.within(inside), [part])
+        answer = answer_of(scene.within(inside), part)
         note = "" if answer.count or answer.present is False else " Nothing stands out there."
         reason = f"{phrase!r} has {object_answer.count:,} splats. Within it: {answer.reason}{note}"
         if answer.count >= WHOLE_SHARE * inside.sum() and request.query.absent == "drop":
             reason = f"{phrase!r} is there, but {part.query.text[0]!r} tells no part of it from the rest."
-            fields = {name: getattr(answer, name) for name in _OF_ANSWER} | {"clear": False, "present": False}
-            answer = Answer.of(answer.query, answer.scores, answer.has_feature, np.zeros_like(inside), **fields)
+            answer = answer.with_selected(np.zeros_like(inside), request.query, clear=False, present=False)
     else:
         answer, note = object_answer, "it" if object_answer.present is False else f"{phrase!r} is not found, and"
         reason = f"{object_answer.reason} So {note} has no parts."
     if not request.part.phrase.sure:
-        whole = answers(scene, [replace(request, part=None)])[0]
+        whole = answer_of(scene, replace(request, part=None))
         shared = int((answer.selected & whole.selected).sum())
         if shared <= max(answer.count / 2, LEAST_OF_WHOLE * whole.count):
             return whole
-    fields = {name: getattr(answer, name) for name in _OF_ANSWER} | {"reason": reason}
-    if object_answer.present is False:
-        fields |= {"present": False, "presence": object_answer.presence}
     wording = tuple(WordMatch(**word._asdict()) for word in part.asked_as.values() if word.match)
-    return Answer.of(request.query, answer.scores, answer.has_feature, answer.selected, **fields, wording=wording)
+    changes = {"present": False, "presence": object_answer.presence} if object_answer.present is False else {}
+    return answer.with_selected(answer.selected, request.query, reason=reason, wording=wording, **changes)
 
 
-def locate(scene: OpenedLift, answer: Answer, count: int | None = None) -> Answer:
+def locate(scene: Scene, answer: Answer, count: int | None = None) -> Answer:
     """Add to an answer its best splats, and the box around all selected ones.
 
     A single outlier stretches the box; boxes of ``objects`` are without outliers.
@@ -275,7 +246,7 @@ def locate(scene: OpenedLift, answer: Answer, count: int | None = None) -> Answe
     return answer.model_copy(update={"top": top, "box": Box(*map(_point, ends)) if ends else None})
 
 
-def best_view(scene: OpenedLift, answer: Answer) -> str | None:
+def best_view(scene: Scene, answer: Answer) -> str | None:
     """Return the view that shows most of the object with the most selected splats, or else the first view."""
     views, objects = scene.metadata.views, scene.object
     if scene.object_views is not None and objects is not None and (answer.selected & (objects >= 0)).any():
@@ -284,26 +255,18 @@ def best_view(scene: OpenedLift, answer: Answer) -> str | None:
     return views[0] if views else None
 
 
-def _similarities(scene: OpenedLift, requests: Sequence[ResolvedQuery]) -> list[np.ndarray]:
-    """Compute for each query the cosines of every row of the features to each of its terms, [K, n] f32."""
-    features, norms = scene.features.rows, scene.features.norms
-    of_words = np.concatenate([request.rows[request.by_cosine] for request in requests])
-    # A row a word from here on, so that its scores are contiguous.
-    columns = iter(np.ascontiguousarray(cosines(features, norms, of_words).T) if len(of_words) else ())
-    output = []
-    for request in requests:
-        similar = np.empty((len(request.rows), len(features)), np.float32)
-        if not request.by_cosine.all():
-            similar[~request.by_cosine] = cosines_about(
-                features, norms, scene.mean, request.rows[~request.by_cosine]
-            ).T
-        for row in np.flatnonzero(request.by_cosine):
-            similar[row] = next(columns)
-        output.append(similar.T)
-    return output
+def _similarities(scene: Scene, request: ResolvedQuery) -> np.ndarray:
+    """Compute the cosines of every row of the features to each term of a query, [K, n] f32."""
+    features, norms, of_words = scene.features.rows, scene.features.norms, request.by_cosine
+    similar = np.empty((len(of_words), len(features)), np.float32)  # a row a term, so that its scores are contiguous
+    if of_words.any():
+        similar[of_words] = cosines(features, norms, request.rows[of_words]).T
+    if not of_words.all():
+        similar[~of_words] = cosines_about(features, norms, scene.mean, request.rows[~of_words]).T
+    return similar.T
 
 
-def _answer(scene: OpenedLift, request: ResolvedQuery, similarities: np.ndarray) -> Answer:
+def _answer(scene: Scene, request: ResolvedQuery, similarities: np.ndarray) -> Answer:
     query, has_feature, rows = request.query, scene.has_feature, scene.distinct
     if query.sets:
         return _set_answer(scene, query)
@@ -336,7 +299,7 @@ def _answer(scene: OpenedLift, request: ResolvedQuery, similarities: np.ndarray)
         # The part has no word, so the reason names the object that was selected.
         sentence = presence.reason.replace(repr(query.text[0]), repr(request.unknown_part.object_phrase))
         presence = presence.model_copy(
-            update={"reason": f"{sentence} {_without_word(request.unknown_part, len(nodes))}", "comparison": None}
+            update={"reason": f"{sentence} {_without_word(request.unknown_part, len(nodes))}"}
         )
     wording = tuple(WordMatch(**word._asdict()) for word in request.asked_as.values() if word.match)
     return Answer.of(
@@ -355,7 +318,7 @@ def _without_word(phrase: PartPhrase, parts: int) -> str:
 
 
 def _nearer_words(
-    scene: OpenedLift, request: ResolvedQuery, scores: np.ndarray, selected: np.ndarray, least: float
+    scene: Scene, request: ResolvedQuery, scores: np.ndarray, selected: np.ndarray, least: float
 ) -> tuple[str, ...]:
     """Return reference words that are the nearest of all to a share of the selected splats, or else the best ones."""
     references, positives = request.references, len(request.query.positives)
@@ -378,7 +341,7 @@ def _nearer_words(
     return tuple(references.words[row].replace("_", " ") for row in order.tolist() if shares[row] >= least)
 
 
-def _set_answer(scene: OpenedLift, query: Query) -> Answer:
+def _set_answer(scene: Scene, query: Query) -> Answer:
     """Answer a query of sets: a score of one for their splats and zero for the others, also without a feature."""
     members = np.zeros(len(scene.features), np.bool_)
     for splat_set in query.splat_sets:
@@ -393,7 +356,7 @@ def _set_answer(scene: OpenedLift, query: Query) -> Answer:
 
 
 def _select(
-    scene: OpenedLift, request: ResolvedQuery, mask: np.ndarray, scores: np.ndarray
+    scene: Scene, request: ResolvedQuery, mask: np.ndarray, scores: np.ndarray
 ) -> tuple[Threshold, np.ndarray]:
     """Return the threshold of a query and the selected splats, [P] bool.
 
@@ -418,7 +381,7 @@ def _select(
 
 
 def _select_rows(
-    scene: OpenedLift, request: ResolvedQuery, mask: np.ndarray, scores: np.ndarray
+    scene: Scene, request: ResolvedQuery, mask: np.ndarray, scores: np.ndarray
 ) -> tuple[Threshold, np.ndarray, CompetingWords | None]:
     """Return the threshold of a query, the splats above it, [P] bool, and the words by which objects correct them."""
     query, positives = request.query, len(request.query.positives)
@@ -469,7 +432,7 @@ def _select_rows(
 
 
 def _are_of_word(
-    scene: OpenedLift, valid_scores: np.ndarray, scores: np.ndarray, competitors: Sequence[CompetingWords]
+    scene: Scene, valid_scores: np.ndarray, scores: np.ndarray, competitors: Sequence[CompetingWords]
 ) -> bool:
     """Return True if scores without a valley are those of the word: against competing words, or by themselves."""
     if competitors:
@@ -477,7 +440,7 @@ def _are_of_word(
     return float(valid_scores.min()) >= SAME_AS_WORD
 
 
-def _is_one_thing(scene: OpenedLift, example: np.ndarray) -> bool:
+def _is_one_thing(scene: Scene, example: np.ndarray) -> bool:
     """Return True if a scene is alike to an example [F], and no valley parts it without the most similar splat."""
     rows = np.flatnonzero(scene.has_feature)
     rows = rows[:: -(-len(rows) // MOST_COMPARED) or 1]
@@ -489,7 +452,7 @@ def _is_one_thing(scene: OpenedLift, example: np.ndarray) -> bool:
     return not len(values) or has_one_mode(values, find_threshold(values, "auto", weights).value, weights)
 
 
-def _select_all(scene: OpenedLift, valid_scores: np.ndarray) -> tuple[Threshold, np.ndarray]:
+def _select_all(scene: Scene, valid_scores: np.ndarray) -> tuple[Threshold, np.ndarray]:
     """Return the threshold of a scene of one thing, and all of its splats, [P] bool."""
     low, explanation = (
         float(valid_scores.min()),
@@ -499,7 +462,7 @@ def _select_all(scene: OpenedLift, valid_scores: np.ndarray) -> tuple[Threshold,
 
 
 def _select_each(
-    scene: OpenedLift, request: ResolvedQuery, mask: np.ndarray, similarities: np.ndarray, words: np.ndarray
+    scene: Scene, request: ResolvedQuery, mask: np.ndarray, similarities: np.ndarray, words: np.ndarray
 ) -> tuple[Threshold, np.ndarray]:
     """Return the lowest threshold of several words, and the splats that one of them selects by its own, [P] bool.
 
@@ -535,7 +498,7 @@ def _competing_words(request: ResolvedQuery, directions: np.ndarray) -> list[Com
     return [words for words in competitors if len(words.vectors)]
 
 
-def _presence(scene: OpenedLift, request: ResolvedQuery, similarities: np.ndarray) -> tuple[Presence, np.ndarray]:
+def _presence(scene: Scene, request: ResolvedQuery, similarities: np.ndarray) -> tuple[Presence, np.ndarray]:
     """Return the presence of the positives, and the terms that count, [n] bool: all, or without absent words."""
     mask, positives = np.ones(len(request.rows), np.bool_), len(request.query.positives)
     words = np.flatnonzero(request.by_cosine[:positives]).tolist()
@@ -549,25 +512,18 @@ def _presence(scene: OpenedLift, request: ResolvedQuery, similarities: np.ndarra
     ]
     presence = any_present(presences)
     if presence.present is False and len(words) < positives:  # examples may be present
-        presence = presence.model_copy(update={"present": None, "comparison": None})
+        presence = presence.model_copy(update={"present": None})
     if presence.present is not False and request.query.absent == "drop":
         mask[[k for k, word in zip(words, presences, strict=True) if word.present is False]] = False
     return presence, mask
 
 
 def _statistics(scores: np.ndarray, counts: np.ndarray | None) -> dict[str, float]:
-    """Return the ends, mean and quantiles of scores [n] f32, each of ``counts`` [n] splats; None: of one."""
-    if len(scores) == 0:
+    """Return the least, the largest and the mean of scores [n] f32, each of ``counts`` [n] splats; None: of one."""
+    if not len(scores):
         return {}
-    if counts is None:
-        mean = scores.mean(dtype=np.float64)
-        last, ordered = np.arange(len(scores)), np.sort(scores)  # faster than selecting seven order statistics
-    else:
-        mean, order = np.average(scores.astype(np.float64), weights=counts), np.argsort(scores)
-        last, ordered = np.cumsum(counts[order]) - 1, scores[order]
-    ends = np.searchsorted(last, [round(q * last[-1]) for q in _QUANTILES])
-    quantiles = {f"q{round(100 * q):02d}": float(ordered[end]) for q, end in zip(_QUANTILES, ends, strict=True)}
-    return {"min": float(ordered[0]), "max": float(ordered[-1]), "mean": float(mean), **quantiles}
+    mean = np.average(scores.astype(np.float64), weights=counts)
+    return {"min": float(scores.min()), "max": float(scores.max()), "mean": float(mean)}
 
 
 def _point(row: np.ndarray) -> Point:

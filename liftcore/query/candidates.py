@@ -13,8 +13,8 @@ from __future__ import annotations
 import numpy as np
 
 from liftcore.query.areas import area_splats
-from liftcore.query.opened import OpenedLift
 from liftcore.query.question import Candidate, Query
+from liftcore.query.scene import Scene
 from liftcore.query.terms import Area, SplatSet, SplatTerm, Term
 
 MOST_PARTS = 8  # candidates for a word, the largest
@@ -22,7 +22,7 @@ TWIN_SHARE = 0.75  # of the splats of a whole: mistakes of masks leave such part
 ROOT_SHARE = 0.25  # of the weight at the click: less is visible through the object, or lies next to it
 
 
-def candidates(scene: OpenedLift, query: Query) -> tuple[Candidate, ...]:
+def candidates(scene: Scene, query: Query) -> tuple[Candidate, ...]:
     """Return the nested nodes that examples of places may mean, the smallest first; () for words and vectors.
 
     Raises:
@@ -50,7 +50,7 @@ def candidates(scene: OpenedLift, query: Query) -> tuple[Candidate, ...]:
     return tuple(reversed(nodes))
 
 
-def parts_of(scene: OpenedLift, objects: np.ndarray) -> tuple[Candidate, ...]:
+def parts_of(scene: Scene, objects: np.ndarray) -> tuple[Candidate, ...]:
     """Return at most `MOST_PARTS` parts of some objects [N] bool, the largest first, with their shares of these."""
     if scene.node_parents is None or scene.object is None:
         return ()
@@ -65,7 +65,7 @@ def parts_of(scene: OpenedLift, objects: np.ndarray) -> tuple[Candidate, ...]:
     return tuple(sorted(parts, key=lambda c: (-c.share, c.id))[:MOST_PARTS])
 
 
-def _path(scene: OpenedLift, example: Term) -> dict[int, float]:
+def _path(scene: Scene, example: Term) -> dict[int, float]:
     """Return the nodes at an example's place, the largest first, and the share of its weight in each."""
     if isinstance(example, SplatTerm):
         rows, weights = np.array([example.splat]), np.ones(1)
@@ -91,7 +91,7 @@ def _path(scene: OpenedLift, example: Term) -> dict[int, float]:
     return path
 
 
-def _candidate(scene: OpenedLift, node: int, share: float) -> Candidate:
+def _candidate(scene: Scene, node: int, share: float) -> Candidate:
     node_set = SplatSet("object", str(node))
     confidence = None if scene.node_confidence is None else float(scene.node_confidence[node])
     splats = int(scene.members(node).sum())

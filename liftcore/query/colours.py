@@ -1,6 +1,5 @@
 """Colours of scores and clusters: perceptually even arcs through OKLab (Ottosson 2020)."""
 
-import functools
 import math
 
 import numpy as np
@@ -16,9 +15,9 @@ _MAP_HUE = (math.radians(300), math.radians(105))
 _MAP_CHROMA = (0.10, 0.17)
 _HEAT_RANGE = (0.01, 0.999)  # quantiles that the map spans: one high outlier does not darken the picture
 
-_CLUSTER_LIGHTNESS = (0.72, 0.86, 0.58)
+_CLUSTER_LIGHTNESS = (0.72, 0.86, 0.58, 0.79)
 _CLUSTER_CHROMA = 0.13
-_HUES = 72
+_GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
 def colour_map() -> np.ndarray:
@@ -54,25 +53,14 @@ def map_colours(level: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 
 def cluster_colours(count: int) -> np.ndarray:
-    """Return a colour a cluster, and grey last for label -1, [count + 1, 3] u8 sRGB; beyond 216 they repeat."""
-    colours = _distinct_colours()[np.arange(count) % len(_distinct_colours())]
-    return np.concatenate([colours, np.array([NO_CLUSTER_COLOUR], dtype=np.uint8)])
+    """Return a colour a cluster, and grey last for label -1, [count + 1, 3] u8 sRGB.
 
-
-@functools.cache
-def _distinct_colours() -> np.ndarray:
-    """Return colours [216, 3] u8 sRGB, each as far as possible from all before it (Gonzalez 1985).
-
-    Lightness counts half, as the shading of a scene changes the lightness of the colours painted over it.
+    Hues are a golden angle apart, so that any number of them in a row differ; four values of lightness alternate.
     """
-    hue, lightness = np.meshgrid(np.linspace(0, 2 * np.pi, _HUES, endpoint=False), _CLUSTER_LIGHTNESS)
-    hue, lightness = hue.ravel(), lightness.ravel()
-    places = np.stack([_CLUSTER_CHROMA * np.cos(hue), _CLUSTER_CHROMA * np.sin(hue), lightness / 2], axis=1)
-    order, nearest = [0], np.full(len(places), np.inf)
-    while len(order) < len(places):
-        nearest = np.minimum(nearest, np.linalg.norm(places - places[order[-1]], axis=1))
-        order.append(int(nearest.argmax()))
-    return _srgb(lightness[order], *places[order, :2].T)
+    number = np.arange(count)
+    hue, lightness = number * _GOLDEN_ANGLE, np.array(_CLUSTER_LIGHTNESS)[number % len(_CLUSTER_LIGHTNESS)]
+    colours = _srgb(lightness, _CLUSTER_CHROMA * np.cos(hue), _CLUSTER_CHROMA * np.sin(hue))
+    return np.concatenate([colours, np.array([NO_CLUSTER_COLOUR], dtype=np.uint8)])
 
 
 def _srgb(lightness: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -4,47 +4,38 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from liftcore.errors import InvalidQuery, NotFound
 from liftcore.query.areas import area_feature
-from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.presence import references_of
 from liftcore.query.question import Query, SuggestedWord, SuggestedWords
-from liftcore.query.terms import Area, Example, Region, SplatSet, SplatTerm, Term, Vector, parse_example
+from liftcore.query.scene import Scene, as_numpy
+from liftcore.query.terms import Area, Example, SplatSet, SplatTerm, Term, Vector, parse_example
 from liftcore.text import CachingEncoder, TextEncoder, check_texts
 from liftcore.text.phrases import PartPhrase, part_phrases, read_phrase
 from liftcore.text.table import TableEncoder
 from liftcore.text.wording import Wording, shipped_words
 
-if TYPE_CHECKING:
-    from liftcore.values.views import Regions
-
 
 class ReadQuery(NamedTuple):
     """A query whose texts are names, and the phrases that they were read from."""
 
-    query: Query
-    names: tuple[str, ...]  # of the terms in errors; () = their own texts
+    query: Query  # with the places of the phrases, for errors
     phrases: Mapping[int, tuple[str, str]]  # by the index of a term: the phrase, and "list" or "negation"
 
 
-def read_query(scene: OpenedLift, query: Query, encoder: TextEncoder | None, names: Sequence[str] = ()) -> ReadQuery:
+def read_query(scene: Scene, query: Query, encoder: TextEncoder | None) -> ReadQuery:
     """Read the texts of a query (`liftcore.text.phrases`): a list is several, a negation has negatives too.
-
-    Args:
-        names: of the terms in errors; () = their own texts.
 
     Raises:
         InvalidQuery: a phrase that scores cannot answer, or one of another form among several.
     """
-    source, term_names = table_of(encoder or scene.table), _Names(query.terms, names)
+    source = table_of(encoder or scene.table)
     is_word = None if source is None else source.vocabulary.has_word
     terms = list[tuple[bool, bool, int, str, Term]]()  # negative, example, index in the query, form, and the term
     for place, term in enumerate(query.terms):
@@ -52,7 +43,7 @@ def read_query(scene: OpenedLift, query: Query, encoder: TextEncoder | None, nam
         if not isinstance(term, str):
             terms.append((is_negative, True, place, "", term))
             continue
-        with term_names(place):
+        with _errors_of(query, place):
             check_texts([term])
             reading = read_phrase(term, is_word)
             if is_negative and reading.negatives:
@@ -66,23 +57,18 @@ def read_query(scene: OpenedLift, query: Query, encoder: TextEncoder | None, nam
         for _, is_example, place, _, name in terms:
             part = None if is_example else source.vocabulary.find_part(str(name))
             if part is not None and part.sure:
-                with term_names(place):
-                    raise InvalidQuery("text", expected="a part of an object alone", got=repr(name))
+                raise InvalidQuery(query.places[place], expected="a part of an object alone", got=repr(name))
     phrases = {index: (str(query.terms[place]), form) for index, (_, _, place, form, _) in enumerate(terms) if form}
     if not phrases:
-        return ReadQuery(query, tuple(names), {})
+        return ReadQuery(query, {})
     options = Query.model_fields.keys() - {"text", "like", "negatives", "unlike"}
     read = Query.of(positives, negatives, **{name: getattr(query, name) for name in options})
-    return ReadQuery(read, tuple(names[place] for _, _, place, _, _ in terms) if names else (), phrases)
+    vars(read)["places"] = [query.places[place] for _, _, place, _, _ in terms]
+    return ReadQuery(read, phrases)
 
 
-def wordings(
-    scene: OpenedLift, query: Query, encoder: TextEncoder | None, names: Sequence[str] = ()
-) -> dict[int, Wording]:
+def wordings(scene: Scene, query: Query, encoder: TextEncoder | None) -> dict[int, Wording]:
     """Return the wording of each text among the terms, by its index: the word of a table, else the text itself.
-
-    Args:
-        names: of the terms in errors; () = their own texts.
 
     Raises:
         InvalidQuery: no word of the table stands for a text; ``nearest`` has words that do.
@@ -93,7 +79,7 @@ def wordings(
         return {place: Wording(text, text, "") for place, text in texts.items()}
     by_place: dict[int, Wording] = {}
     for place, text in texts.items():
-        with _Names(query.terms, names)(place):
+        with _errors_of(query, place):
             check_texts([text])
             word = source.vocabulary.find(text)
             if word is None:
@@ -108,7 +94,7 @@ def table_of(encoder: TextEncoder | None) -> TableEncoder | None:
     return source if isinstance(source, TableEncoder) else None
 
 
-def part_phrase(scene: OpenedLift, query: Query, encoder: TextEncoder | None) -> PartPhrase | None:
+def part_phrase(scene: Scene, query: Query, encoder: TextEncoder | None) -> PartPhrase | None:
     """Return the part of an object that the only positive of a query names; None if it names no part.
 
     A text that a table has as a word names no part; nor does one of the shipped words, with any other encoder.
@@ -123,7 +109,7 @@ def part_phrase(scene: OpenedLift, query: Query, encoder: TextEncoder | None) ->
     return part or next((phrase for phrase in part_phrases(query.text[0]) if phrase.sure), None)
 
 
-def unknown_part(scene: OpenedLift, query: Query, encoder: TextEncoder | None) -> PartPhrase | None:
+def unknown_part(scene: Scene, query: Query, encoder: TextEncoder | None) -> PartPhrase | None:
     """Return the part that the only positive of a query names and the table has no word for, as typed; else None."""
     source = table_of(encoder or scene.table)
     if source is None or len(query.positives) != 1 or not query.text:
@@ -131,7 +117,7 @@ def unknown_part(scene: OpenedLift, query: Query, encoder: TextEncoder | None) -
     return source.vocabulary.unknown_part(query.text[0])
 
 
-def askable_words(scene: OpenedLift, encoder: TextEncoder, text: str, count: int) -> SuggestedWords:
+def askable_words(scene: Scene, encoder: TextEncoder, text: str, count: int) -> SuggestedWords:
     """Suggest words to query a lift by (`Scene.askable`)."""
     source = table_of(encoder)
     if source is not None:
@@ -143,7 +129,7 @@ def askable_words(scene: OpenedLift, encoder: TextEncoder, text: str, count: int
     return SuggestedWords(open_vocabulary=True, words=(), scene_words=scene_words)
 
 
-def object_words(scene: OpenedLift, words: Sequence[str], vectors: np.ndarray) -> tuple[str, ...]:
+def object_words(scene: Scene, words: Sequence[str], vectors: np.ndarray) -> tuple[str, ...]:
     """Return the nearest word of each of the lift's objects, without repeats, the largest total weight first.
 
     An object is left out if its word is not among the nearest hundredth also about the scene's mean: the word may be
@@ -163,60 +149,45 @@ def object_words(scene: OpenedLift, words: Sequence[str], vectors: np.ndarray) -
 
 
 def directions(
-    scene: OpenedLift,
+    scene: Scene,
     query: Query,
     encoder: TextEncoder | None,
-    names: Sequence[str] = (),
     asked_as: Mapping[int, Wording] | None = None,
 ) -> np.ndarray:
     """Return the unit vector of every term, [n, F] f32.
 
     Args:
-        names: of the terms in errors; () = their own texts.
         asked_as: of the texts (`wordings`); None: computed here.
 
     Raises:
         InvalidQuery: a text without an encoder or with one of another space, a text that it cannot encode, or an
             example without a feature: outside the image, on a ray that misses the scene, of another length.
-        NotFound: an example names a view or a region that does not exist.
-        InvalidLift: the splats, the cameras or the packs that an example needs moved or changed.
+        NotFound: an example names a view that does not exist.
+        InvalidLift: the splats or the cameras that an example needs moved or changed.
     """
-    term_names = _Names(query.terms, names)
-    rows = _encode(scene, query, encoder, term_names, asked_as) | _regions(scene, query, term_names)
+    rows = _encode(scene, query, encoder, asked_as)
     for place, term in enumerate(query.terms):
-        if not isinstance(term, str | Region):
-            with term_names(place):
+        if not isinstance(term, str):
+            with _errors_of(query, place):
                 rows[place] = _unit(_feature(scene, term), "vector" if isinstance(term, Vector) else str(term))
     empty = np.zeros((0, scene.channels), np.float32)  # of a query of sets
     return np.stack([rows[place] for place in range(len(query.terms))]) if rows else empty
 
 
-@dataclass(frozen=True)
-class _Names:
-    """Context that raises the errors of a term again under its name, if it has one."""
-
-    terms: Sequence[Term]
-    names: Sequence[str]
-
-    @contextmanager
-    def __call__(self, place: int) -> Iterator[None]:
-        try:
-            yield
-        except (InvalidQuery, NotFound) as error:
-            if not self.names:
-                raise
-            term = self.terms[place]
-            got = error.got if isinstance(term, str | Vector) else f"{error.got} in {term}"
-            name, hint, nearest = self.names[place], error.hint, error.nearest
-            raise type(error)(name, expected=error.expected, got=got, hint=hint, nearest=nearest) from None
+@contextmanager
+def _errors_of(query: Query, place: int) -> Iterator[None]:
+    """Raise the errors of a term again under its place in the query."""
+    try:
+        yield
+    except (InvalidQuery, NotFound) as error:
+        term, name = query.terms[place], query.places[place]
+        got = error.got if isinstance(term, str | Vector) else f"{error.got} in {term}"
+        hint, nearest = error.hint, error.nearest
+        raise type(error)(name, expected=error.expected, got=got, hint=hint, nearest=nearest) from None
 
 
 def _encode(
-    scene: OpenedLift,
-    query: Query,
-    encoder: TextEncoder | None,
-    term_names: _Names,
-    asked_as: Mapping[int, Wording] | None,
+    scene: Scene, query: Query, encoder: TextEncoder | None, asked_as: Mapping[int, Wording] | None
 ) -> dict[int, np.ndarray]:
     """Return the unit vector of each text, by its index among the terms."""
     texts = {place: term for place, term in enumerate(query.terms) if isinstance(term, str)}
@@ -233,32 +204,12 @@ def _encode(
         expected = f"{scene.channels} channels as the lift has (its text space: {space})"
         hint = "query with the text encoder that belongs to the features' image encoder"
         raise InvalidQuery("encoder", expected=expected, got=f"{encoder.name} with {encoder.channels}", hint=hint)
-    asked_as = wordings(scene, query, encoder, term_names.names) if asked_as is None else asked_as
-    texts = {place: asked_as[place].word for place in texts}
-    try:
-        rows = encoder.encode(list(texts.values()))
-    except InvalidQuery:
-        for place, text in texts.items():  # one by one, so that the error names the text
-            with term_names(place):
-                encoder.encode([text])
-        raise
-    return {place: _unit(row, text) for row, (place, text) in zip(as_numpy(rows), texts.items(), strict=True)}
+    asked_as = wordings(scene, query, encoder) if asked_as is None else asked_as
+    rows = as_numpy(encoder.encode([asked_as[place].word for place in texts]))
+    return {place: _unit(row, text) for row, (place, text) in zip(rows, texts.items(), strict=True)}
 
 
-def _regions(scene: OpenedLift, query: Query, term_names: _Names) -> dict[int, np.ndarray]:
-    """Return the unit row of each region, by its index among the terms; a view is read once for all its regions."""
-    region_terms = [(term.view, place, term) for place, term in enumerate(query.terms) if isinstance(term, Region)]
-    rows: dict[int, np.ndarray] = {}
-    for _, of_view in groupby(sorted(region_terms, key=itemgetter(0, 1)), key=itemgetter(0)):
-        regions = None  # one view at a time: maps are large
-        for _, place, term in of_view:
-            with term_names(place):
-                regions = regions or _regions_of(scene, term.view, str(term))
-                rows[place] = _unit(_codebook_row(regions, term), str(term))
-    return rows
-
-
-def _feature(scene: OpenedLift, example: Area | SplatTerm | SplatSet | Vector) -> np.ndarray:
+def _feature(scene: Scene, example: Area | SplatTerm | SplatSet | Vector) -> np.ndarray:
     if isinstance(example, Area):
         return area_feature(scene, example)
     if isinstance(example, Vector):
@@ -274,33 +225,6 @@ def _feature(scene: OpenedLift, example: Area | SplatTerm | SplatSet | Vector) -
     if example.splat >= count:
         raise InvalidQuery(str(example), expected=f"a splat in 0..{count - 1}", got=str(example.splat))
     return scene.features[example.splat]
-
-
-def _regions_of(scene: OpenedLift, view: str, argument: str) -> Regions:
-    """Return the regions of a view in the packs, by its name in the pack or that of its camera."""
-    from liftcore.scene.views import cameras_of_views
-    from liftcore.values.views import Regions
-
-    packs = scene.packs
-    name = cameras_of_views([view], packs.views).get(view)
-    if name is None:
-        raise NotFound(argument, expected="a view of the lift's feature packs", got=repr(view))
-    view_regions = packs[name]
-    if not isinstance(view_regions, Regions):
-        hint = "ask by a pixel, VIEW:x,y"
-        raise InvalidQuery(argument, expected="a view with regions", got="a feature grid", hint=hint)
-    return view_regions
-
-
-def _codebook_row(regions: Regions, example: Region) -> np.ndarray:
-    """Return the vector of a region, [F]."""
-    levels = regions.labels.shape[0]
-    if example.level >= levels:
-        raise NotFound(str(example), expected=f"a level in 0..{levels - 1}", got=str(example.level))
-    if not (as_numpy(regions.labels[example.level]) == example.region).any():
-        expected = f"a label of level {example.level} in view {example.view!r}"
-        raise NotFound(str(example), expected=expected, got=str(example.region))
-    return as_numpy(regions.codebook[example.region])
 
 
 def _unit(vector: np.ndarray, name: str) -> np.ndarray:

@@ -7,46 +7,48 @@ and they can be lifted again.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.catalogue import Catalogue, one_object_splats, table_csv
+from liftcore.query.catalogue import one_object_splats, table_csv
 from liftcore.query.colours import NOT_SEEN_COLOUR, cluster_colours, heat_colours
 from liftcore.query.objects import MOST_SPLATS, objects
-from liftcore.query.opened import OpenedLift, as_numpy
-from liftcore.query.question import Answer, SceneTree
+from liftcore.query.question import Answer
+from liftcore.query.scene import Scene, Source
 
 if TYPE_CHECKING:  # these load torch
     from PIL.Image import Image
 
     from liftcore.query.render import ViewMask
-    from liftcore.query.segment import Segmentation
     from liftcore.scene.cameras import Camera
 
-OF_LABELS = ("labelled", "names", "masks")  # files with labels of all splats
-FILES = {  # kind of a source -> the files that can be made of it
-    "answer": ("object", "coloured", "scores", "selection", "mask", "attention", "overlay", *OF_LABELS),
-    "answers": OF_LABELS,
-    "segmentation": ("coloured", "labels", "picture", "splat_labels", *OF_LABELS),
-    "object": ("object",),
-    "catalogue": ("csv", *OF_LABELS),
-    "scenetree": OF_LABELS,
-    "scene": ("rgb", "depth", "pca", "cluster", "confidence", "splats"),
-}
 
-BY_SUFFIX = {  # suffix of a name -> file of sources with several classes
-    **dict.fromkeys((".glb", ".spz", ".usdc", ".usdz"), "labelled"), ".json": "masks",
-}  # fmt: skip
-OF_CATALOGUE = BY_SUFFIX | {".ply": "labelled"}  # a segmentation's .ply has its colours instead
+@dataclass(frozen=True)
+class Export:
+    """Source and options of a file."""
+
+    scene: Scene
+    source: Any  # as `Scene.blocks_of` has it, without queries
+    content: str  # of FILES
+    view: str | Camera | None
+    suffix: str
+    view_mask: ViewMask | None
+    photo: Image | None
+
+    def require_view(self) -> str | Camera:
+        """Return the view; InvalidQuery without one."""
+        if self.view is None:
+            raise InvalidQuery("view", expected="a view's name or a camera", got="nothing")
+        return self.view
 
 
 def blocks_of(
-    scene: OpenedLift,
-    source: Answer | Mapping[str, Answer] | Segmentation | Catalogue | SceneTree | int | None,
+    scene: Scene,
+    source: Source,
     content: str = "",
     *,
     view: str | Camera | None = None,
@@ -58,107 +60,75 @@ def blocks_of(
 
     Arguments and errors are those of `Scene.blocks_of`; ``content`` is one of FILES.
     """
-    kind = "object" if isinstance(source, int) else "scene" if source is None else type(source).__name__.lower()
-    kind = "answers" if isinstance(source, Mapping) else kind
-    default = (
-        (OF_CATALOGUE if kind == "catalogue" else BY_SUFFIX).get(suffix)
-        if kind in ("segmentation", "catalogue", "scenetree", "answers")
-        else None
-    )
-    content = content or default or FILES[kind][0]
-    if content not in FILES[kind]:
-        raise InvalidQuery("what", expected=f"one of {', '.join(FILES[kind])}", got=repr(content))
-    if isinstance(source, int):
-        return one_object_splats(scene, source, suffix or ".ply")
-    if isinstance(source, Mapping | SceneTree) or (source is not None and content in OF_LABELS):
-        return _of_labels(scene, source, content, suffix, view)
-    if source is None:
-        return _of_scene(scene, content, view, suffix)
-    if isinstance(source, Catalogue):
-        return [table_csv(source)]
-    if isinstance(source, Answer):
-        return _of_answer(scene, source, content, view, suffix, view_mask, photo)
-    return _of_words(scene, source, content, view)
+    kinds = {int: "object", type(None): "scene", np.ndarray: "array"}
+    kind = "answers" if isinstance(source, Mapping) else kinds.get(type(source), type(source).__name__.lower())
+    files = FILES[kind]
+    if kind in ("segmentation", "scenetree", "answers"):
+        by_suffix = BY_SUFFIX | ({".ply": "labelled"} if kind == "scenetree" else {})
+        content = content or by_suffix.get(suffix, "")
+    content = content or next(iter(files))
+    if content not in files:
+        raise InvalidQuery("what", expected=f"one of {', '.join(files)}", got=repr(content))
+    return files[content](Export(scene, source, content, view, suffix, view_mask, photo))
 
 
-def _of_scene(scene: OpenedLift, content: str, view: str | Camera | None, suffix: str) -> Iterable[bytes]:
-    if content == "splats":
-        return splats_as(scene, suffix or ".splat")
+def _of_scene(export: Export) -> Iterable[bytes]:
     from liftcore.query.render import render_png
 
-    return [render_png(scene, _require_view(view), content)]
+    return [render_png(export.scene, export.require_view(), export.content)]
 
 
-def _of_answer(
-    scene: OpenedLift,
-    answer: Answer,
-    content: str,
-    view: str | Camera | None,
-    suffix: str,
-    in_view: ViewMask | None,
-    photo: Image | None,
-) -> Iterable[bytes]:
-    if content == "object":
-        return object_splats(scene, answer, suffix or ".ply")
-    if content == "coloured":
-        return coloured_ply(scene, answer)
-    if content in ("scores", "selection"):
-        return [npy(answer.scores if content == "scores" else answer.selected)]
+def _of_view(export: Export) -> Iterable[bytes]:
+    """Return the picture of an answer in a view."""
     from liftcore.query.render import attention_png, mask_png, overlay_png, view_mask
 
-    place = answer.query.seen_from() if view is None else view
-    in_view = view_mask(scene, answer, place) if in_view is None else in_view
-    if content == "overlay":
-        caption = ", ".join(map(str, answer.query.positives))
-        return [overlay_png(scene, in_view, place, caption, photo)]
-    return [mask_png(in_view.mask) if content == "mask" else attention_png(in_view)]
+    place = export.source.query.seen_from() if export.view is None else export.view
+    in_view = view_mask(export.scene, export.source, place) if export.view_mask is None else export.view_mask
+    if export.content == "overlay":
+        caption = ", ".join(map(str, export.source.query.positives))
+        return [overlay_png(export.scene, in_view, place, caption, export.photo)]
+    return [mask_png(in_view.mask) if export.content == "mask" else attention_png(in_view)]
 
 
-def _of_words(
-    scene: OpenedLift, segmentation: Segmentation, content: str, view: str | Camera | None
-) -> Iterable[bytes]:
-    from liftcore.query.segment import map_png, named_ply, picture_png, word_map
-
-    if content == "coloured":
-        return named_ply(scene, segmentation)
-    if content == "splat_labels":
-        return [npy(segmentation.values)]
-    values = word_map(scene, segmentation, _require_view(view))
-    if content == "labels":
-        return [map_png(values, segmentation)]
+def _of_words(export: Export) -> Iterable[bytes]:
+    """Return the map or the picture of a segmentation in a view."""
     from liftcore.query.render import render
+    from liftcore.query.segment import map_png, picture_png, value_map
 
-    return [picture_png(render(scene, _require_view(view)), values, segmentation)]
+    values = value_map(export.scene, export.source.values, export.require_view())
+    if export.content == "labels":
+        return [map_png(values, export.source)]
+    return [picture_png(render(export.scene, export.require_view()), values, export.source)]
 
 
-def _of_labels(
-    scene: OpenedLift,
-    source: Answer | Mapping[str, Answer] | Segmentation | Catalogue | SceneTree,
-    content: str,
-    suffix: str,
-    view: str | Camera | None,
-) -> Iterable[bytes]:
+def _of_labels(export: Export) -> Iterable[bytes]:
     from liftcore.io.labels import document_bytes
     from liftcore.io.splats import labelled
+    from liftcore.query.coco import masks_json
     from liftcore.query.labels import labels
 
-    columns = labels(scene, source)
-    if content == "labelled":
-        return labelled(scene.splat_file, columns, suffix or ".ply")
-    if content == "masks":
-        from liftcore.query.coco import masks_json
-
-        return masks_json(scene, columns, [view] if isinstance(view, str) else None)
+    columns = labels(export.scene, export.source)
+    if export.content == "labelled":
+        return labelled(export.scene.splat_file, columns, export.suffix or ".ply")
+    if export.content == "masks":
+        return masks_json(export.scene, columns, [export.view] if isinstance(export.view, str) else None)
     return [document_bytes(columns)]
 
 
-def _require_view(view: str | Camera | None) -> str | Camera:
-    if view is None:
-        raise InvalidQuery("view", expected="a view's name or a camera", got="nothing")
-    return view
+def _recoloured(scene: Scene, colours: np.ndarray) -> Iterable[bytes]:
+    """Write all splats in other colours [P, 3] u8 sRGB, the same from all directions, as a file in blocks."""
+    from liftcore.io.splats import recoloured
+
+    return recoloured(scene.splat_file, colours)
 
 
-def object_splats(scene: OpenedLift, answer: Answer, suffix: str = ".ply") -> Iterable[bytes]:
+def _mask_of_array(export: Export) -> Iterable[bytes]:
+    from liftcore.query.render import mask_png
+
+    return [mask_png(export.source)]
+
+
+def object_splats(scene: Scene, answer: Answer, suffix: str = ".ply") -> Iterable[bytes]:
     """Write the splats of an answer's objects as a file, in blocks; a PLY has all their properties unchanged.
 
     They are those of `objects` and masks, without unassigned splats; of more than are grouped, all selected ones.
@@ -189,22 +159,15 @@ def object_splats(scene: OpenedLift, answer: Answer, suffix: str = ".ply") -> It
     return some_rows(scene.splat_file, mask, suffix, scene.world)
 
 
-def coloured_ply(scene: OpenedLift, answer: Answer) -> Iterable[bytes]:
-    """Write all splats in the colours of their scores as a file, in blocks.
+def score_colours(answer: Answer) -> np.ndarray:
+    """Colour all splats by their scores, [P, 3] u8 sRGB.
 
     The colour map spans the scores of splats with a feature, as a picture of the attention spans its pixels. Splats
-    without a score are grey, and so are all splats if the object is absent. Colours are the same from all directions;
-    all other properties are unchanged.
-
-    Raises:
-        InvalidLift: the splats moved or changed since the lift.
-        InvalidSplats: their file holds no colours; raised with the first block.
+    without a score are grey, and so are all splats if the object is absent.
     """
-    from liftcore.io.splats import recoloured
-
     colours = heat_colours(answer.scores, answer.has_feature)
     colours[~answer.has_feature | answer.is_dropped] = NOT_SEEN_COLOUR
-    return recoloured(scene.splat_file, colours)
+    return colours
 
 
 def npy(values: np.ndarray) -> bytes:
@@ -214,14 +177,7 @@ def npy(values: np.ndarray) -> bytes:
     return content.getvalue()
 
 
-def array_blocks(values: np.ndarray, content: str = "") -> list[bytes]:
-    """Write an array as ``npy``, or a mask [H, W] of booleans as PNG: ``mask``."""
-    from liftcore.query.render import mask_png
-
-    return [mask_png(values) if content == "mask" else npy(values)]
-
-
-def splats_as(scene: OpenedLift, suffix: str) -> Iterator[bytes]:
+def splats_as(scene: Scene, suffix: str) -> Iterator[bytes]:
     """Write the splats of the scene in another format, in the lift's order, in blocks; web viewers read ``.splat``.
 
     Raises:
@@ -233,7 +189,7 @@ def splats_as(scene: OpenedLift, suffix: str) -> Iterator[bytes]:
     return blocks_as(replace(scene.splats, world=scene.world), suffix)
 
 
-def layer_colours(scene: OpenedLift, layer: str) -> np.ndarray:
+def layer_colours(scene: Scene, layer: str) -> np.ndarray:
     """Colour all splats by a layer, [P, 3] u8 sRGB.
 
     ``pca`` are three principal components of the features, ``cluster`` a colour a cluster; ``total_weight`` (by its
@@ -251,12 +207,12 @@ def layer_colours(scene: OpenedLift, layer: str) -> np.ndarray:
             raise InvalidQuery("what", expected="a lift with clusters", got="a lift without aggregation", hint=hint)
         colours = cluster_colours(len(scene.cluster_features))[scene.cluster]
     else:
-        tensor = getattr(scene.lift, layer)
+        tensor = getattr(scene, layer)
         if tensor is None:
             hint = "lift again with the setting robust=true"
             got = "a lift without reweighting"
             raise InvalidQuery("what", expected=f"a lift with {layer}", got=got, hint=hint)
-        values = as_numpy(tensor).astype(np.float32)
+        values = tensor.astype(np.float32)
         valid = scene.has_feature & np.isfinite(values)
         if layer == "total_weight":
             valid &= values > 0
@@ -264,3 +220,34 @@ def layer_colours(scene: OpenedLift, layer: str) -> np.ndarray:
         colours = heat_colours(values, valid)
     colours[~scene.has_feature] = NOT_SEEN_COLOUR
     return colours
+
+
+Files = dict[str, Callable[[Export], Iterable[bytes]]]
+OF_LABELS: Files = {"labelled": _of_labels, "names": _of_labels, "masks": _of_labels}  # with labels of all splats
+FILES: dict[str, Files] = {  # kind of a source -> the files that are made of it
+    "answer": {
+        "object": lambda export: object_splats(export.scene, export.source, export.suffix or ".ply"),
+        "coloured": lambda export: _recoloured(export.scene, score_colours(export.source)),
+        "scores": lambda export: [npy(export.source.scores)],
+        "selection": lambda export: [npy(export.source.selected)],
+        **dict.fromkeys(("mask", "attention", "overlay"), _of_view),
+        **OF_LABELS,
+    },
+    "answers": OF_LABELS,
+    "segmentation": {
+        "coloured": lambda export: _recoloured(export.scene, export.source.colours[export.source.values]),
+        **dict.fromkeys(("labels", "picture"), _of_words),
+        "splat_labels": lambda export: [npy(export.source.values)],
+        **OF_LABELS,
+    },
+    "object": {"object": lambda export: one_object_splats(export.scene, export.source, export.suffix or ".ply")},
+    "scenetree": {"csv": lambda export: [table_csv(export.source)], **OF_LABELS},
+    "scene": {
+        **dict.fromkeys(("rgb", "depth", "pca", "cluster", "confidence"), _of_scene),
+        "splats": lambda export: splats_as(export.scene, export.suffix or ".splat"),
+    },
+    "array": {"npy": lambda export: [npy(export.source)], "mask": _mask_of_array},
+}
+BY_SUFFIX = {  # suffix of a name -> file of sources with several classes
+    **dict.fromkeys((".glb", ".spz", ".usdc", ".usdz"), "labelled"), ".json": "masks",
+}  # fmt: skip

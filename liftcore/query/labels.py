@@ -1,49 +1,40 @@
 """Labels of all splats for other programs: class and instance numbers per splat, and a document that explains them.
 
 All sources give the same format. A segmentation has words as classes, and groups of touching splats as instances. An
-answer has its texts as the one class, and its objects as instances. A catalogue has the objects of the lift.
+answer has its texts as the one class, and its objects as instances. A tree has the objects of the lift.
 """
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liftcore.errors import InvalidLift, InvalidQuery
+from liftcore.errors import InvalidQuery
 from liftcore.io.labels import FORMAT, Labels
-from liftcore.query.catalogue import Catalogue
 from liftcore.query.colours import cluster_colours
 from liftcore.query.objects import LEAST_OBJECT_WEIGHT, is_outlier, objects, trimmed_box
-from liftcore.query.opened import OpenedLift, as_numpy
-from liftcore.query.question import Answer, SceneNode, SceneObject, SceneTree
+from liftcore.query.question import Answer, SceneNode, SceneTree
+from liftcore.query.scene import Scene
 from liftcore.runtime.version import __version__
 from liftcore.scene.touching import touching
 
 if TYPE_CHECKING:
     from liftcore.query.segment import Segmentation
 
-FRAMES = {
-    "colmap": "that of the COLMAP model that was lifted: right-handed, its unit",
-    "file": "that of the splat file that was lifted, with x, y and z as its PLY has them",
-}
 
-
-def labels(scene: OpenedLift, source: Segmentation | Answer | Mapping[str, Answer] | Catalogue | SceneTree) -> Labels:
-    """Return the labels of a segmentation, of answers, or of a lift's objects, of a tree with their parts.
+def labels(scene: Scene, source: Segmentation | Answer | Mapping[str, Answer] | SceneTree) -> Labels:
+    """Return the labels of a segmentation, of answers, or of a lift's objects with their parts.
 
     Of a segmentation, ``class_id`` is the value of a splat's word (`Segmentation.values`), and ``instance_id``
     numbers the groups of touching splats of one word (`liftcore.scene.touching`), the one with the largest total
     weight first; groups with less than a twentieth of the total weight of their word's largest have only a class. Of
     an answer, every selected splat has class 1, and the instances are its objects. Of several answers by name, each
-    is a class; a splat that several select belongs to the one whose threshold it exceeds most. Of a catalogue, the
-    instances are its objects and the classes their names; without names there are no classes. Of a tree, instances
-    and classes are those of its objects, and ``node_id`` is 1 + the id of the smallest node of a splat: object, part
-    or group. 0 means none in all columns. ``score`` is the cosine to the word, or the answer's score. ``confidence``
-    is that of a reweighted lift; other lifts have none.
+    is a class; a splat that several select belongs to the one whose threshold it exceeds most. Of a tree, the
+    instances are its objects and the classes their names, without names none; ``node_id`` is 1 + the id of the
+    smallest node of a splat: object, part or group. 0 means none in all columns. ``score`` is the cosine to the word,
+    or the answer's score. ``confidence`` is that of a reweighted lift; other lifts have none.
 
     Raises:
         InvalidQuery: no splat has a label, or more splats are selected than are grouped to objects.
@@ -58,8 +49,7 @@ def labels(scene: OpenedLift, source: Segmentation | Answer | Mapping[str, Answe
         if isinstance(source, Answer | Mapping):
             result = _of_answers(scene, {_name(source): source} if isinstance(source, Answer) else source)
         else:
-            of_objects = isinstance(source, Catalogue | SceneTree)
-            result = _of_objects(scene, source) if of_objects else _of_words(scene, source)
+            result = _of_tree(scene, source) if isinstance(source, SceneTree) else _of_words(scene, source)
         scene.labelled = parts, result
     columns: Labels = scene.labelled[1]
     return columns
@@ -73,12 +63,12 @@ def _name(answer: Answer) -> str:
     return ", ".join(map(str, (*answer.query.positives, *answer.query.sets)))
 
 
-def _of_words(scene: OpenedLift, segmentation: Segmentation) -> Labels:
+def _of_words(scene: Scene, segmentation: Segmentation) -> Labels:
     values, colours = segmentation.values, segmentation.colours.tolist()
     instances, entries = np.zeros(len(values), np.int32), list[dict[str, Any]]()
     for value, label in enumerate(segmentation.named_words, 1):
         rows = np.flatnonzero(values == value)
-        weights = _weights(scene, rows)
+        weights = scene.weights_of(rows)
         groups = touching(scene.splats, rows)
         sums = np.bincount(groups, weights)
         for group in np.argsort(-sums, kind="stable")[
@@ -103,7 +93,7 @@ def _of_words(scene: OpenedLift, segmentation: Segmentation) -> Labels:
     return _labels(scene, values, instances, segmentation.score, classes, entries)
 
 
-def _of_answers(scene: OpenedLift, answers: Mapping[str, Answer]) -> Labels:
+def _of_answers(scene: Scene, answers: Mapping[str, Answer]) -> Labels:
     selections = {name: (a, objects(scene, a)) for name, a in answers.items() if a.count and not a.is_dropped}
     if not selections:
         first = next(iter(answers.values()))
@@ -131,39 +121,31 @@ def _of_answers(scene: OpenedLift, answers: Mapping[str, Answer]) -> Labels:
     return _labels(scene, class_ids, instances, scores, classes, entries)
 
 
-def _of_objects(scene: OpenedLift, source: Catalogue | SceneTree) -> Labels:
-    objects: Sequence[SceneObject]
-    if isinstance(source, SceneTree):
-        objects = [obj for obj in source.nodes if obj.kind == "object"]
-    else:
-        objects = source.objects
-    if not objects or scene.object is None or scene.object_views is None:
-        raise InvalidQuery("source", expected="a lift with objects", got=source.explanation, hint="export words")
-    names = list(dict.fromkeys(obj.name for obj in objects if obj.name is not None))
+def _of_tree(scene: Scene, tree: SceneTree) -> Labels:
+    if not tree.objects or scene.object is None or scene.node is None or scene.node_parents is None:
+        raise InvalidQuery("source", expected="a lift with objects", got=tree.explanation, hint="export words")
+    names = list(dict.fromkeys(node.name for node in tree.objects if node.name is not None))
     class_of = {name: value for value, name in enumerate(names, 1)}
-    colours = cluster_colours(len(scene.object_views if scene.node_parents is None else scene.node_parents)).tolist()
-    numbers, entries = np.zeros(len(scene.object_views) + 1, np.int32), []  # the last is of -1
-    scores = np.zeros(len(scene.object_views) + 1, np.float32)
-    for obj in objects:
-        numbers[obj.id] = class_of.get(obj.name or "", 0)
-        scores[obj.id] = obj.score or 0.0
-        entry: dict[str, Any] = {"instance_id": obj.id + 1, "class_id": int(numbers[obj.id]), "name": obj.name}
-        entries.append(entry | _entry_of(scene, obj, colours[obj.id]))
-    values = numbers[scene.object]
+    colours = cluster_colours(len(scene.node_parents)).tolist()
+    numbers, scores = np.zeros(len(scene.node_parents) + 1, np.int32), np.zeros(len(scene.node_parents) + 1)
+    nodes = list[dict[str, Any]]()
+    for node in tree.nodes:
+        numbers[node.id], scores[node.id] = class_of.get(node.name or "", 0), node.score or 0.0
+        entry: dict[str, Any] = {"colour": colours[node.id], "score": node.score, "share": node.share}
+        entry |= {"views": list(node.views)} | _facts(scene, np.flatnonzero(scene.members(node.id)), None)
+        nodes.append(_path(node) | entry | {"box": {"low": node.box[0], "high": node.box[1]}})
+    values = numbers[scene.object]  # the last entry is of splats without an object
     classes = [
-        {"class_id": value, "name": name, "splats": int((values == value).sum())}
-        for value, name in enumerate(names, 1)
+        {"class_id": value, "name": name, "splats": int((values == value).sum())} for name, value in class_of.items()
     ]
-    result = _labels(scene, values, scene.object + 1, scores[scene.object] if names else None, classes, entries)
-    if scene.node is None or not isinstance(source, SceneTree):
-        return result
-    node_entries = [_path(obj) | _entry_of(scene, obj, colours[obj.id]) for obj in source.nodes]
-    for entry, node in zip(
-        result.document["instances"], (obj for obj in source.nodes if obj.kind == "object"), strict=True
-    ):
-        entry.update(_path(node))
+    instances = [
+        {"instance_id": node.id + 1, "class_id": int(numbers[node.id])} | entry
+        for node, entry in zip(tree.nodes, nodes, strict=True)
+        if node.kind == "object"
+    ]
+    result = _labels(scene, values, scene.object + 1, scores[scene.object] if names else None, classes, instances)
     columns = result.columns | {"node_id": scene.node + 1}
-    return Labels(columns, result.document | {"columns": list(columns), "nodes": node_entries})
+    return Labels(columns, result.document | {"columns": list(columns), "nodes": nodes})
 
 
 def _path(node: SceneNode) -> dict[str, Any]:
@@ -173,14 +155,8 @@ def _path(node: SceneNode) -> dict[str, Any]:
     return facts | {"depth": len(path) - 1, "path": path, "parts": [number + 1 for number in node.parts]}
 
 
-def _entry_of(scene: OpenedLift, obj: SceneObject, colour: list[int]) -> dict[str, Any]:
-    facts = _facts(scene, np.flatnonzero(scene.members(obj.id)), None)
-    entry = {"colour": colour, "score": obj.score, "share": obj.share, "views": list(obj.views)} | facts
-    return entry | {"box": {"low": obj.box[0], "high": obj.box[1]}}
-
-
 def _labels(
-    scene: OpenedLift,
+    scene: Scene,
     classes: np.ndarray,
     instances: np.ndarray,
     scores: np.ndarray | None,
@@ -192,10 +168,9 @@ def _labels(
     if scores is not None:
         columns["score"] = scores.astype(np.float32)
     if scene.confidence is not None:
-        confidence = np.where((classes > 0) | (instances > 0), as_numpy(scene.confidence), 0)
+        confidence = np.where((classes > 0) | (instances > 0), scene.confidence, 0)
         columns["confidence"] = confidence.astype(np.float32)
-    frame, source = _frame(scene), f"splatlift {__version__}"
-    metadata = scene.metadata
+    metadata, source = scene.metadata, f"splatlift {__version__}"
     provenance = ", ".join(
         filter(None, (source, metadata.encoder, metadata.text_space, f"{len(metadata.views)} views"))
     )
@@ -207,8 +182,6 @@ def _labels(
         "made_by": source,
         "splats": len(classes),
         "columns": list(columns),
-        "frame": frame,
-        "frame_is": FRAMES[frame],
         "world": scene.world.model_dump(mode="json"),
         "unit": scene.world.unit,
         "classes": [row | {"instances": members.get(row["class_id"], [])} for row in class_rows],
@@ -217,19 +190,14 @@ def _labels(
     return Labels(columns, document)
 
 
-def _weights(scene: OpenedLift, rows: np.ndarray) -> np.ndarray:
-    weights = scene.total_weight[rows].astype(np.float64)
-    return weights if weights.any() else np.ones(len(rows))
-
-
-def _facts(scene: OpenedLift, rows: np.ndarray, scores: np.ndarray | None) -> dict[str, Any]:
+def _facts(scene: Scene, rows: np.ndarray, scores: np.ndarray | None) -> dict[str, Any]:
     """Summarise splats: their number, their means of scores and confidence by total weight, and their boxes."""
-    weights = _weights(scene, rows)
+    weights = scene.weights_of(rows)
     facts: dict[str, Any] = {"splats": len(rows)}
     if scores is not None:
         facts["score"] = float(np.average(scores[rows], weights=weights))
     if scene.confidence is not None:
-        facts["confidence"] = float(np.average(as_numpy(scene.confidence)[rows], weights=weights))
+        facts["confidence"] = float(np.average(scene.confidence[rows], weights=weights))
     inside = ~is_outlier(scene.splats, rows, weights)
     boxes = _boxes(scene.splats.positions(rows[inside]).astype(np.float64), weights[inside])
     return facts | boxes | {"size": [scene.world.length(2 * half) for half in boxes["oriented_box"]["half_sizes"]]}
@@ -254,16 +222,3 @@ def _boxes(means: np.ndarray, weights: np.ndarray) -> dict[str, Any]:
             "half_sizes": ((ends[1] - ends[0]) / 2).tolist(),
         },
     }
-
-
-def _frame(scene: OpenedLift) -> str:
-    """Return the key in FRAMES of the frame of boxes and splats, as far as the lift's files have it."""
-    from liftcore.io.cameras import camera_source
-
-    try:
-        cameras, path = scene.cameras, Path(scene.metadata.cameras.path)
-    except InvalidLift:
-        return "file"
-    is_transformed = cameras.frame is not None or cameras.of_nerfstudio
-    is_colmap = bool(path.name) and (camera_source(path).model is not None or zipfile.is_zipfile(path))
-    return "colmap" if is_colmap and not is_transformed else "file"

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.opened import OpenedLift
 from liftcore.query.question import Answer, Box, Objects, Point, SelectedObject
+from liftcore.query.scene import Scene
 from liftcore.query.selection import MOSTLY_SELECTED, PARTLY_SELECTED
 from liftcore.query.terms import SplatSet
 from liftcore.scene.touching import touching
@@ -22,7 +22,7 @@ MOST_SPLATS = 1 << 20  # that are grouped: a million take seven seconds of two c
 _TAIL = 1e-3  # of an object's total weight that its box leaves out at each end of each axis
 
 
-def objects(scene: OpenedLift, answer: Answer) -> Objects:
+def objects(scene: Scene, answer: Answer) -> Objects:
     """Group the selected splats of an answer into objects.
 
     An object is a group of touching splats (`touching`). A group with less than a twentieth of the total weight of
@@ -46,8 +46,7 @@ def objects(scene: OpenedLift, answer: Answer) -> Objects:
     numbers = np.full(len(answer.scores), -1, np.int32)
     if not len(rows):
         return Objects.of((), numbers, 0, scene.world)
-    weights = scene.total_weight[rows].astype(np.float64)
-    weights = weights if weights.any() else np.ones(len(rows))
+    weights = scene.weights_of(rows)
     groups = _set_numbers(scene, sets)[rows] if sets else touching(scene.splats, rows)
     sums = np.bincount(groups, weights)
     order = np.argsort(-sums, kind="stable")
@@ -84,7 +83,7 @@ def objects(scene: OpenedLift, answer: Answer) -> Objects:
 
 
 def _without_leaks(
-    scene: OpenedLift, rows: np.ndarray, groups: np.ndarray, sums: np.ndarray, order: np.ndarray
+    scene: Scene, rows: np.ndarray, groups: np.ndarray, sums: np.ndarray, order: np.ndarray
 ) -> np.ndarray:
     """Return the groups that are objects, of groups in order of their total weight.
 
@@ -115,7 +114,7 @@ def _without_leaks(
     return large[[not (few and is_fragment(group)) for group, few in zip(large, small, strict=True)]]
 
 
-def _set_numbers(scene: OpenedLift, sets: Sequence[SplatSet]) -> np.ndarray:
+def _set_numbers(scene: Scene, sets: Sequence[SplatSet]) -> np.ndarray:
     """Return the index of the first set that contains a splat, [P] i32; -1 for none."""
     numbers = np.full(len(scene.features), -1, np.int32)
     for place, members in reversed(list(enumerate(sets))):

@@ -30,13 +30,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 from pathlib import Path
-from typing import Any, Self
 
 import numpy as np
 
 from liftcore.errors import InvalidQuery, InvalidTable, Unavailable
-from liftcore.query.opened import OpenedLift, as_numpy
-from liftcore.query.question import Presence, ReferenceComparison
+from liftcore.query.question import Presence
+from liftcore.query.scene import Scene
 from liftcore.query.threshold import LEAST_SHARE
 from liftcore.runtime.folders import cache_folder
 from liftcore.text import LVIS_TABLE, CachingEncoder, TextEncoder
@@ -61,25 +60,6 @@ class References:
 
     words: tuple[str, ...]
     vectors: np.ndarray  # [n, F] f32, unit
-
-    @classmethod
-    def of(cls, vectors: Any, channels: int) -> Self:
-        """Return references of vectors [n, F], torch or numpy, of any length above zero.
-
-        Raises:
-            InvalidQuery: fewer than LEAST_WORDS vectors, other channels than ``channels``, zero or non-finite ones.
-        """
-        rows = np.asarray(as_numpy(vectors), np.float32)
-        lengths = np.linalg.norm(rows, axis=-1)
-        if (
-            rows.ndim != 2
-            or len(rows) < LEAST_WORDS
-            or rows.shape[1] != channels
-            or not (np.isfinite(lengths) & (lengths > 0)).all()
-        ):
-            expected = f"finite vectors of {LEAST_WORDS} words or more, [n, {channels}], each with a direction"
-            raise InvalidQuery("references", expected=expected, got=f"the shape {list(rows.shape)}, or zeros or NaN")
-        return cls(tuple(f"number {row}" for row in range(len(rows))), _unit(rows))
 
     @cached_property
     def mean(self) -> np.ndarray:
@@ -108,7 +88,7 @@ class References:
 
 
 def estimate_presence(
-    scene: OpenedLift, name: str, direction: np.ndarray, scores: np.ndarray, references: References
+    scene: Scene, name: str, direction: np.ndarray, scores: np.ndarray, references: References
 ) -> Presence:
     """Estimate if the object of a word is in the scene.
 
@@ -140,11 +120,10 @@ def estimate_presence(
     near = weights @ products(rows, norms, direction[None], references.vectors[reference_rows])[1]
     nearest = references.words[reference_rows[int(near.argmax())]].replace("_", " ")
     facts = f"its best splats are nearer to {middle} of {count} other words, first of all to {nearest!r}"
-    comparison = ReferenceComparison(nearer=middle, limit=limit, count=count, nearest=nearest)
     first = float(weights[contrast == 0].sum() / weights.sum())
     if shares[0] < 0.5 and first < 0.5:
         reason = f"{name} is not there: {facts}."
-        return Presence(present=False, presence=presence, reason=reason, comparison=comparison)
+        return Presence(present=False, presence=presence, reason=reason)
     if shares[0] < 0.5:
         facts += ", but to what sets them apart from the rest of the scene it is the nearest"
     else:
@@ -152,10 +131,10 @@ def estimate_presence(
             "hardly any other word is nearer to its best splats, but many are to what sets them apart from the rest"
         )
     reason = f"Whether {name} is there is not sure: {facts}."
-    return Presence(present=None, presence=presence, reason=reason, comparison=comparison)
+    return Presence(present=None, presence=presence, reason=reason)
 
 
-def _near_share(scene: OpenedLift, direction: np.ndarray, references: np.ndarray, limit: int) -> float:
+def _near_share(scene: Scene, direction: np.ndarray, references: np.ndarray, limit: int) -> float:
     """Return the share of a scene, by a sample of its splats, at which at most ``limit`` references are nearer."""
     rows = np.flatnonzero(scene.has_feature)
     rows = rows[:: -(-len(rows) // MOST_SPLATS) or 1]
@@ -208,11 +187,10 @@ def any_present(words: Sequence[Presence]) -> Presence:
     """Combine the presences of one or more words: present if one of them is."""
     first = max(words, key=lambda word: (word.present is not False, word.present is True, word.presence or 0.0))
     reason = " ".join(word.reason for word in words)
-    comparison = first.comparison if len(words) == 1 else None
-    return Presence(present=first.present, presence=first.presence, reason=reason, comparison=comparison)
+    return Presence(present=first.present, presence=first.presence, reason=reason)
 
 
-def best_splats(scene: OpenedLift, scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def best_splats(scene: Scene, scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the splats of the highest scores [P] that have LEAST_SHARE of the total weight, and their weights.
 
     Returns:

@@ -248,9 +248,9 @@ class Query(Viewpoint):
         """The sets of splats that are selected as they are."""
         return tuple(parse_set(notation, f"sets.{place}") for place, notation in enumerate(self.sets))
 
-    @property
+    @cached_property
     def places(self) -> list[str]:
-        """The field and index of each of the terms, for errors over HTTP."""
+        """The field and index of each of the terms, for errors."""
         names = ("text", "like", "negatives", "unlike")
         return [f"{name}.{place}" for name in names for place in range(len(getattr(self, name)))]
 
@@ -332,28 +332,12 @@ class Threshold(Value):
     clear: bool = Field(default=True, exclude=True)  # True if the method has a clear result
 
 
-class ReferenceComparison(Value):
-    """Comparison of a word's best splats with the reference words (`liftcore.query.presence`)."""
-
-    nearer: int = Field(
-        description="the number of reference words that are nearer to a splat than the word is: the median, by total "
-        "weight"
-    )
-    limit: int = Field(description="the largest such number at which the word may be there")
-    count: int = Field(description="the number of reference words")
-    nearest: str = Field(description="the reference word with the highest mean cosine to these splats")
-
-
 class Presence(Value):
     """Presence of the target in the scene."""
 
     present: bool | None = Field(description="true if the target is in the scene; null if unknown or uncertain")
     presence: float | None = Field(description="its probability, 0..1, present from 0.5 on; null if unknown")
     reason: str = Field(description="one sentence on how it is known whether it is there, or why it is not")
-    comparison: ReferenceComparison | None = Field(
-        default=None,
-        description="numbers of `reason`, for one word that is absent or uncertain; null otherwise, and of a part",
-    )
 
 
 class SelectionSummary(Presence):
@@ -424,7 +408,7 @@ class Answer(SelectionSummary):
         default=(),
         description="other words that are nearer to what was found, or most like it; of a clear answer to most of it",
     )
-    statistics: Mapping[str, Any] = Field(description="of the scores over the splats with a feature")
+    statistics: Mapping[str, Any] = Field(description="least, largest and mean score of the splats with a feature")
     top: tuple[TopSplat, ...] = ()
     candidates: tuple[Candidate, ...] = Field(
         default=(),
@@ -447,6 +431,12 @@ class Answer(SelectionSummary):
             **fields,
         )
         answer._query, answer._arrays = query, (scores, has_feature, selected)
+        return answer
+
+    def with_selected(self, selected: np.ndarray, query: Query, **fields: Any) -> Self:
+        """Return the answer with other selected splats [P] bool, as that to another query, with other fields."""
+        answer = self.model_copy(update={"text": query.text, "count": int(selected.sum())} | fields)
+        answer._query, answer._arrays = query, (self.scores, self.has_feature, selected)
         return answer
 
     @property
@@ -557,34 +547,18 @@ class BestWords(Value):
     words: tuple[BestWord, ...] = Field(description="the nearest first")
 
 
-class SceneObject(Value):
-    """An object on which masks of many views agree."""
+class SceneNode(Value):
+    """An object on which masks of many views agree, a part of one, or a group of objects."""
 
-    id: int = Field(description="the same for the same lift; 0 has the largest total weight")
+    id: int = Field(description="the same for the same lift; 0 is the object with the largest total weight")
     name: str | None = Field(description="the nearest word of the vocabulary; null without one")
-    score: float | None = Field(description="its cosine with the object's mean feature")
+    score: float | None = Field(description="its cosine with the node's mean feature")
     splats: int = Field(description="number of splats")
     share: float = Field(description="of the total weight of all splats")
     centre: Point = Field(description="the middle of its box: x y z, frame of the splat file")
     box: Box = Field(description="of its large groups of splats that touch, without outliers elsewhere")
     size: Point = Field(description="the sides of its box, in `unit`")
     views: tuple[str, ...] = Field(description="that show most of it, the best first")
-    feature: tuple[float, ...] | None = Field(
-        default=None, description="if requested: the normalised mean of its unit features, [F]"
-    )
-
-
-class ListedObjects(WithUnits):
-    """The objects of a scene, or some of them, those with the largest total weight first."""
-
-    explanation: str = Field(description="why there are so many; or why there are none")
-    count: int = Field(description="of all pages")
-    objects: tuple[SceneObject, ...]
-
-
-class SceneNode(SceneObject):
-    """An object, a part of one, or a group of objects, with the fields of objects."""
-
     kind: NodeKind
     parent: int | None = Field(description="the node that it is a part of; null where it is of none")
     path: tuple[int, ...] = Field(description="the nodes that hold it, the largest first, and itself")
@@ -598,6 +572,11 @@ class SceneTree(WithUnits):
     explanation: str = Field(description="why there are so many; or why there are none")
     count: int = Field(description="of all pages")
     nodes: tuple[SceneNode, ...]
+
+    @property
+    def objects(self) -> tuple[SceneNode, ...]:
+        """The objects among the nodes, those with the largest total weight first."""
+        return tuple(node for node in self.nodes if node.kind == "object")
 
 
 def page_fields() -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Images of a scene and its answers from a camera: masks, attention, colours and depths, in the photo's pixels."""
 
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,8 +13,8 @@ from liftcore.errors import InvalidQuery
 from liftcore.query.areas import MINIMUM_ROW_SUM
 from liftcore.query.colours import cluster_colours, heat_colours, map_colours
 from liftcore.query.objects import objects
-from liftcore.query.opened import OpenedLift
 from liftcore.query.question import Answer, Objects
+from liftcore.query.scene import Scene
 from liftcore.query.splat_colours import view_colours
 from liftcore.runtime.one_line import one_line, value_text
 from liftcore.scene.cameras import Camera
@@ -48,26 +48,9 @@ class ViewMask:
         size = f"{list(self.mask.shape)} pixels, {self.mask.mean():.1%} of them in the mask"
         return one_line(self, value_text(self.view), size, value_text(self.explanation))
 
-    @staticmethod
-    def overlay(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """Tint and outline a mask [H, W] bool in an image [H, W, 3] u8, and dim the rest; [H, W, 3] u8."""
-        return overlay(image, mask)
-
-
-@dataclass(frozen=True)
-class ShownDepth:
-    """Depths as a grey image: a level of 1 is ``far`` or farther, 255 ``near`` or nearer, and 0 no depth."""
-
-    levels: np.ndarray  # [H, W] u8
-    span: tuple[float, float] | None  # near and far, scene units; None when no pixel is covered
-
-    def text(self) -> dict[str, str]:
-        """Return the text chunks of a PNG: ``depth-near`` and ``depth-far``, in decimals that read back exactly."""
-        return {} if self.span is None else dict(zip(("depth-near", "depth-far"), map(repr, self.span), strict=True))
-
 
 def view_mask(
-    scene: OpenedLift, answer: Answer, view: str | Camera, group: Callable[[OpenedLift, Answer], Objects] = objects
+    scene: Scene, answer: Answer, view: str | Camera, group: Callable[[Scene, Answer], Objects] = objects
 ) -> ViewMask:
     """Render an answer from a camera: its attention, and a mask of its objects.
 
@@ -111,21 +94,23 @@ def attention_png(in_view: ViewMask) -> bytes:
     return _png(heat_colours(in_view.attention, in_view.row_sums > 0))
 
 
-def render_png(scene: OpenedLift, view: str | Camera, channel: str = "rgb") -> bytes:
+def render_png(scene: Scene, view: str | Camera, channel: str = "rgb") -> bytes:
     """Render the scene from a camera as a PNG, RGB [H, W, 3] on black: colours, features (``pca``) or clusters.
 
-    ``depth`` is one 8-bit channel [H, W], near bright; the PNG has its range as text (`ShownDepth`).
+    ``depth`` is one 8-bit channel [H, W], near bright; the PNG has its range as text, ``depth-near`` and
+    ``depth-far``, in decimals that read back exactly.
 
     Raises:
         NotFound, InvalidQuery, InvalidLift: as `render` does.
     """
     if channel == "depth":
-        depth = shown_depth(scene, view)
-        return _png(depth.levels, depth.text())
+        levels, span = shown_depth(scene, view)
+        text = {} if span is None else {"depth-near": repr(span[0]), "depth-far": repr(span[1])}
+        return _png(levels, text)
     return _png(render(scene, view, channel))
 
 
-def render(scene: OpenedLift, view: str | Camera, channel: str = "rgb") -> np.ndarray:
+def render(scene: Scene, view: str | Camera, channel: str = "rgb") -> np.ndarray:
     """Render the colours of a view, [H, W, 3] u8 sRGB on black, with the opacities as trained.
 
     ``rgb`` takes the splats' colours, ``pca`` the first three principal components of their features, and ``cluster``
@@ -149,7 +134,7 @@ def render(scene: OpenedLift, view: str | Camera, channel: str = "rgb") -> np.nd
     return np.round(levels, out=levels).astype(np.uint8)
 
 
-def _render_clusters(scene: OpenedLift, view: str | Camera) -> np.ndarray:
+def _render_clusters(scene: Scene, view: str | Camera) -> np.ndarray:
     if scene.cluster is None or scene.cluster_features is None:
         hint = "lift again with the setting aggregation=true"
         raise InvalidQuery("channel", expected="a lift with clusters", got="a lift without aggregation", hint=hint)
@@ -161,7 +146,7 @@ def _render_clusters(scene: OpenedLift, view: str | Camera) -> np.ndarray:
     return picture
 
 
-def _render_confidence(scene: OpenedLift, view: str | Camera) -> np.ndarray:
+def _render_confidence(scene: Scene, view: str | Camera) -> np.ndarray:
     if scene.confidence is None:
         hint = "lift again with the preset default, or with robust=true"
         raise InvalidQuery(
@@ -174,7 +159,7 @@ def _render_confidence(scene: OpenedLift, view: str | Camera) -> np.ndarray:
     return map_colours(means, sums >= MINIMUM_ROW_SUM)
 
 
-def expected_depth(scene: OpenedLift, view: str | Camera) -> tuple[np.ndarray, np.ndarray]:
+def expected_depth(scene: Scene, view: str | Camera) -> tuple[np.ndarray, np.ndarray]:
     """Render the expected depth of the rays of a view, ``sum_j w_j z_j / sum_j w_j``.
 
     z_j is the depth of a splat's centre along the camera's axis, not along the ray. Opacities are as trained.
@@ -193,8 +178,12 @@ def expected_depth(scene: OpenedLift, view: str | Camera) -> tuple[np.ndarray, n
     return torch.where(hit, image[..., 0] / image[..., 1], 0.0).numpy(), hit.numpy()
 
 
-def shown_depth(scene: OpenedLift, view: str | Camera) -> ShownDepth:
+def shown_depth(scene: Scene, view: str | Camera) -> tuple[np.ndarray, tuple[float, float] | None]:
     """Map the expected depths of a view to grey, near bright, from the 1st to the 99th percentile of covered pixels.
+
+    Returns:
+        Levels [H, W] u8: 1 is the far end or farther, 255 the near end or nearer, and 0 no depth; and the ends near
+        and far, scene units, None when no pixel is covered.
 
     Raises:
         NotFound, InvalidQuery, InvalidLift: as `render` does.
@@ -202,19 +191,19 @@ def shown_depth(scene: OpenedLift, view: str | Camera) -> ShownDepth:
     depths, hit = expected_depth(scene, view)
     levels = np.zeros(depths.shape, dtype=np.uint8)
     if not hit.any():
-        return ShownDepth(levels, None)
+        return levels, None
     near, far = (float(depth) for depth in np.quantile(depths[hit], _DEPTH_QUANTILES))
     nearness = (far - depths[hit]) / (far - near) if far > near else np.ones(int(hit.sum()))
     levels[hit] = 1 + np.round(_LEVELS * nearness.clip(0.0, 1.0))
-    return ShownDepth(levels, (near, far))
+    return levels, (near, far)
 
 
-def _as_trained(scene: OpenedLift) -> CompositingParams:
+def _as_trained(scene: Scene) -> CompositingParams:
     return CompositingParams(antialiased=scene.compositing.antialiased)
 
 
 def overlay_png(
-    scene: OpenedLift, in_view: ViewMask, view: str | Camera, name: str, photo: Image.Image | None = None
+    scene: Scene, in_view: ViewMask, view: str | Camera, name: str, photo: Image.Image | None = None
 ) -> bytes:
     """Overlay an answer's mask on the photo of its view or else a render, with its share of the image as a caption.
 
@@ -223,13 +212,21 @@ def overlay_png(
     """
     height, width = in_view.mask.shape
     image = render(scene, view) if photo is None else np.asarray(photo.convert("RGB").resize((width, height)))
-    size = max(12, height // 30)
-    canvas = Image.new("RGB", (width, height + 2 * size), "white")
-    canvas.paste(Image.fromarray(overlay(image, in_view.mask)), (0, 0))
     caption = f"{name}: {in_view.mask.mean():.1%} of {in_view.view}"
-    ImageDraw.Draw(canvas).text(
-        (size // 2, height + size // 2), caption, fill="black", font=ImageFont.load_default(size)
-    )
+    return captioned_png(overlay(image, in_view.mask), [(caption, _OUTLINE)])
+
+
+def captioned_png(image: np.ndarray, lines: Sequence[tuple[str, np.ndarray]]) -> bytes:
+    """Write an image [H, W, 3] u8 with lines of text below, each after a square of its colour [3] u8, as a PNG."""
+    height, width, _ = image.shape
+    size = max(12, height // 30)
+    canvas = Image.new("RGB", (width, height + 2 * size * len(lines)), "white")
+    canvas.paste(Image.fromarray(image), (0, 0))
+    draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(size)
+    for line, (text, colour) in enumerate(lines):
+        top = height + 2 * size * line + size // 2
+        draw.rectangle((size // 2, top, 3 * size // 2, top + size), fill=tuple(colour.tolist()))
+        draw.text((2 * size, top), text, fill="black", font=font)
     return _png(np.asarray(canvas))
 
 

@@ -7,19 +7,17 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
-from liftcore.errors import InvalidInput, InvalidQuery
+from liftcore.errors import InvalidInput
 from liftcore.values.lift import Lift
 from liftcore.values.lift_file import has_poses, open_lift, save_lift, tensors_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     import numpy as np
 
-    from liftcore.query.catalogue import Catalogue
     from liftcore.query.question import Answer
     from liftcore.query.scene import Scene
-    from liftcore.query.segment import Segmentation
     from liftcore.runtime.progress import Progress
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
@@ -59,7 +57,6 @@ class LiftResult(Lift):
         negatives: Any = (),
         *,
         splats: Splats | None = None,
-        references: Any = None,
         encoder: TextEncoder | str | Path | None = None,
         **fields: Any,
     ) -> Answer:
@@ -69,8 +66,6 @@ class LiftResult(Lift):
             positives: the target: a text or several, or [n, F] or [F], torch or numpy, rows of any length above zero.
             negatives: likewise; they reduce the scores.
             splats: that were lifted; with them the answer has its best splats and the box of its selection.
-            references: with vectors: [n, F], those of 200 words or more, to estimate presence; None = those of the
-                lift's text space, if it has some.
             encoder: of texts, or the specification of one (`liftcore.open_encoder`), which is opened once. None: the
                 lift's own words (`table`), else the encoder of its text space, or its shipped table if the weights
                 are not available.
@@ -87,44 +82,11 @@ class LiftResult(Lift):
 
         scene, words = self.scene(splats), [positives] if isinstance(positives, str) else positives
         if not isinstance(words, list | tuple) or not words or not all(isinstance(word, str) for word in words):
-            answer = ask_vectors(scene, positives, negatives, references, **fields)
+            answer = ask_vectors(scene, positives, negatives, **fields)
             return answer if splats is None else scene.locate(answer)
-        if references is not None:
-            hint = "an encoder has reference words of its own"
-            raise InvalidQuery("references", expected="vectors to query", got="texts", hint=hint)
         against = [negatives] if isinstance(negatives, str) else negatives
         check_texts([*words, *against])
         return scene.ask(Query.of(words, against, **fields), encoder=encoder, places=splats is not None)
-
-    def segment(
-        self,
-        words: Sequence[str],
-        vectors: Any = None,
-        splats: Splats | None = None,
-        *,
-        encoder: TextEncoder | str | Path | None = None,
-    ) -> Segmentation:
-        """Label every splat with the most similar word, or none, as `liftcore.Scene.segment`.
-
-        Args:
-            splats: that were lifted; may be left out if the lift was made of files that are still in place.
-        """
-        return self.scene(splats).segment(words, vectors, encoder=encoder)
-
-    def objects(
-        self,
-        splats: Splats | None = None,
-        words: Sequence[str] = (),
-        vectors: Any = None,
-        *,
-        encoder: TextEncoder | str | Path | None = None,
-    ) -> Catalogue:
-        """List the objects on which masks of many views agree, the largest first, as `liftcore.Scene.catalogue`.
-
-        Args:
-            splats: that were lifted; may be left out if the lift was made of files that are still in place.
-        """
-        return self.scene(splats).catalogue(words, vectors, encoder=encoder)
 
     def transferred(self, old: Splats, new: Splats | Path | str, *, matrix: Any = None) -> LiftResult:
         """Transfer the lift to an edited copy of its splats: cropped, reordered, compressed or thinned.
@@ -181,6 +143,8 @@ class LiftResult(Lift):
         if not isinstance(codes, str):
             facts = {"rows": len(codes.codebook), "loss": codes.loss}
             changes = {"features": torch.from_numpy(codes.codebook), "code": torch.from_numpy(codes.code)}
+            if lift.confidence is not None:  # so that the file takes two bytes for it
+                changes["confidence"] = lift.confidence.half().float()
         metadata = self.metadata.model_copy(update={"diagnostics": self.diagnostics | {"codes": facts}})
         return replace(lift, **changes, metadata=metadata)
 

@@ -1,55 +1,70 @@
-"""Scene, a lift opened for queries: the library's face of all queries of the command line and the service."""
+"""Scene, a lift opened for queries, with the splats and cameras of its scene: the face of all queries."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext, suppress
+from copy import copy
+from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from shutil import rmtree
+from tempfile import mkdtemp
+from typing import TYPE_CHECKING, Any, Literal, Self, TypeAlias
+from weakref import finalize
 
-from liftcore.errors import InvalidLift
-from liftcore.query.opened import OpenedLift
+import numpy as np
+
+from liftcore.errors import InvalidLift, InvalidQuery, NotFound
+from liftcore.io.splats import quick_count
+from liftcore.query.scores import Features
 from liftcore.runtime.progress import Progress, shown_progress
+from liftcore.scene.kernel import Kernel
+from liftcore.scene.world import UNKNOWN, WorldFrame
+from liftcore.text.table import TableEncoder, own_words
+from liftcore.values.lift_file import read_lift, tensors_of
 
 if TYPE_CHECKING:  # these load torch
-    import numpy as np
     from PIL.Image import Image
+    from torch import Tensor
 
     from liftcore.io.labels import Labels
-    from liftcore.query.ask import ResolvedQuery
-    from liftcore.query.catalogue import Catalogue
-    from liftcore.query.question import (
-        Answer,
-        BestWord,
-        Objects,
-        Query,
-        SceneTree,
-        SuggestedWords,
-    )
+    from liftcore.query.question import Answer, BestWord, Box, Objects, Query, SceneTree, SuggestedWords
     from liftcore.query.render import ViewMask
     from liftcore.query.segment import Segmentation
     from liftcore.query.selections import Selection
-    from liftcore.query.terms import Example
-    from liftcore.scene.cameras import Camera
-    from liftcore.scene.kernel import Kernel
+    from liftcore.query.terms import Example, SplatSet
+    from liftcore.raster.base import Raster
+    from liftcore.scene.cameras import Camera, Cameras
+    from liftcore.scene.compositing import CompositingParams
+    from liftcore.scene.splats import Splats
     from liftcore.text import TextEncoder
+    from liftcore.values.lift import InputFile, Lift, LiftMetadata
 
 Source: TypeAlias = (  # of a file
-    "Query | str | Answer | Mapping[str, Answer] | Segmentation | Catalogue | SceneTree | np.ndarray | int | None"
+    "Query | str | Answer | Mapping[str, Answer] | Segmentation | SceneTree | np.ndarray | int | None"
 )
+AnyEncoder: TypeAlias = "TextEncoder | str | Path | None"  # or the specification of one; None: that of the lift
+
+MOST_SAMPLED = 1 << 14  # splats of which a rough mean is computed
+MOST_OF_OBJECT = 512  # splats of an object, likewise
+TRANSFER = (
+    "edited splats need a lift of their own, which 'splatlift transfer LIFT EDITED --splats LIFTED -o NEW' makes of "
+    "this one (in Python lift.transferred)"
+)
+MOST_PIXELS = 1 << 26  # of a picture: 67 million take a minute of one core and 2 GB
 
 
-class Scene(OpenedLift):
+class Scene:
     """A lift opened for queries, with the splats and cameras of its scene.
 
-    Norms, mean, axes and encoders are computed once and cached. Scores need the lift alone, and no torch. Splats,
-    cameras and packs that are not passed are read from the paths in the lift, once and at first use, and verified by
+    Norms, mean, axes and encoders are computed once and cached. Scores need the lift alone, and no torch. Splats
+    and cameras that are not passed are read from the paths in the lift, once and at first use, and verified by
     their digests.
 
     Args:
         source: the lift, or the path of its file, which is mapped and not read.
         splats: that were lifted, or their new path if they moved. cameras: of the scene, or their path.
-        packs: that were lifted.
         world: up axis and length unit, if the lift has none, or wrong ones.
 
     Raises:
@@ -58,16 +73,70 @@ class Scene(OpenedLift):
         InvalidSplats: other splats than were lifted (`Lift.require_splats`).
     """
 
+    features: Features
+    """[P, F], exact or as codes; zero rows without a feature"""
+    row_counts: np.ndarray | None = None
+    """[P] f64, the number of splats that each row is of, of `distinct` rows; None: one"""
     selections: dict[str, Selection]
     """selections by their names (`select`)"""
+    # The tensors of `liftcore.values.lift.Lift`, as arrays.
+    total_weight: np.ndarray
+    cluster: np.ndarray | None = None
+    cluster_features: np.ndarray | None = None
+    confidence: np.ndarray | None = None
+    object: np.ndarray | None = None
+    object_views: np.ndarray | None = None
+    node: np.ndarray | None = None
+    node_parents: np.ndarray | None = None
+    node_views: np.ndarray | None = None
+    node_confidence: np.ndarray | None = None
+    node_features: np.ndarray | None = None
+    embeddings: np.ndarray | None = None
+    _has_feature: np.ndarray
+    _metadata_json: str  # of a lift file
+    _new_paths: dict[str, Path | None]  # of files that were moved, by their roles
+
+    def __init__(
+        self,
+        source: Lift | Path | str,
+        splats: Splats | Path | str | None = None,
+        cameras: Mapping[str, Camera] | Path | str | None = None,
+        *,
+        world: WorldFrame = UNKNOWN,
+    ) -> None:
+        self._world_override = world
+        self.labelled: tuple[Any, Labels] | None = None  # of the last exported source, for the next file
+        self.selections = {}
+        self.node_boxes: dict[tuple[int, int], Box] = {}  # of listed nodes, by their ids and numbers of splats
+        self._encoders: dict[str | None, TextEncoder] = {}
+        paths = {"splats": splats, "cameras": cameras}
+        self._new_paths = {role: Path(at) if isinstance(at, str | Path) else None for role, at in paths.items()}
+        if isinstance(source, str | Path):
+            self.path = Path(source)
+            arrays, self._metadata_json = read_lift(self.path)
+            splats_path = self._new_paths["splats"]
+            cached: dict[str, Any] = {}
+        else:
+            arrays = {name: as_numpy(tensor) for name, tensor in tensors_of(source).items()}
+            self.path, splats_path = Path("lift"), None
+            cached = {"lift": source, "metadata": self._with_places(source.metadata)}
+        features, code = arrays.pop("features"), arrays.pop("code", None)
+        self.features = Features(features if code is None else features.astype(np.float32), code)
+        self._has_feature = arrays.pop("has_feature")
+        self.__dict__.update(arrays)
+        if splats_path is not None and splats_path.exists():
+            self._require_rows(quick_count(splats_path))
+        cached |= {"cameras": cameras} if cameras is not None and self._new_paths["cameras"] is None else {}
+        self.__dict__.update(cached)
+        if splats is not None and not isinstance(splats, str | Path):
+            self.lift.require_splats(splats)
+            self.__dict__["splats"] = splats.cpu()
 
     def __repr__(self) -> str:
         objects = "" if self.object_views is None else f", {len(self.object_views)} objects"
         return f"Scene({len(self.features)} splats, {self.channels} channels{objects})"
 
-    def ask(
-        self, query: Query | str, *, encoder: TextEncoder | str | Path | None = None, places: bool | None = None
-    ) -> Answer:
+    def ask(self, query: Query | str, *, encoder: AnyEncoder = None, places: bool | None = None) -> Answer:
         """Score every splat for a query and select those that answer it (`liftcore.query.ask`).
 
         Args:
@@ -80,7 +149,7 @@ class Scene(OpenedLift):
         Raises:
             InvalidQuery: a text that the encoder cannot encode or no encoder of the lift's space, a term that has no
                 feature.
-            NotFound: an example names a view or a region that does not exist.
+            NotFound: an example names a view that does not exist.
             InvalidLift: an example or ``places`` need the scene's files, and they moved or changed.
             Unavailable: the encoder's weights are not on this machine.
         """
@@ -95,18 +164,6 @@ class Scene(OpenedLift):
         with nullcontext() if places else suppress(InvalidLift):
             return locate(self, answer)
         return answer
-
-    def prepare(self, query: Query, encoder: TextEncoder | None = None) -> ResolvedQuery:
-        """Resolve a query's terms to directions, and raise all of its errors; arguments as in `ask`."""
-        from liftcore.query.ask import resolve_query
-
-        return resolve_query(self, query, encoder, query.places)
-
-    def answer(self, questions: Sequence[ResolvedQuery]) -> list[Answer]:
-        """Answer prepared queries in one pass over the features; each to the same bits as alone (`ask`)."""
-        from liftcore.query.ask import answers
-
-        return answers(self, questions)
 
     def locate(self, answer: Answer, count: int | None = None) -> Answer:
         """Add to an answer its best splats and the box of its selection (`liftcore.query.ask.locate`)."""
@@ -125,7 +182,7 @@ class Scene(OpenedLift):
         query: Query | str | Answer,
         view: str | Camera | None = None,
         *,
-        encoder: TextEncoder | str | Path | None = None,
+        encoder: AnyEncoder = None,
         find_objects: Callable[[], Objects] | None = None,
     ) -> ViewMask:
         """Render an answer from a camera: its attention, and a mask of the objects that were found.
@@ -149,20 +206,10 @@ class Scene(OpenedLift):
         query: Query | str | Answer,
         view: str | Camera | None = None,
         *,
-        encoder: TextEncoder | str | Path | None = None,
+        encoder: AnyEncoder = None,
     ) -> np.ndarray:
         """Return the pixels of a view with the answer's objects, [H, W] bool; arguments as in `view_mask`."""
         return self.view_mask(query, view, encoder=encoder).mask
-
-    def attention(
-        self,
-        query: Query | str | Answer,
-        view: str | Camera | None = None,
-        *,
-        encoder: TextEncoder | str | Path | None = None,
-    ) -> np.ndarray:
-        """Render the scores of a view, [H, W] f32; arguments as in `view_mask`."""
-        return self.view_mask(query, view, encoder=encoder).attention
 
     def select(self, name: str, source: Answer | Query | str | np.ndarray | int | None = None) -> Selection:
         """Return the selection of a name, a new one if there is none; `Selection.edit` changes its splats.
@@ -199,38 +246,18 @@ class Scene(OpenedLift):
         scene = self.without(hide)
         return expected_depth(scene, view)[0] if channel == "depth" else render(scene, view, channel)
 
-    def objects(self, query: Query | str | Answer, *, encoder: TextEncoder | str | Path | None = None) -> Objects:
+    def objects(self, query: Query | str | Answer, *, encoder: AnyEncoder = None) -> Objects:
         """Group the splats of an answer to objects of touching splats with boxes (`liftcore.query.objects`)."""
         from liftcore.query.objects import objects
 
         return objects(self, self._answer(query, encoder))
 
-    def catalogue(
-        self, words: Sequence[str] = (), vectors: Any = None, *, encoder: TextEncoder | str | Path | None = None
-    ) -> Catalogue:
-        """List the objects on which masks of many views agree, found at lift time; words name them.
+    def tree(self, words: Sequence[str] = (), vectors: Any = None, *, encoder: AnyEncoder = None) -> SceneTree:
+        """List the objects on which masks of many views agree, found at lift time, with their parts and groups.
 
         Args:
-            words: n. vectors: [n, F], torch or numpy, their text vectors, of any length above zero. None: the encoder
-                computes them.
-        """
-        from liftcore.query.catalogue import catalogue
-
-        if words and vectors is None:
-            vectors = self.encoder(encoder).encode(words)
-        return catalogue(self, words, vectors)
-
-    def tree(
-        self,
-        words: Sequence[str] = (),
-        vectors: Any = None,
-        *,
-        encoder: TextEncoder | str | Path | None = None,
-    ) -> SceneTree:
-        """List the objects of `catalogue` with their parts and groups of them: a node's parts are nodes, too.
-
-        Args:
-            words, vectors, encoder: as in `catalogue`.
+            words: n, that name them. vectors: [n, F], torch or numpy, their text vectors, of any length above zero.
+                None: the encoder computes them.
         """
         from liftcore.query.catalogue import tree
 
@@ -243,13 +270,13 @@ class Scene(OpenedLift):
         words: Sequence[str] | None = None,
         vectors: Any = None,
         *,
-        encoder: TextEncoder | str | Path | None = None,
+        encoder: AnyEncoder = None,
         progress: Progress | bool | None = False,
     ) -> Segmentation:
         """Label every splat with the most similar word, or none (`liftcore.query.segment`).
 
         Args:
-            words: n different ones; None: all words of the encoder, which is a table. vectors: as in `catalogue`.
+            words: n different ones; None: all words of the encoder, which is a table. vectors: as in `tree`.
             progress: as `liftcore.lift` has it.
         """
         from liftcore.query.presence import references_of
@@ -269,7 +296,7 @@ class Scene(OpenedLift):
         words: Sequence[str] | None = None,
         *,
         top: int = 5,
-        encoder: TextEncoder | str | Path | None = None,
+        encoder: AnyEncoder = None,
     ) -> tuple[BestWord, ...]:
         """Return the words most similar to an example, the nearest first.
 
@@ -288,15 +315,13 @@ class Scene(OpenedLift):
             example = Vector(tuple(example))
         return best_words(self, example, words, reader.encode(words), top)
 
-    def words(self, encoder: TextEncoder | str | Path | None = None) -> list[str]:
+    def words(self, encoder: AnyEncoder = None) -> list[str]:
         """Return all words of an encoder that is a table, each once; another encoder is an InvalidQuery."""
         from liftcore.query.segment import words_of
 
         return words_of(self.encoder(encoder))
 
-    def askable(
-        self, text: str = "", count: int = 8, *, encoder: TextEncoder | str | Path | None = None
-    ) -> SuggestedWords:
+    def askable(self, text: str = "", count: int = 8, *, encoder: AnyEncoder = None) -> SuggestedWords:
         """Suggest at most ``count`` words that complete a text, and words of the lift's objects.
 
         Raises:
@@ -320,7 +345,7 @@ class Scene(OpenedLift):
 
         return layer_colours(self, what)
 
-    def labels(self, source: Answer | Mapping[str, Answer] | Segmentation | Catalogue | SceneTree) -> Labels:
+    def labels(self, source: Answer | Mapping[str, Answer] | Segmentation | SceneTree) -> Labels:
         """Return class and instance labels of all splats, as written to files (`liftcore.query.labels.labels`)."""
         from liftcore.query.labels import labels
 
@@ -355,19 +380,18 @@ class Scene(OpenedLift):
         suffix: str = "",
         view_mask: ViewMask | None = None,
         photo: Image | None = None,
-        encoder: TextEncoder | str | Path | None = None,
+        encoder: AnyEncoder = None,
     ) -> Iterable[bytes]:
         """Make a file, in blocks.
 
         Args:
-            source: a query or its answer, answers by names, a segmentation, a catalogue or a tree, the id of an
-                object or another node, or an array; None: the scene.
+            source: a query or its answer, answers by names, a segmentation, a tree, the id of an object or another
+                node, or an array; None: the scene.
             what: of an answer object, coloured, scores, selection, mask, attention or overlay; of a segmentation
-                coloured, labels, picture or splat_labels; of a catalogue csv; of all these and of a tree labelled
+                coloured, labels, picture or splat_labels; of a tree csv, of its objects; of all these labelled
                 (splats with labels), names (of the labels) or masks (COCO's JSON, in the views); of the scene a
                 channel of `render`, or splats; of an array npy, or mask of booleans [H, W]. Empty: the first of
-                these; of a segmentation or a catalogue as a .glb or .usdz labelled (a catalogue as a .ply, too),
-                .json masks.
+                these; of a segmentation or a tree as a .glb or .usdz labelled (a tree as a .ply, too), .json masks.
             view: of pictures, as in `view_mask`; of masks the name of the only one.
             suffix: of its name, where there are several formats.
             view_mask: the answer's mask in the view, if it is cached. photo: of the view, for an overlay.
@@ -376,17 +400,451 @@ class Scene(OpenedLift):
             InvalidQuery: there is no such file of the source, or the file would be empty.
             NotFound, InvalidLift, Unavailable: as the query, or as `render`.
         """
-        import numpy as np
-
-        from liftcore.query.export import array_blocks, blocks_of
+        from liftcore.query.export import blocks_of
         from liftcore.query.question import Query
 
-        if isinstance(source, np.ndarray):
-            return array_blocks(source, what)
         source = self._answer(source, encoder) if isinstance(source, str | Query) else source
         return blocks_of(self, source, what, view=view, suffix=suffix, view_mask=view_mask, photo=photo)
 
-    def _answer(self, query: Query | str | Answer, encoder: TextEncoder | str | Path | None) -> Answer:
+    def _answer(self, query: Query | str | Answer, encoder: AnyEncoder) -> Answer:
         from liftcore.query.question import Answer
 
         return query if isinstance(query, Answer) else self.ask(query, encoder=encoder, places=False)
+
+    def encoder(
+        self,
+        encoder: AnyEncoder = None,
+        *,
+        hint: str = "give encoder=, or vectors",
+        stand_in: bool = True,
+    ) -> TextEncoder:
+        """Open the encoder of a specification once, with a cache of its last texts; return an encoder as it is.
+
+        None: the lift's own words, else the encoder of its text space.
+
+        Args:
+            hint: of the error if there is none. stand_in: if the weights of the space's encoder are not available,
+                take its shipped table, which has its own words alone.
+
+        Raises:
+            InvalidQuery: it is something else, or the lift's text space names none.
+            Unavailable: its weights are not on this machine.
+        """
+        from liftcore.text import CachingEncoder, encoder_of_space, open_encoder
+
+        if encoder is not None and not isinstance(encoder, str | Path):
+            if not all(hasattr(encoder, name) for name in ("encode", "channels", "name")):
+                expected = "a text encoder (open_encoder) or its specification"
+                raise InvalidQuery("encoder", expected=expected, got=type(encoder).__name__)
+            return encoder
+        if encoder is None and self.table is not None:
+            return self.table
+        key = None if encoder is None else str(encoder)
+        if key not in self._encoders:
+            space = self.metadata.text_space
+            text_encoder = encoder_of_space(space, hint, stand_in=stand_in) if key is None else open_encoder(key)
+            self._encoders[key] = CachingEncoder(text_encoder)
+        return self._encoders[key]
+
+    @cached_property
+    def metadata(self) -> LiftMetadata:
+        """The lift's metadata with the present paths of its files; parsed at the first access.
+
+        Raises:
+            InvalidLift: the file has no valid lift metadata, or its rows are not those of the splats that they name.
+        """
+        from liftcore.values.lift_file import input_file, parse_metadata
+
+        metadata = parse_metadata(self._metadata_json, self.path)
+        splats = Path(metadata.splats.path)
+        if metadata.splats.path and self._new_paths["splats"] is None and splats.exists():
+            count = quick_count(splats)
+            # Another file may have this path now, whose number of rows does not matter.
+            if count not in (None, len(self.features)) and input_file(splats).sha256 == metadata.splats.sha256:
+                self._require_rows(count)
+        return self._with_places(metadata)
+
+    def _with_places(self, metadata: LiftMetadata) -> LiftMetadata:
+        """Return the metadata with the new paths of files that were moved."""
+        files = {
+            name: getattr(metadata, name).model_copy(update={"path": str(place)})
+            for name, place in self._new_paths.items()
+            if place is not None
+        }
+        return metadata.model_copy(update=files) if files else metadata
+
+    @cached_property
+    def world(self) -> WorldFrame:
+        """Up axis and length unit, as passed to the scene, else as stored in the lift; may be set."""
+        return self._world_override.known_or(self.metadata.world)
+
+    @cached_property
+    def table(self) -> TableEncoder | None:
+        """The words of its packs, as an encoder; None without any.
+
+        Raises:
+            InvalidTable: its words and their vectors do not fit together.
+        """
+        return own_words(self.metadata.words, self.embeddings)
+
+    @cached_property
+    def lift(self) -> Lift:
+        """The lift with torch tensors over the same memory."""
+        from liftcore.values.lift_file import open_lift
+
+        return open_lift(self.path)
+
+    @property
+    def channels(self) -> int:
+        """F."""
+        return self.features.rows.shape[1]
+
+    @cached_property
+    def norms(self) -> np.ndarray:
+        """[P] f32, the features' norms."""
+        return self.features.of_splats(self.features.norms)
+
+    @cached_property
+    def has_feature(self) -> np.ndarray:
+        """[P] bool, True if a splat has a feature."""
+        return self._has_feature & (self.norms > 0)
+
+    @cached_property
+    def all_have_features(self) -> bool:
+        """True if every splat has a feature."""
+        return bool(self.has_feature.all())
+
+    @cached_property
+    def weights(self) -> np.ndarray | None:
+        """[n] f32, total weights of the splats with a feature; None, which means equal ones, if all are zero."""
+        weights = self.total_weight if self.all_have_features else self.total_weight[self.has_feature]
+        return weights if weights.max(initial=0.0) > 0 else None
+
+    def weights_of(self, rows: np.ndarray) -> np.ndarray:
+        """Return the total weights [n] f64 of some splats; equal ones if all are zero."""
+        weights = self.total_weight[rows].astype(np.float64)
+        return weights if weights.any() else np.ones(len(weights))
+
+    @cached_property
+    def effective_count(self) -> float:
+        """Number of splats with a feature whose scores have as much noise as those of these total weights."""
+        count, weights = np.count_nonzero(self.has_feature), self.weights
+        return float(count if weights is None else weights.sum() ** 2 / max(float(np.square(weights).sum()), 1e-30))
+
+    @cached_property
+    def mean(self) -> np.ndarray:
+        """[F] f32, the mean of the unit features by total weight, which all features of the scene share."""
+        return self.features.mean(self.total_weight)
+
+    @cached_property
+    def rough_mean(self) -> np.ndarray:
+        """[F] f32, the mean of at most MOST_SAMPLED evenly spaced ones: faster, and accurate enough for words."""
+        rows = slice(None, None, -(-len(self.features) // MOST_SAMPLED) or 1)
+        return self.features.mean(self.total_weight[rows], rows)
+
+    @cached_property
+    def distinct(self) -> Self:
+        """The lift with a splat for each row of the features, of the row's total weight; itself if they are exact."""
+        if self.features.code is None:
+            return self
+        rows = copy(self)
+        for name in ("has_feature", "all_have_features", "weights", "norms"):
+            rows.__dict__.pop(name, None)
+        rows.__dict__ |= {"mean": self.mean, "rough_mean": self.rough_mean, "effective_count": self.effective_count}
+        rows.features = Features(self.features.rows)
+        rows.features.__dict__["norms"] = self.features.norms
+        rows.row_counts = self.features.of_rows(self.has_feature)
+        rows._has_feature = rows.row_counts > 0
+        weights = self.features.of_rows(np.where(self.has_feature, self.total_weight, np.float32(0.0)))
+        rows.total_weight = weights if weights.any() else rows.row_counts
+        rows.object = rows.node = None  # of splats
+        return rows
+
+    @cached_property
+    def object_means(self) -> np.ndarray:
+        """[N, F] f32, the unit mean of the features of each object of the lift (`mean_of`)."""
+        assert self.object is not None and self.object_views is not None
+        objects = np.where(self.has_feature, self.object, -1)
+        order = np.argsort(objects, kind="stable")
+        ends = np.searchsorted(objects[order], np.arange(len(self.object_views) + 1))
+        means = [self.mean_of(order[first:last]) for first, last in pairwise(ends.tolist())]
+        return np.stack(means) if means else np.zeros((0, self.channels), np.float32)
+
+    @cached_property
+    def object_numbers(self) -> tuple[np.ndarray, np.ndarray]:
+        """The object of each splat with a feature, [P] i32, -1 for none; and the total weight of each, [N] f64."""
+        assert self.object is not None and self.object_views is not None
+        numbers = np.where(self.has_feature, self.object, -1)
+        in_object = numbers >= 0
+        return numbers, np.bincount(numbers[in_object], self.total_weight[in_object], len(self.object_views))
+
+    def node_path(self, node: int) -> tuple[int, ...]:
+        """Return the nodes of the tree that contain a node, the largest first, and the node itself."""
+        assert self.node_parents is not None
+        path = [node]
+        while (above := int(self.node_parents[path[-1]])) >= 0:
+            path.append(above)
+        return tuple(reversed(path))
+
+    def node_kind(self, node: int) -> Literal["object", "part", "group"]:
+        """Return the kind of a node of the tree: the first nodes are the objects."""
+        objects = 0 if self.object_views is None else len(self.object_views)
+        if node < objects:
+            return "object"
+        return "part" if min(self.node_path(node)) < objects else "group"
+
+    def lack_of_objects(self) -> str:
+        """Explain why the lift has no objects, and how to get some."""
+        settings = self.metadata.settings
+        if settings.objects is False:
+            cause = "quality=draft sets it" if settings.quality == "draft" else "they were not requested"
+            return f"this lift has no objects, as objects=false ({cause}): lift again with objects=auto"
+        return (
+            "this lift has no objects: they are found by lifts of masks, by the preset default or the setting "
+            "objects; grids have no masks"
+        )
+
+    def members(self, number: int) -> np.ndarray:
+        """Return the splats of an object, or of another node of the tree with its parts, [P] bool.
+
+        Raises:
+            NotFound: the lift has no such object.
+        """
+        count = 0 if self.object_views is None else len(self.object_views)
+        nodes = count if self.node_parents is None else len(self.node_parents)
+        if self.object is None or not 0 <= number < nodes:
+            expected = f"a number from 0 to {nodes - 1}" if nodes else "a lift with objects"
+            hint = "the list of the lift's objects has them" if nodes else self.lack_of_objects()
+            raise NotFound("object", expected=expected, got=str(number), hint=hint)
+        if self.node is None or self.node_parents is None:
+            return self.object == number
+        below, above = np.zeros(nodes + 1, np.bool_), np.arange(nodes)
+        while (above >= 0).any():
+            below[:-1] |= above == number
+            above = np.where(above >= 0, self.node_parents[above], -1)
+        return below[self.node]  # the last entry is of splats without a node
+
+    def set_members(self, splat_set: SplatSet) -> np.ndarray:
+        """Return the splats of an object or of a selection, [P] bool; NotFound if there is none of that name."""
+        if splat_set.kind != "selection":
+            return self.members(int(splat_set.name))
+        selection = self.selections.get(splat_set.name)
+        if selection is None:
+            names = ", ".join(list(self.selections)[:20]) or "none yet"
+            raise NotFound("selection", expected=f"a selection of the scene: {names}", got=repr(splat_set.name))
+        return selection.splats
+
+    def without(self, sets: Sequence[str]) -> Self:
+        """Return a copy for pictures, in which splats of sets (``object:N``, ``selection:NAME``) are unseen."""
+        import torch
+
+        from liftcore.query.terms import parse_set
+
+        if not sets:
+            return self
+        members = [self.set_members(parse_set(notation, f"hide.{place}")) for place, notation in enumerate(sets)]
+        unseen = torch.from_numpy(np.logical_or.reduce(members)).to(self.splats.opacity_logits.device)
+        splats, scene = copy(self.splats), copy(self)
+        object.__setattr__(splats, "opacity_logits", splats.opacity_logits.masked_fill(unseen, -torch.inf))
+        scene.__dict__.pop("raster", None)
+        scene.__dict__["splats"] = splats
+        return scene
+
+    def within(self, members: np.ndarray) -> Self:
+        """Return a copy of the lift in which only some splats [P] bool have features, with nodes as its objects.
+
+        Means and shares of total weight are those of these splats, so that a query distinguishes among them.
+        """
+        inner = copy(self)
+        for name in (
+            "has_feature",
+            "all_have_features",
+            "weights",
+            "effective_count",
+            "mean",
+            "distinct",
+            "object_numbers",
+            "object_means",
+            "principal",
+        ):
+            inner.__dict__.pop(name, None)
+        inner._has_feature = self.has_feature & members
+        inner.total_weight = np.where(members, self.total_weight, np.float32(0.0))
+        rows = np.flatnonzero(inner._has_feature)
+        rows = rows[:: -(-len(rows) // MOST_SAMPLED) or 1]
+        inner.__dict__["rough_mean"] = self.features.mean(self.total_weight[rows], rows)
+        if self.node is not None and self.node_views is not None:
+            inner.object, inner.object_views = self.node, self.node_views
+        inner.node_features = None  # of all splats of the nodes
+        return inner
+
+    def mean_of(self, rows: np.ndarray) -> np.ndarray:
+        """Compute the unit mean [F] f32 of the unit features of splats [n] by total weight; of many, by a sample."""
+        rows = rows[:: -(-len(rows) // MOST_OF_OBJECT) or 1]
+        mean = self.features.mean(self.weights_of(rows), rows)
+        return mean / max(float(np.linalg.norm(mean)), 1e-30)
+
+    @cached_property
+    def principal(self) -> Tensor:
+        """[P, 3] f32 in 0..1, the features as colours."""
+        from liftcore.query.splat_colours import principal_colours
+
+        colours = principal_colours(self.features.rows, self.features.of_rows(self.total_weight))
+        return colours if self.features.code is None else colours[self.features.code.astype(np.int64)]
+
+    @cached_property
+    def splat_file(self) -> Path:
+        """The file of the splats that were lifted; of values in memory a temporary one.
+
+        Raises:
+            InvalidLift: it moved, is another than the one that was lifted, or has another number of splats.
+        """
+        if not self.metadata.splats.path and "splats" in self.__dict__:
+            from liftcore.io.splats import write_splats
+
+            folder = Path(mkdtemp(prefix="splatlift-"))
+            finalize(self, rmtree, folder, ignore_errors=True)
+            write_splats(folder / "splats.ply", self.splats)
+            return folder / "splats.ply"
+        path = self._verified_input("splats", self.metadata.splats)
+        self._require_rows(quick_count(path))
+        return path
+
+    def _require_rows(self, splats: int | None) -> None:
+        """Raise InvalidLift if the lift's rows are not those of its splats: answers would be of other splats.
+
+        Args:
+            splats: their number; None if it is not known yet.
+        """
+        if splats not in (None, len(self.features)):
+            raise InvalidLift(
+                str(self.path), expected=f"a row for each of its {splats} splats", got=f"{len(self.features)} rows",
+                hint=TRANSFER,
+            )  # fmt: skip
+
+    @cached_property
+    def splats(self) -> Splats:
+        """The splats that were lifted.
+
+        Raises:
+            InvalidLift: their file moved, or is another than the one that was lifted.
+        """
+        from liftcore.io.splats import read_splats
+
+        splats = read_splats(self.splat_file, self.kernel)
+        self._require_rows(splats.count)
+        return splats
+
+    @property
+    def kernel(self) -> str:
+        """The kernel of the lift; ``auto`` if its diagnostics do not have it."""
+        setting = self.metadata.settings.kernel
+        plan = self.metadata.diagnostics.get("plan")
+        lifted = plan.get("kernel") if setting == "auto" and isinstance(plan, dict) else setting
+        return str(lifted) if lifted in set(Kernel) else setting
+
+    @cached_property
+    def axes(self) -> np.ndarray:
+        """[3, P], `Splats.positions` axis by axis: a box around many of them takes a fifth of the time."""
+        if "splats" in self.__dict__:
+            return np.ascontiguousarray(self.splats.positions().T)
+        from liftcore.io.splats import read_places
+
+        places = read_places(self.splat_file, self.kernel)
+        self._require_rows(len(places))
+        return np.ascontiguousarray(places.T)
+
+    @cached_property
+    def cameras(self) -> Cameras:
+        """The cameras of the scene, all of them, also those that the lift left out.
+
+        Raises:
+            InvalidLift: their file moved, or is another than the one that was lifted.
+        """
+        from liftcore.io.cameras import read_cameras
+
+        return read_cameras(self._verified_input("cameras", self.metadata.cameras))
+
+    @cached_property
+    def raster(self) -> Raster:
+        """A for this scene."""
+        from liftcore.raster import open_raster
+        from liftcore.runtime.device import CPU
+
+        return open_raster(self.splats, CPU)
+
+    @property
+    def compositing(self) -> CompositingParams:
+        """Parameters that scores are rendered with: the lift's rendering scale of the opacity logits."""
+        return self.metadata.settings.compositing
+
+    def camera(self, view: str | Camera) -> Camera:
+        """Return the camera of a name; a camera is returned as it is.
+
+        Raises:
+            NotFound: no camera has this name.
+            InvalidLift: the cameras moved or changed since the lift.
+        """
+        return self.cameras[view] if isinstance(view, str) else view
+
+    def image(self, view: str | Camera, draw: Callable[[Camera], Tensor]) -> Tensor:
+        """Render an image [H, W, ..] of a view in its photo's pixels, by a function for pinholes (`in_photo`).
+
+        Args:
+            view: the name of a camera of the scene, or any camera in the frame of the splats.
+
+        Raises:
+            NotFound: no camera has this name.
+            InvalidQuery: its image is larger than pictures may be.
+            InvalidLift: the cameras moved or changed since the lift.
+        """
+        from liftcore.scene.cameras import drawn_by
+        from liftcore.scene.drawing import in_photo
+
+        camera = self.camera(view)
+        for width, height in (camera.photo_size, drawn_by(camera).photo_size):
+            if width * height > MOST_PIXELS:
+                raise InvalidQuery(
+                    "view", expected=f"an image of at most {MOST_PIXELS} pixels to draw",
+                    got=f"{width}x{height} in {camera.name!r}" + (", for its distorted photo" if camera.lens else ""),
+                    hint="give the scene a camera of that pose with width, height, fx, fy, cx and cy divided alike",
+                )  # fmt: skip
+        return in_photo(camera, draw)
+
+    def _verified_input(self, role: str, record: InputFile) -> Path:
+        """Return the path of an input whose bytes are those that were lifted.
+
+        Raises:
+            InvalidLift: there is no such file.
+        """
+        if not record.path:
+            raise InvalidLift(str(self.path), expected=f"a lift with a path of its {role}", got="values in memory",
+                              hint=f"give the {role} that were lifted, {role}=")  # fmt: skip
+        from liftcore.io.transforms import FRAME_FILE
+        from liftcore.values.lift_file import found_input
+
+        path, is_moved = Path(record.path), self._new_paths.get(role) is not None
+        if role == "splats" and is_moved and not record.sha256 and path.exists():
+            return path  # of values in memory, of which only the number is known
+        verified_path = found_input(role, record, self.metadata, None if is_moved else self.path)
+        if verified_path is not None:
+            return verified_path
+        option = f"say where they are with --{role} (in Python {role}=), or " if role in ("splats", "cameras") else ""
+        if not path.exists():
+            raise InvalidLift(
+                str(self.path), expected=f"its {role} at {path}, or beside the lift", got="nothing there",
+                hint=f"{option}move the {role} back or beside the lift",
+            )  # fmt: skip
+        remedy = f"restore them; {TRANSFER}" if role == "splats" else "restore them, or lift again"
+        note = f" ({FRAME_FILE} beside them counts too)" if role == "cameras" else ""
+        raise InvalidLift(
+            str(self.path), expected=f"the {role} that were lifted at {path}", got="a file with another SHA-256",
+            hint=f"the {role} changed since the lift{note}: {option}{remedy}",
+        )  # fmt: skip
+
+
+def as_numpy(array: Any) -> Any:
+    """Return a NumPy array over the same memory if it is on the CPU, else a copy; None stays None."""
+    if array is None or isinstance(array, np.ndarray):
+        return array
+    return array.detach().cpu().numpy() if hasattr(array, "detach") else np.asarray(array)

@@ -185,7 +185,7 @@ class Features:
     """Features [P, F] of splats: the rows that differ, and the row of each splat.
 
     Of a lift as codes these are some thousands, whatever its number of splats. So what queries compute of features
-    they compute of rows, with the total weight of a row's splats (`liftcore.query.opened.OpenedLift.distinct`), and
+    they compute of rows, with the total weight of a row's splats (`liftcore.query.scene.Scene.distinct`), and
     take the answer to the splats at the end. Exact features have a row a splat.
     """
 

@@ -7,14 +7,14 @@ by total weight, and if reference words do not show that it is absent (`liftcore
 own references). Absent words get no splats.
 
 The lift's tree corrects this: a word that names parts, where levels differ in meaning, gets their nodes
-(`liftcore.query.selection.parts_of_words`); and splats of a node without a word get the word of most of the node.
+(`liftcore.query.selection.part_nodes`); and splats of a node without a word get the word of most of the node.
 """
 
 from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -25,11 +25,11 @@ from liftcore.query.areas import MINIMUM_ROW_SUM
 from liftcore.query.colours import cluster_colours
 from liftcore.query.directions import directions
 from liftcore.query.objects import trimmed_box
-from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.presence import LEAST_WORDS, References, estimate_presence, references_of_space
 from liftcore.query.question import BestWord, LabelSummary, NamedSplats, Query
+from liftcore.query.scene import Scene, as_numpy
 from liftcore.query.scores import cosines, norms_of
-from liftcore.query.selection import levels_disagree, parts_of_words
+from liftcore.query.selection import CompetingWords, levels_disagree, part_nodes
 from liftcore.query.terms import Example
 from liftcore.query.threshold import find_threshold
 from liftcore.runtime.one_line import one_line
@@ -111,7 +111,7 @@ def words_of(encoder: TextEncoder) -> list[str]:
 
 @one_thread()
 def segment(
-    scene: OpenedLift,
+    scene: Scene,
     words: Sequence[str],
     vectors: Any,
     progress: Progress = silent,
@@ -203,16 +203,16 @@ def segment(
     return Segmentation(words, labels, score, margin, summaries)
 
 
-def _parts(scene: OpenedLift, unit: np.ndarray, references: References | str | None) -> np.ndarray:
+def _parts(scene: Scene, unit: np.ndarray, references: References | str | None) -> np.ndarray:
     """Return the nodes of parts that each of some words [n, F] f32 names, [n, N] bool."""
     mask = np.zeros((len(unit), 0 if scene.node_parents is None else len(scene.node_parents)), np.bool_)
     if isinstance(references, References) and levels_disagree(scene):
-        for row, nodes in enumerate(parts_of_words(scene, references, unit)):
-            mask[row, nodes] = True
+        for row, word in enumerate(unit):
+            mask[row, part_nodes(scene, CompetingWords.among(references, word[None]))] = True
     return mask
 
 
-def _by_nodes(scene: OpenedLift, labels: np.ndarray, weights: np.ndarray, parts: np.ndarray) -> np.ndarray:
+def _by_nodes(scene: Scene, labels: np.ndarray, weights: np.ndarray, parts: np.ndarray) -> np.ndarray:
     """Correct labels by the lift's nodes: parts that a word names, and splats without a word; [P] i32.
 
     Args:
@@ -250,7 +250,7 @@ class _Nearest:
         self.row[nearer] = row
 
 
-def _scores(scene: OpenedLift, vectors: np.ndarray, rows: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+def _scores(scene: Scene, vectors: np.ndarray, rows: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
     """Yield each row with the cosines [K] f32 of its vector; AT_ONCE rows in one pass over the features."""
     for first in range(0, len(rows), AT_ONCE):
         block = rows[first : first + AT_ONCE]
@@ -259,7 +259,7 @@ def _scores(scene: OpenedLift, vectors: np.ndarray, rows: Sequence[int]) -> Iter
 
 
 def best_words(
-    scene: OpenedLift, example: Example, words: Sequence[str], vectors: Any, count: int = 5
+    scene: Scene, example: Example, words: Sequence[str], vectors: Any, count: int = 5
 ) -> tuple[BestWord, ...]:
     """Return the words most similar to an example, the nearest first.
 
@@ -276,28 +276,7 @@ def best_words(
     return tuple(BestWord(word=words[row], score=float(scores[row])) for row in nearest)
 
 
-def named_ply(scene: OpenedLift, segmentation: Segmentation) -> Iterable[bytes]:
-    """Write all splats in the colours of their words, grey without one, as a file in blocks.
-
-    Raises:
-        InvalidLift: the splats moved or changed since the lift.
-        InvalidSplats: their file holds no colours; raised with the first block.
-    """
-    from liftcore.io.splats import recoloured
-
-    return recoloured(scene.splat_file, segmentation.colours[segmentation.values])
-
-
-def word_map(scene: OpenedLift, segmentation: Segmentation, view: str | Camera) -> np.ndarray:
-    """Render the value of the word (`Segmentation.values`) with the most weight on each ray, [H, W] i32.
-
-    Raises:
-        NotFound, InvalidQuery, InvalidLift: as `liftcore.query.render.view_mask`.
-    """
-    return value_map(scene, segmentation.values, view)
-
-
-def value_map(scene: OpenedLift, values: np.ndarray, view: str | Camera) -> np.ndarray:
+def value_map(scene: Scene, values: np.ndarray, view: str | Camera) -> np.ndarray:
     """Render the splats' value [P] i32 with the most weight on each ray, [H, W] i32; 0 where it misses the scene.
 
     Raises:
@@ -334,27 +313,12 @@ def map_png(values: np.ndarray, segmentation: Segmentation) -> bytes:
 
 
 def picture_png(image: np.ndarray, values: np.ndarray, segmentation: Segmentation) -> bytes:
-    """Tint a view [H, W, 3] u8 with the colours of its words, and draw a legend next to it, as a PNG."""
-    from PIL import Image, ImageDraw, ImageFont
+    """Tint a view [H, W, 3] u8 with the colours of its words, and list them below it, as a PNG."""
+    from liftcore.query.render import captioned_png
 
     colours = segmentation.colours
     tinted = np.where(values[..., None] > 0, (0.4 * image + 0.6 * colours[values]).astype(np.uint8), image // 2)
     pixels = np.bincount(values.ravel(), minlength=len(colours))
-    visible = [place for place in np.argsort(-pixels, kind="stable").tolist() if place and pixels[place]][
-        :LEGEND_WORDS
-    ]
-    size = max(12, image.shape[0] // 30)
-    font = ImageFont.load_default(size)
-    words = [segmentation.named_words[place - 1].word for place in visible] or ["no word is here"]
-    width = int(max(font.getlength(word) for word in words)) + 3 * size
-    canvas = Image.new("RGB", (image.shape[1] + width, max(image.shape[0], (2 * len(words) + 1) * size)), "white")
-    canvas.paste(Image.fromarray(tinted), (0, 0))
-    draw = ImageDraw.Draw(canvas)
-    for line, word in enumerate(words):
-        x, y = image.shape[1] + size // 2, size // 2 + line * 2 * size
-        if visible:
-            draw.rectangle((x, y, x + size, y + size), fill=tuple(colours[visible[line]].tolist()))
-        draw.text((x + 1.5 * size, y), word, fill="black", font=font)
-    content = io.BytesIO()
-    canvas.save(content, format="PNG")
-    return content.getvalue()
+    visible = [place for place in np.argsort(-pixels, kind="stable").tolist() if place and pixels[place]]
+    lines = [(segmentation.named_words[place - 1].word, colours[place]) for place in visible[:LEGEND_WORDS]]
+    return captioned_png(tinted, lines or [("no word is here", colours[0])])

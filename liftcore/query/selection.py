@@ -36,7 +36,7 @@ from liftcore.query.threshold import LEAST_SHARE
 from liftcore.runtime.cores import cores
 
 if TYPE_CHECKING:
-    from liftcore.query.opened import OpenedLift
+    from liftcore.query.scene import Scene
 
 NEAR = 0.9  # share of the selected total weight at which the word must be among the nearest; .5 lets two objects pass
 SAMPLED = 256  # splats sampled from each octave of the ranking: a million splats have twelve octaves
@@ -72,16 +72,16 @@ class CompetingWords:
         is_own = (competitors.vectors @ directions.T >= SAME_WORD).any(axis=1)
         return cls(directions, competitors.vectors[~is_own], 0)
 
-    def count_nearer(self, scene: OpenedLift, rows: np.ndarray) -> np.ndarray:
+    def count_nearer(self, scene: Scene, rows: np.ndarray) -> np.ndarray:
         """Count the words that are nearer to each of some splats [n] than the query's words, [n] i64."""
         return np.minimum(*nearer_counts(scene.features[rows], scene.norms[rows], scene.rough_mean, *self._pair))
 
-    def count_nearer_means(self, scene: OpenedLift, means: np.ndarray) -> np.ndarray:
+    def count_nearer_means(self, scene: Scene, means: np.ndarray) -> np.ndarray:
         """Count the words that are nearer to unit features [n, F] than the query's words, [n] i64."""
         ones = np.ones(len(means), np.float32)
         return np.minimum(*nearer_counts(means, ones, scene.rough_mean, *self._pair))
 
-    def near_share(self, scene: OpenedLift, rows: np.ndarray) -> float:
+    def near_share(self, scene: Scene, rows: np.ndarray) -> float:
         """Return the share of the total weight of some splats, of a sample of them, that the words are near to."""
         rows = rows[:: -(-len(rows) // _BLOCK) or 1]
         near = self.count_nearer(scene, rows) <= self.nearer_limit
@@ -101,9 +101,7 @@ class RankComparison:
     rest: float  # share of the total weight below the threshold for which the word is among the nearest
 
 
-def compare_ranks(
-    scene: OpenedLift, scores: np.ndarray, threshold: float, competitors: CompetingWords
-) -> RankComparison:
+def compare_ranks(scene: Scene, scores: np.ndarray, threshold: float, competitors: CompetingWords) -> RankComparison:
     """Compare the splats of a ranking with competing words, from the highest score down.
 
     A sample is compared, denser at higher scores: `SAMPLED` evenly spaced splats of each octave of the ranking. Where
@@ -135,7 +133,7 @@ def compare_ranks(
     return RankComparison(float(lowest), share, float(rest))
 
 
-def nearest_to_query(scene: OpenedLift, selected: np.ndarray, competitors: CompetingWords) -> np.ndarray:
+def nearest_to_query(scene: Scene, selected: np.ndarray, competitors: CompetingWords) -> np.ndarray:
     """Return the selected splats [P] bool to which no competing word is nearer than the query's words, [P] bool."""
     mask = np.zeros_like(selected)
     rows = np.flatnonzero(selected)
@@ -152,9 +150,7 @@ def nearest_to_query(scene: OpenedLift, selected: np.ndarray, competitors: Compe
     return mask
 
 
-def correct_by_objects(
-    scene: OpenedLift, selected: np.ndarray, competitors: CompetingWords
-) -> tuple[np.ndarray, str]:
+def correct_by_objects(scene: Scene, selected: np.ndarray, competitors: CompetingWords) -> tuple[np.ndarray, str]:
     """Correct a selection [P] bool by the objects of the region graph.
 
     Args:
@@ -205,13 +201,13 @@ def correct_by_objects(
     return corrected, ", ".join(clauses)
 
 
-def levels_disagree(scene: OpenedLift) -> bool:
+def levels_disagree(scene: Scene) -> bool:
     """Return True if masks of parts and of wholes differ in meaning: then a splat's feature, their sum, has both."""
     level_agreement = (scene.metadata.diagnostics.get("objects") or {}).get("level_agreement")
     return level_agreement is not None and level_agreement < LEVELS_AGREE
 
 
-def part_nodes(scene: OpenedLift, competitors: CompetingWords) -> list[int]:
+def part_nodes(scene: Scene, competitors: CompetingWords) -> list[int]:
     """Return the parts that a query's words name, in a lift whose levels differ in meaning; [] if levels agree.
 
     A splat's feature is the sum over all levels, so that words of parts also match their wholes. A node has the
@@ -228,36 +224,17 @@ def part_nodes(scene: OpenedLift, competitors: CompetingWords) -> list[int]:
     )
 
 
-def parts_of_words(scene: OpenedLift, references: References, words: np.ndarray) -> list[list[int]]:
-    """Return `part_nodes` of each word [n, F] f32, unit; nodes are compared with the references once for all."""
-    nodes = _NodeMeanings.of(scene)
-    if nodes is None:
-        return [[] for _ in words]
-    cosines = products(nodes.vectors, np.ones(len(nodes.vectors), np.float32), words, references.vectors)
-    means = words @ scene.rough_mean, references.vectors @ scene.rough_mean
-    centred = tuple(table - mean for table, mean in zip(cosines, means, strict=True))
-    parts = []
-    for row, word in enumerate(words):
-        rows, limit = references.against(word)
-        nearer = [
-            (reference_cosines[:, rows] >= own_cosines[:, row, None]).sum(axis=1)
-            for own_cosines, reference_cosines in (cosines, centred)
-        ]
-        parts.append(nodes.select_parts(cosines[0][:, row], np.minimum(*nearer) <= limit))
-    return parts
-
-
 @dataclass(frozen=True)
 class _NodeMeanings:
     """Features of the nodes of a lift's tree, of a lift whose levels differ in meaning."""
 
-    scene: OpenedLift
+    scene: Scene
     parents: np.ndarray  # [N] i32
     vectors: np.ndarray  # [N, F] f32, unit; zeros for none
     widest: np.ndarray  # [N] i64, the largest node of the same meaning above each, or itself
 
     @classmethod
-    def of(cls, scene: OpenedLift) -> _NodeMeanings | None:
+    def of(cls, scene: Scene) -> _NodeMeanings | None:
         """Return the meanings of a lift's nodes; None if its levels agree, or it has no tree."""
         parents = scene.node_parents
         if parents is None or scene.node_features is None or not levels_disagree(scene):
@@ -291,7 +268,7 @@ class _NodeMeanings:
         return parts
 
 
-def objects_within(scene: OpenedLift, selected: np.ndarray) -> np.ndarray:
+def objects_within(scene: Scene, selected: np.ndarray) -> np.ndarray:
     """Return the objects [N] bool of which `PARTLY_SELECTED` or more is among the selected splats [P] bool."""
     if scene.object is None or scene.object_views is None or len(scene.object) != len(selected):
         return np.zeros(0, np.bool_)
@@ -303,7 +280,7 @@ def objects_within(scene: OpenedLift, selected: np.ndarray) -> np.ndarray:
     return (inside > 0) & (inside >= PARTLY_SELECTED * totals)
 
 
-def add_objects(scene: OpenedLift, selected: np.ndarray) -> np.ndarray:
+def add_objects(scene: Scene, selected: np.ndarray) -> np.ndarray:
     """Add to selected splats [P] bool the objects of which `PARTLY_SELECTED` or more is selected, with all parts."""
     objects = objects_within(scene, selected)
     return selected | (scene.has_feature & np.append(objects, False)[scene.object]) if objects.any() else selected
@@ -314,7 +291,7 @@ def _quantity(count: int, noun: str) -> str:
 
 
 def _objects_of_other_words(
-    scene: OpenedLift, objects: np.ndarray, selected: np.ndarray, among: np.ndarray, competitors: CompetingWords
+    scene: Scene, objects: np.ndarray, selected: np.ndarray, among: np.ndarray, competitors: CompetingWords
 ) -> list[int]:
     """Return the objects to whose selected splats the object's own best word is nearer than the query's words.
 
@@ -332,7 +309,7 @@ def _objects_of_other_words(
     return numbers
 
 
-def _nearest_to(scene: OpenedLift, rows: np.ndarray, means: np.ndarray, target: int) -> np.ndarray:
+def _nearest_to(scene: Scene, rows: np.ndarray, means: np.ndarray, target: int) -> np.ndarray:
     """Return those of some splats [n] that are nearer to one object than to any other, about the scene's mean.
 
     Args:
@@ -350,7 +327,7 @@ def _nearest_to(scene: OpenedLift, rows: np.ndarray, means: np.ndarray, target: 
     return rows[is_nearest[inverse]]
 
 
-def _about(scene: OpenedLift, means: np.ndarray, mean: np.ndarray) -> np.ndarray:
+def _about(scene: Scene, means: np.ndarray, mean: np.ndarray) -> np.ndarray:
     """Compute the cosines [n] f32 of unit features [n, F] and [F] about the scene's mean."""
     offsets, offset = means - scene.rough_mean, mean - scene.rough_mean
     lengths = np.linalg.norm(offsets, axis=1) * np.linalg.norm(offset)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import binascii
-import math
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Self
@@ -15,8 +14,8 @@ from liftcore.errors import InvalidQuery
 from liftcore.query.ask import ask
 from liftcore.query.edits import Edit
 from liftcore.query.objects import MOST_SPLATS, object_box, objects
-from liftcore.query.opened import MOST_PIXELS, OpenedLift
 from liftcore.query.question import Answer, Box, Query
+from liftcore.query.scene import MOST_PIXELS, Scene
 from liftcore.query.terms import PixelBox, Stroke
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.touching import REACH, spreads_along, touching_pairs
@@ -55,7 +54,7 @@ class Selection:
         scene: an opened lift. name: ``selection:NAME`` in queries. splats: [P] bool at the start; None: none.
     """
 
-    def __init__(self, scene: OpenedLift, name: str, splats: np.ndarray | None = None) -> None:
+    def __init__(self, scene: Scene, name: str, splats: np.ndarray | None = None) -> None:
         self._scene, self.name = scene, name
         start = np.zeros(len(scene.features), np.bool_) if splats is None else _booleans(scene, splats)
         self._steps, self._place = [Step.of({"operation": "set"}, start)], 0
@@ -77,7 +76,7 @@ class Selection:
     def box(self) -> Box | None:
         """The box of its large groups of touching splats (`object_box`); None without splats."""
         rows = np.flatnonzero(self.splats)
-        return object_box(self._scene.splats, rows, _weights(self._scene, rows)) if rows.size else None
+        return object_box(self._scene.splats, rows, self._scene.weights_of(rows)) if rows.size else None
 
     @property
     def history(self) -> tuple[dict[str, Any], ...]:
@@ -118,9 +117,7 @@ class Selection:
         return self
 
 
-def _edit_of(
-    scene: OpenedLift, operation: str | Edit, source: Any, fields: dict[str, Any]
-) -> tuple[Edit, Answer | None]:
+def _edit_of(scene: Scene, operation: str | Edit, source: Any, fields: dict[str, Any]) -> tuple[Edit, Answer | None]:
     """Return an edit from Python's arguments, and the answer that is its source."""
     answer = source if isinstance(source, Answer) else None
     if isinstance(operation, Edit):
@@ -138,7 +135,7 @@ def splats_of_bits(bits: bytes, count: int) -> np.ndarray:
     return np.unpackbits(np.frombuffer(bits, np.uint8), count=count, bitorder="little").astype(np.bool_)
 
 
-def apply_edit(scene: OpenedLift, splats: np.ndarray, edit: Edit, answer: Answer | None = None) -> np.ndarray:
+def apply_edit(scene: Scene, splats: np.ndarray, edit: Edit, answer: Answer | None = None) -> np.ndarray:
     """Apply an edit to splats [P] bool, and return them, [P] bool.
 
     Args:
@@ -155,7 +152,7 @@ def apply_edit(scene: OpenedLift, splats: np.ndarray, edit: Edit, answer: Answer
     return source if edit.operation == "set" else splats | source if edit.operation == "add" else splats & ~source
 
 
-def _source(scene: OpenedLift, edit: Edit, answer: Answer | None) -> np.ndarray:
+def _source(scene: Scene, edit: Edit, answer: Answer | None) -> np.ndarray:
     count = len(scene.features)
     if answer is not None:
         return objects(scene, answer).numbers >= 0 if answer.query.keeps_some else answer.selected
@@ -187,58 +184,22 @@ def area_mask(area: PixelBox | Stroke, size: tuple[int, int], radius: float) -> 
     Args:
         size: width and height of the image.
     """
-    width, height = size
+    mask = np.zeros(size[::-1], np.bool_)
     if isinstance(area, PixelBox):
-        mask = np.zeros((height, width), np.bool_)
         mask[max(0, area.y0) : max(0, area.y1), max(0, area.x0) : max(0, area.x1)] = True
         return mask
-    # Along each row: count the pieces of the stroke that begin at a pixel, less those that end before it. Discs
-    # around its corners and rectangles between them are convex, so a row crosses each of them once.
-    changes = np.zeros((height, width + 1), np.int16)
-    corners = np.array(area.pixels, np.float64)
-    pieces = [_disc_runs(corner, radius, height) for corner in corners]
-    pieces += [_rectangle_runs(ends, radius, height) for ends in pairwise(corners)]
-    for rows, low, high in pieces:
-        first, end = np.clip(np.ceil(low - ROUNDING), 0, width), np.clip(np.floor(high + ROUNDING) + 1, 0, width)
-        changes[rows, first.astype(np.int64)] += 1
-        changes[rows, np.maximum(first, end).astype(np.int64)] -= 1
-    return np.cumsum(changes[:, :-1], axis=1, dtype=np.int16) > 0
+    reach = radius + ROUNDING
+    for begin, end in pairwise(np.array(area.pixels, np.float64)):
+        left, top = np.clip(np.ceil(np.minimum(begin, end) - reach), 0, size).astype(np.int64).tolist()
+        right, bottom = np.clip(np.floor(np.maximum(begin, end) + reach) + 1, 0, size).astype(np.int64).tolist()
+        x, y = np.arange(left, right) - begin[0], np.arange(top, bottom)[:, None] - begin[1]
+        along_x, along_y = (end - begin).tolist()
+        share = np.clip((x * along_x + y * along_y) / max(along_x**2 + along_y**2, 1.0), 0.0, 1.0)
+        mask[top:bottom, left:right] |= np.hypot(x - share * along_x, y - share * along_y) <= reach
+    return mask
 
 
-def _rows_between(low: float, high: float, height: int) -> np.ndarray:
-    """Return the rows of an image between two coordinates, [n] i64."""
-    return np.arange(max(0, math.ceil(low - ROUNDING)), min(height, math.floor(high + ROUNDING) + 1))
-
-
-def _disc_runs(centre: np.ndarray, radius: float, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the rows [n] i64 of an image that a disc crosses, and its first and last column in each, [n] f64."""
-    x, y = centre.tolist()
-    rows = _rows_between(y - radius, y + radius, height)
-    half = np.sqrt(np.maximum(radius**2 - (rows - y) ** 2, 0))
-    return rows, x - half, x + half
-
-
-def _rectangle_runs(
-    ends: tuple[np.ndarray, np.ndarray], radius: float, height: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return rows, first and last columns, as `_disc_runs`, of the rectangle within a radius of a line segment."""
-    begin, end = ends
-    across = (end - begin)[::-1] * (-radius, radius) / max(np.hypot(*(end - begin)), 1.0)
-    corners = [begin + across, end + across, end - across, begin - across]
-    rows = _rows_between(min(y for _, y in corners), max(y for _, y in corners), height)
-    low, high = np.full(len(rows), np.inf), np.full(len(rows), -np.inf)
-    for (x, y), (to_x, to_y) in zip(corners, [*corners[1:], corners[0]], strict=True):
-        meets = (rows >= min(y, to_y) - ROUNDING) & (rows <= max(y, to_y) + ROUNDING)
-        if y == to_y:
-            crossing = np.array([[x], [to_x]])
-        else:
-            crossing = np.clip(x + (rows - y) * ((to_x - x) / (to_y - y)), min(x, to_x), max(x, to_x))[None]
-        low = np.where(meets, np.minimum(low, crossing.min(axis=0)), low)
-        high = np.where(meets, np.maximum(high, crossing.max(axis=0)), high)
-    return rows, low, high
-
-
-def splats_under(scene: OpenedLift, camera: Camera, mask: np.ndarray, *, through: bool = False) -> np.ndarray:
+def splats_under(scene: Scene, camera: Camera, mask: np.ndarray, *, through: bool = False) -> np.ndarray:
     """Return the splats whose centres a camera sees in a mask [H, W] bool of its image, [P] bool.
 
     A splat is hidden if it lies completely, to `REACH` standard deviations, behind the splat at which the ray through
@@ -299,7 +260,7 @@ def _pinhole_mask(camera: Camera, mask: np.ndarray) -> np.ndarray:
     return pinhole_mask
 
 
-def _grow(scene: OpenedLift, splats: np.ndarray, steps: int, core: np.ndarray | None = None) -> np.ndarray:
+def _grow(scene: Scene, splats: np.ndarray, steps: int, core: np.ndarray | None = None) -> np.ndarray:
     """Add to splats [P] bool those that touch one of them, ``steps`` times; ``core`` bounds the search."""
     rows = _near(scene, splats if core is None else core, steps)
     inside = splats[rows]
@@ -314,7 +275,7 @@ def _grow(scene: OpenedLift, splats: np.ndarray, steps: int, core: np.ndarray | 
     return full
 
 
-def _near(scene: OpenedLift, splats: np.ndarray, steps: int) -> np.ndarray:
+def _near(scene: Scene, splats: np.ndarray, steps: int) -> np.ndarray:
     """Return the splats around some [P] bool among which neighbours are searched, [n] i64.
 
     Raises:
@@ -333,14 +294,9 @@ def _near(scene: OpenedLift, splats: np.ndarray, steps: int) -> np.ndarray:
     return rows
 
 
-def _booleans(scene: OpenedLift, splats: Any) -> np.ndarray:
+def _booleans(scene: Scene, splats: Any) -> np.ndarray:
     splats = np.asarray(splats)
     if splats.dtype != np.bool_ or splats.shape != (len(scene.features),):
         expected = f"a boolean for each of {len(scene.features)} splats"
         raise InvalidQuery("splats", expected=expected, got=f"{splats.dtype} {list(splats.shape)}")
     return splats
-
-
-def _weights(scene: OpenedLift, rows: np.ndarray) -> np.ndarray:
-    weights = scene.total_weight[rows].astype(np.float64)
-    return weights if weights.any() else np.ones(len(rows))

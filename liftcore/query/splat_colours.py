@@ -22,9 +22,8 @@ _LARGEST_POWER = 1e30
 
 SAMPLE = 32_768  # rows of which the principal components are computed
 SAMPLE_FLOATS = 1 << 26  # most numbers in them: there are fewer rows of very many channels
-SEED = 0
 COMPONENTS = 3
-_RANGE = (0.02, 0.98)  # weighted-sample quantiles that the colours span
+_RANGE = (0.02, 0.98)  # quantiles of the sample that the colours span
 
 
 def view_colours(splats: Splats, camera: Camera) -> Tensor:
@@ -96,9 +95,8 @@ def _sh_basis(directions: Tensor, degree: int) -> Tensor:
 def principal_colours(features: np.ndarray, weights: np.ndarray) -> Tensor:
     """Map the first three principal components of unit features to red, green and blue.
 
-    The components are those of a seeded sample of the rows with probabilities by the weights: splats that no ray hits
-    have no influence. Signs are fixed (the largest entry of a component is positive), so the same lift has the same
-    colours in every run.
+    The components are those of evenly spaced rows with a weight: splats that no ray hits have no influence. Signs are
+    fixed (the largest entry of a component is positive), so the same lift has the same colours in every run.
 
     Args:
         features: [P, F] f16 or f32; zero rows stay black.
@@ -107,31 +105,22 @@ def principal_colours(features: np.ndarray, weights: np.ndarray) -> Tensor:
     Returns:
         [P, 3] f32 in 0..1.
     """
-    rows_of, odds_of = torch.from_numpy(features), torch.from_numpy(weights)
+    rows_of = torch.from_numpy(features)
     has_feature = (rows_of != 0).any(dim=1)
-    odds = torch.where(has_feature, odds_of.to(torch.float32), 0.0)
-    colours = torch.zeros(features.shape[0], COMPONENTS, dtype=torch.float32)
-    if not bool((odds > 0).any()):
+    colours = torch.zeros(len(features), COMPONENTS, dtype=torch.float32)
+    rows = torch.nonzero(has_feature & (torch.from_numpy(weights) > 0))[:, 0]
+    if not len(rows):
         return colours
-    rows = _draw(odds, max(COMPONENTS, min(SAMPLE, SAMPLE_FLOATS // features.shape[1])))
-    sample = _unit(rows_of[rows])
+    sample = _unit(rows_of[rows[:: -(-len(rows) // min(SAMPLE, SAMPLE_FLOATS // features.shape[1] + 1))]])
     centre = sample.mean(dim=0)
     axes = torch.from_numpy(principal_axes((sample - centre).numpy(), COMPONENTS))
-    projected = (sample - centre) @ axes
-    low, high = torch.quantile(projected, torch.tensor(_RANGE, dtype=torch.float32), dim=0)
+    low, high = torch.quantile((sample - centre) @ axes, torch.tensor(_RANGE, dtype=torch.float32), dim=0)
     at_a_time = rows_at_a_time(features.shape[1])
-    for first in range(0, features.shape[0], at_a_time):
+    for first in range(0, len(features), at_a_time):
         block = slice(first, first + at_a_time)
         levels = ((_unit(rows_of[block]) - centre) @ axes - low) / (high - low).clamp_min(1e-12)
         colours[block, : axes.shape[1]] = levels.clamp(0.0, 1.0) * has_feature[block, None]
     return colours
-
-
-def _draw(odds: Tensor, count: int) -> Tensor:
-    """Sample seeded rows [count] i64 with probabilities proportional to the odds [P] (inverse of the running sum)."""
-    running = torch.cumsum(odds.double(), dim=0)
-    marks = torch.rand(count, generator=torch.Generator().manual_seed(SEED), dtype=torch.float64) * running[-1]
-    return torch.searchsorted(running, marks, right=True).clamp_max(len(odds) - 1)
 
 
 def _unit(rows: Tensor) -> Tensor:

@@ -7,7 +7,6 @@ Examples stand in place of words, "more of this":
 | `VIEW:x,y` | of a pixel of a camera, ``sum_j A_ij x_j``; any camera, lifted or not |
 | `VIEW:box:x0,y0,x1,y1` | common to the pixels of a box, and not around it; columns x0 up to x1 without x1 |
 | `VIEW:stroke:x0,y0,x1,y1,...` | common to the pixels on the line through these corners, two or more |
-| `region:VIEW:LEVEL:ID` | the codebook row of a region of the lift's feature packs |
 | `splat:J` | the feature of a splat, by its row in the splat file |
 | `object:N` | the mean of an object's features, by its number in the lift (`liftcore.query.catalogue`) |
 | `selection:NAME` | the mean of the features of a selection (`liftcore.query.selections`) |
@@ -22,12 +21,11 @@ from dataclasses import dataclass
 from liftcore.errors import InvalidQuery
 
 SETS = "object:N or selection:NAME"
-NOTATIONS = f"VIEW:x,y, VIEW:box:x0,y0,x1,y1, VIEW:stroke:x0,y0,x1,y1,..., region:VIEW:LEVEL:ID, splat:J, {SETS}"
+NOTATIONS = f"VIEW:x,y, VIEW:box:x0,y0,x1,y1, VIEW:stroke:x0,y0,x1,y1,..., splat:J, {SETS}"
 _PIXEL = re.compile(r"(.+):\s*(-?\d{1,9})\s*,\s*(-?\d{1,9})\s*", re.ASCII | re.DOTALL)
 _AREA = re.compile(r"(.+):(box|stroke):([^:]*)", re.ASCII | re.DOTALL)
 AREAS = (":box", ":stroke")  # ends of a pixel's view that look like an area without its corners
 _INTEGER = re.compile(r"\s*-?\d{1,9}\s*", re.ASCII)
-_REGION = re.compile(r"region:(.+):(\d{1,9}):(\d{1,9})", re.ASCII | re.DOTALL)
 _SPLAT = re.compile(r"splat:(\d{1,18})", re.ASCII)
 _SET = re.compile(r"object:(?P<object>\d{1,9})|selection:(?P<selection>[^:,]{1,100})", re.ASCII)
 
@@ -70,18 +68,6 @@ class Stroke:
 
 
 @dataclass(frozen=True)
-class Region:
-    """A region of a feature pack that was lifted."""
-
-    view: str  # a view of the packs
-    level: int  # of its label map
-    region: int  # its label, the row of the view's codebook
-
-    def __str__(self) -> str:
-        return f"region:{self.view}:{self.level}:{self.region}"
-
-
-@dataclass(frozen=True)
 class SplatTerm:
     """A splat as an example."""
 
@@ -113,7 +99,7 @@ class Vector:
 
 
 Area = Pixel | PixelBox | Stroke  # of a camera's image
-Example = Area | Region | SplatTerm | SplatSet | Vector
+Example = Area | SplatTerm | SplatSet | Vector
 Term = str | Example  # a text, or an example
 
 
@@ -131,8 +117,6 @@ def parse_example(notation: str, argument: str = "like") -> Example:
     """
     if pixel := _PIXEL.fullmatch(notation):
         return Pixel(pixel[1], int(pixel[2]), int(pixel[3]))
-    if region := _REGION.fullmatch(notation):
-        return Region(region[1], int(region[2]), int(region[3]))
     if splat := _SPLAT.fullmatch(notation):
         return SplatTerm(int(splat[1]))
     if members := _SET.fullmatch(notation):

@@ -6,8 +6,9 @@ i32, -1 for splats in none, and ``cluster_features`` [K, F]; where objects were 
 none, and ``object_views`` [N, 5] i32, and of the tree of objects, parts and groups ``node`` [P] i32, ``node_parents``
 [T] i32, ``node_views`` [T, 5] i32, ``node_confidence`` [T] f32 and ``node_features`` [T, F] f16 (`Lift`); of packs
 with words their vectors, ``embeddings`` [n, F] f32. A lift as codes (`liftcore.solve.codes`) has ``code`` [P] u16,
-the row of ``features`` [K, F] of each splat, whose first row is zero. Its metadata hold settings, inputs with
-digests, the encoder, words, the diagnostics, timings and the version, as JSON.
+the row of ``features`` [K, F] of each splat, whose first row is zero. Columns of i32, and the confidence, are written
+as i16 and f16 where that loses nothing. Its metadata hold settings, inputs with digests, the encoder, words, the
+diagnostics, timings and the version, as JSON.
 """
 
 from __future__ import annotations
@@ -48,11 +49,14 @@ OBJECT_TENSORS = ("object", "object_views")  # in lifts that looked for objects
 NODE_TENSORS = ("node", "node_parents", "node_views", "node_confidence", "node_features")  # beside objects
 MOST_DEPTH = 63  # of a tree of nodes
 EMBEDDINGS = "embeddings"  # in lifts of packs with words
+NARROWED = {  # columns that take two bytes in the file, where that loses nothing
+    CONFIDENCE: np.float32, "cluster": np.int32, "object": np.int32, "node": np.int32,
+}  # fmt: skip
 SCHEMA = {  # types, and axes: P splats, K rows, F channels, C clusters, O objects, V views, N nodes, W words
     "features": ("f2 f4", "K F"), "code": ("u2", "P"), "total_weight": ("f4", "P"), "has_feature": ("?", "P"),
-    CONFIDENCE: ("f4", "P"), "cluster": ("i4", "P"), "cluster_features": ("f2 f4", "C F"),
-    "object": ("i4", "P"), "object_views": ("i4", "O V"),
-    "node": ("i4", "P"), "node_parents": ("i4", "N"), "node_views": ("i4", "N V"), "node_confidence": ("f4", "N"),
+    CONFIDENCE: ("f2 f4", "P"), "cluster": ("i2 i4", "P"), "cluster_features": ("f2 f4", "C F"),
+    "object": ("i2 i4", "P"), "object_views": ("i4", "O V"),
+    "node": ("i2 i4", "P"), "node_parents": ("i4", "N"), "node_views": ("i4", "N V"), "node_confidence": ("f4", "N"),
     "node_features": ("f2", "N F"), EMBEDDINGS: ("f4", "W F"),
 }  # fmt: skip
 
@@ -68,7 +72,16 @@ def save_lift(lift: Lift, path: Path | str) -> None:
             "node_features", expected=expected, got=got, hint=f"replace {', '.join(NODE_TENSORS)} by None"
         )
 
-    write_tensors(as_path(path), tensors_of(lift), {"splatlift": lift.metadata.model_dump_json()})
+    tensors = {name: _narrowed(tensor) if name in NARROWED else tensor for name, tensor in tensors_of(lift).items()}
+    write_tensors(as_path(path), tensors, {"splatlift": lift.metadata.model_dump_json()})
+
+
+def _narrowed(column: Tensor) -> Tensor:
+    """Return a column [P] i32 or f32 in half of the bytes, where that loses nothing."""
+    import torch
+
+    narrow = column.to(torch.float16 if column.is_floating_point() else torch.int16)
+    return narrow if torch.equal(narrow.to(column.dtype), column) else column
 
 
 def tensors_of(lift: Lift) -> dict[str, Tensor]:
@@ -107,6 +120,9 @@ def _read_arrays(source: Path, path: Path | str) -> tuple[dict[str, np.ndarray],
             raise ValueError(f"no {missing[0]} in it")
         arrays = {name: tensors[name] for name in SCHEMA if name in tensors}
         _check_tensors(arrays)
+        for name, dtype in NARROWED.items():
+            if name in arrays:
+                arrays[name] = arrays[name].astype(dtype, copy=False)
     except FileNotFoundError:
         raise InvalidLift(str(path), expected="a lift file", got="no such file") from None
     except (OSError, ValueError) as error:

@@ -63,8 +63,8 @@ async def create_lift(
 ) -> Lift:
     """Upload a lift file of the command line. It is checked whole.
 
-    Its splats and its file of cameras must be assets (404 names the missing one), its feature packs only for examples
-    by region. ``cameras`` names other cameras with the same poses, such as a zip of the folder that was lifted with.
+    Its splats and its file of cameras must be assets (404 names the missing one). ``cameras`` names other cameras
+    with the same poses, such as a zip of the folder that was lifted with.
     """
     async with receive_upload(request, deps) as (draft, digest):
         lift = await in_thread(deps, results.find_lift_file, deps.store, owner, digest)

@@ -45,7 +45,7 @@ from service.settings import encoder_label, encoder_spec, encoder_version
 from service.store import SERVICE, Owner
 
 NO_ENCODER: dict[str, Any] = {"encoder": None, "encoder_version": None}  # of a question without words
-REGION, SELECTION = "region:", "selection:"  # prefixes of examples that need the lift's packs, or a stored selection
+SELECTION = "selection:"  # prefix of examples that need a stored selection
 NPY, PNG, JSON = "application/x-npy", "image/png", "application/json"
 # The outputs of a question, by name: media type, and what they are; pictures need a view, or a camera in a body
 Output = Literal["objects", "scores", "selection", "mask", "attention", "splats"]
@@ -131,13 +131,11 @@ def scene_request(operation: str, lift: models.Lift, deps: Parts) -> dict[str, A
 
 
 def query_request(operation: str, question: Question, lift: models.Lift, deps: Parts, owner: Owner) -> dict[str, Any]:
-    """Return the request of a question: with the encoder of its texts, its selections, the packs of its regions."""
+    """Return the request of a question: with the encoder of its texts, and its selections."""
     work = scene_request(operation, lift, deps)
     examples = [str(item) for item in (*question.sets, *question.like, *question.unlike)]
     work |= with_selections(examples, lift, deps)
     work = with_encoder(work, question, lift, deps, owner) if question.texts else work | NO_ENCODER
-    if any(item.startswith(REGION) for item in examples):
-        work = with_packs(work, lift, deps, "like")
     return work | {"query": question.model_dump(mode="json", include=set(Query.deciding()))}
 
 
@@ -158,17 +156,6 @@ def bits_text(bits: bytes) -> str:
 def seen_from(view: models.Viewpoint) -> dict[str, Any]:
     """Return the camera of a picture: a view of the lift, or a camera of the request."""
     return {"view": view.view, "camera": view.camera and view.camera.model_dump()}
-
-
-def with_packs(work: dict[str, Any], lift: models.Lift, deps: Parts, argument: str | None) -> dict[str, Any]:
-    """Add the lift's feature packs, which have its regions, to a request."""
-    if argument is not None and len(lift.features) < lift.pack_count:
-        hint = "PUT /assets/features each of its packs before POST /lifts, or ask by splat:J or VIEW:x,y"
-        got = "one that was brought without some of them"
-        raise InvalidRequest(argument, expected="a lift whose feature packs are here", got=got, hint=hint)
-    packs = [deps.store.asset(SERVICE, asset) for asset in lift.features]
-    names = work["names"] | {str(pack.file): pack.client_name for pack in packs}
-    return work | {"features": [str(pack.file) for pack in packs], "names": names}
 
 
 def with_encoder(
@@ -198,7 +185,7 @@ def word_request(operation: str, words: Words, lift: models.Lift, deps: Parts, o
     """Return the request of many words."""
     work = with_encoder(scene_request(operation, lift, deps), words, lift, deps, owner)
     head = {"lift": lift.id, "encoder": encoder_label(work["encoder"])}
-    return with_packs(work, lift, deps, None) | {"words": words.words, "head": head}
+    return work | {"words": words.words, "head": head}
 
 
 # The routes
@@ -314,7 +301,7 @@ def example_text(example: str | tuple[float, ...]) -> str:
 
 @router.post("/query/what", response_model=NearestWordsAnswer)
 def name_example(words: NearestWordsRequest, request: Request, deps: Deps, owner: Caller) -> Response:
-    """List the words nearest to a pixel, a splat, a region or a vector."""
+    """List the words nearest to a pixel, a splat or a vector."""
     lift = deps.store.lift(owner, words.lift)
     work = word_request("what", words, lift, deps, owner) | {"example": words.example, "top": words.top}
     work["head"] |= {"example": example_text(words.example)}

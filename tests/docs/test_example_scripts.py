@@ -89,7 +89,7 @@ def test_shared_folder_opens_wherever_it_is_put(tiny: Path, tmp_path: Path) -> N
     ]
     (tiny / "shared").rename(tiny / "elsewhere")
     scene = lc.Scene(tiny / "elsewhere" / "lift.safetensors")
-    assert len(scene.catalogue().objects) == 3 and scene.render("middle", "rgb").max() > 0
+    assert len(scene.tree().objects) == 3 and scene.render("middle", "rgb").max() > 0
 
 
 def test_training_loop_finds_the_red_blob_alone() -> None:

@@ -55,7 +55,7 @@ REFUSALS = {  # words behind the lift -> what the line says
     "query apple": "'tiny' is not the name of an available encoder",
     "query apple --table {c}": "c.json: expected table as --table, got cameras",
     "query": "query: expected a text or an example",
-    "query --like splat:60": "splat:60: expected a splat in 0..59, got 60",
+    "query --like splat:60": "like.0: expected a splat in 0..59, got 60 in splat:60",
     "query --like nowhere": "--like: expected",
     "query --like splat:0 --mask {m}.png": "--mask: expected a view",
     "query --like splat:0 --camera {c} --mask {m}.png": "--camera: expected one camera, got 3 of them",
@@ -128,14 +128,13 @@ def test_labels_are_columns_with_names_and_boxes(lift: Path, table: list[object]
 def test_objects_are_written_one_by_one_and_as_a_table(lift: Path, tmp_path: Path) -> None:
     (tmp_path / "words.txt").write_text("lamp\napple\n")
     words = ["--vocabulary", tmp_path / "words.txt", "--encoder", f"table:{lift.with_name('words.safetensors')}"]
-    options = ["--into", tmp_path / "each", "--csv", tmp_path / "t.csv", "--features"]
+    options = ["--into", tmp_path / "each", "--csv", tmp_path / "t.csv"]
     document = run("objects", lift, *words, *options, "--json").document
-    scene, entries = lc.Scene(lift), document["answer"]["objects"]
+    scene, entries = lc.Scene(lift), document["answer"]["nodes"]
     assert {entry["name"] for entry in entries} == {"apple", "lamp"} and len(entries) == 3
     for entry in entries:
         splats = lc.read_splats(document["files"][f"object-{entry['id']}"])
         assert torch.equal(splats.means, scene.splats.means[scene.members(entry["id"])])
-        assert np.argmax(entry["feature"]) == CLUSTER[scene.members(entry["id"])][0]
     rows = (tmp_path / "t.csv").read_text().splitlines()
     assert len(rows) == 4 and [row.split(",")[0] for row in rows[1:]] == [str(entry["id"]) for entry in entries]
 

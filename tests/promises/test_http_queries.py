@@ -127,7 +127,6 @@ WRONG: dict[str, tuple[str, dict[str, Any], int, str]] = {
     "an unknown word": ("/query", {"text": ["apple", "zeppelin"], "negatives": ["lamp"]}, 422, "text.1"),
     "a splat that is none": ("/query", {"like": ["splat:1", "splat:60"]}, 422, "like.1"),
     "an unknown view": ("/query", {"unlike": ["behind:1,1"], "like": ["splat:1"]}, 404, "unlike.0"),
-    "an unknown region": ("/query", {"like": ["region:left:7:0"]}, 404, "like.0"),
     "a pixel outside": ("/query", {"like": ["middle:99,0"]}, 422, "like.0"),
     "an unknown lift": ("/query", {"text": ["apple"], "lift": NO_ID}, 404, "lift"),
     "no lift's id": ("/query", {"text": ["apple"], "lift": "../../etc/passwd"}, 422, "lift"),

@@ -23,7 +23,7 @@ from tests.server import serving, wait_for_end
 from tests.tiny_scene import HEIGHT, VIEWS, WORDS
 
 EXAMPLES = (
-    "middle:6,12", f"middle:26,{HEIGHT // 2}", "splat:0", "splat:47", "region:left:0:1", "middle:box:3,4,10,20",
+    "middle:6,12", f"middle:26,{HEIGHT // 2}", "splat:0", "splat:47", "middle:box:3,4,10,20",
     "middle:stroke:26,5,26,12,27,19", "object:1", "splat:60", "middle:box:9,9,3,3", "none",
 )  # the last three are refused  # fmt: skip
 FIELDS: dict[str, st.SearchStrategy[Any]] = {
@@ -44,7 +44,7 @@ ROWS: list[dict[str, Any]] = [
     {"like": ["middle:6,12"], "unlike": ["splat:47"]},
     {"like": ["middle:box:3,4,10,20"]},
     {"like": ["middle:stroke:26,5,26,12,27,19"], "keep": "largest"},
-    {"like": ["region:left:0:1"], "instances": 1},
+    {"like": ["splat:20"], "instances": 1},
     {"like": ["splat:47"], "threshold": -1.0, "min_size": 21},
     {"sets": ["object:0", "object:2"]},
     {"text": ["book"], "threshold": "paper", "absent": "keep"},
@@ -86,7 +86,6 @@ class Interfaces:
         self.path = folder / "downloaded.lift.safetensors"
         self.path.write_bytes(client.get(job["links"]["features"]).content)
         self.scene = lc.Scene(self.path, self.files["splats"], self.files["cameras"])
-        self.scene.find_packs([self.files["features"]])
 
     def get(self, path: str, **parameters: Any) -> Any:
         """Return the reply to a GET about the lift."""
@@ -157,11 +156,9 @@ def assert_equal_answers(interfaces: Interfaces, fields: dict[str, Any]) -> None
         if expected is not None:
             document = {name: value for reply in replies for name, value in reply.json().items()}
             assert {name: document[name] for name in expected} == expected
-    if not any(str(example).startswith("region:") for example in fields.get("like", []) + fields.get("unlike", [])):
-        # a command finds packs only where the lift remembers them
-        top = [] if "top" in fields else ["--top", "10"]
-        document = interfaces.command("query", *words_of(fields), *top, "--objects", *encoder_of(interfaces, fields))
-        assert (document and document["answer"]) == expected
+    top = [] if "top" in fields else ["--top", "10"]
+    document = interfaces.command("query", *words_of(fields), *top, "--objects", *encoder_of(interfaces, fields))
+    assert (document and document["answer"]) == expected
 
 
 def encoder_of(interfaces: Interfaces, fields: dict[str, Any]) -> list[object]:
@@ -306,7 +303,7 @@ def test_objects_and_their_tree_are_the_same_lists(interfaces: Interfaces) -> No
     page = interfaces.of_lift("objects", table=interfaces.table).json()["objects"]
     output = interfaces.command("objects", "--table", interfaces.files["table"])
     assert output is not None
-    for listing in (page, output["answer"]["objects"]):
+    for listing in (page, output["answer"]["nodes"]):
         nodes = [
             {name: node[name] for name in entry if name in node}
             for entry, node in zip(listing, expected["nodes"], strict=True)

@@ -192,7 +192,7 @@ def test_mask_is_where_the_rendered_selection_is_above_a_half(lift: Path) -> Non
         selected = lc.render(scene.splats, scene.cameras[view], torch.from_numpy(answer.selected).float())
         scores = lc.render(scene.splats, scene.cameras[view], torch.from_numpy(answer.scores))
         assert np.array_equal(scene.mask(answer, view), np.asarray(selected) > 0.5) and scene.mask(answer, view).any()
-        np.testing.assert_allclose(scene.attention(answer, view), np.asarray(scores), atol=1e-6)
+        np.testing.assert_allclose(scene.view_mask(answer, view).attention, np.asarray(scores), atol=1e-6)
 
 
 def test_selections_by_hand_are_asked_as_they_are(lift: Path) -> None:

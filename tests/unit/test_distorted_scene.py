@@ -18,7 +18,7 @@ from liftcore.query.question import Query
 from liftcore.query.render import render_png, view_mask
 from liftcore.query.result import LiftResult
 from liftcore.query.scene import Scene
-from liftcore.query.terms import Pixel, Region
+from liftcore.query.terms import Pixel, Vector
 from liftcore.scene.cameras import Camera
 from liftcore.values.lift_file import save_lift
 from liftcore.values.settings import LiftSettings
@@ -91,7 +91,7 @@ def test_masks_lie_over_the_photo(lens: str, tmp_path: Path) -> None:
             assert rendered.mask.shape == photo.shape
             selected, truth = rendered.mask & (photo >= 0), photo == part
             assert (selected & truth).sum() / (selected | truth).sum() > 0.99
-    answer = ask(scene, Query.of((Region("left", 0, 1),), threshold=0.5))
+    answer = ask(scene, Query.of((Vector((0.0, 1.0, 0.0, 0.0)),), threshold=0.5))
     expected = is_lifted(scene.cameras["left"]) & (photo_of("left", lens, CLEAR) == 1)
     assert view_mask(scene, answer, "left").mask[expected].all()
     with pytest.raises(InvalidQuery, match=rf"x in 0\.\.{WIDTH - 1} and y in 0\.\.{HEIGHT - 1}, got {WIDTH},0"):

@@ -235,10 +235,11 @@ def test_repr_of_public_values_is_one_line_with_their_size(scene):
     _, splats, cameras, views = scene
     result = lc.lift(splats, cameras, views, preset="row-sum")
     vectors, words = torch.eye(2, result.features.shape[1]), ["a" * 90, "b"]
-    segmentation, catalogue = result.segment(words, vectors, splats), result.objects(splats, words, vectors)
+    lift_scene = result.scene(splats, cameras)
+    segmentation, tree = lift_scene.segment(words, vectors), lift_scene.tree(words, vectors)
     sized = [splats, result, lc.region_weights(splats, cameras, views), segmentation, lc.plan(splats, cameras, views)]
     values = [cameras, cameras["v0"].replace(name="x" * 300), *views.values(), lc.FeatureGrid(np.ones((3, 4, 5)))]
-    values += [catalogue, *catalogue.objects, *segmentation.named_words, result.scene(splats, cameras)]
+    values += [tree, *tree.objects, *segmentation.named_words, lift_scene]
     values += [result.query(vectors, splats=splats, threshold=0.1), lc.Query(text=["a" * 99], like=["splat:1"])]
     values += [lc.LiftSettings.of(**dict(lc.LiftSettings.of(quality="fast"))), lc.CompositingParams(stride=3)]
     values += [lc.LocalEngine(), lc.open_encoder("lvis"), lc.WorldFrame(up=(0, -3, 0), metres_per_unit=0.1)]

@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound, SplatliftError
 from liftcore.io.splats import some_rows
-from liftcore.query.ask import answers, ask, locate, resolve_query
+from liftcore.query.ask import ask, locate, resolve_query
 from liftcore.query.directions import directions, read_vector
 from liftcore.query.question import Query
 from liftcore.query.result import load_lift
 from liftcore.query.scene import Scene
-from liftcore.query.terms import Example, Pixel, PixelBox, Region, SplatTerm, Stroke, Vector, parse_example
+from liftcore.query.terms import Example, Pixel, PixelBox, SplatTerm, Stroke, Vector, parse_example
 from liftcore.query.threshold import find_threshold
 from liftcore.scene.cameras import Cameras
 from liftcore.values.lift_file import save_lift
@@ -74,19 +74,6 @@ def test_splats_without_weight_do_not_decide_the_threshold(exact: Scene) -> None
     assert answer.selected[COUNT] and answer.count > reference.count  # the outliers are selected even so
 
 
-def test_questions_together_have_the_bits_of_each_alone(scene: Scene) -> None:
-    queries = [
-        Query.of(("x",)),
-        Query.of(("y", SplatTerm(3)), ("z",)),
-        Query.of((SplatTerm(1),)),
-        Query.of(("z", "x")),
-    ]
-    resolved_queries = [resolve_query(scene, query, Axes()) for query in queries]
-    for batched, resolved_query in zip(answers(scene, resolved_queries), resolved_queries, strict=True):
-        (single,) = answers(scene, [resolved_query])
-        assert np.array_equal(batched.scores, single.scores) and batched.threshold == single.threshold
-
-
 def test_what_cannot_be_asked_is_refused(scene: Scene) -> None:
     def of_space(space: str) -> Scene:
         return Scene(replace(scene.lift, metadata=scene.metadata.model_copy(update={"text_space": space})))
@@ -122,10 +109,6 @@ def test_cameras_may_be_added_but_not_moved(lift_tiny: Callable[..., Path], tmp_
     file.write_text(json.dumps(document))
     with pytest.raises(InvalidLift, match="cameras changed since the lift"):
         _ = Scene(lift).cameras
-    with (tmp_path / "f.st").open("a") as pack:
-        pack.write(" ")
-    with pytest.raises(InvalidLift, match="features changed since the lift"):
-        ask(Scene(lift), Query.of((Region("left", 0, 0),)))
 
 
 @pytest.mark.parametrize("cluster", range(3))
@@ -136,7 +119,6 @@ def test_every_kind_of_example_finds_its_cluster(scene: Scene, cluster: int) -> 
         Pixel("middle", x, HEIGHT // 2),
         PixelBox("middle", x - 4, 2, x + 5, HEIGHT - 2),
         Stroke("middle", ((x, 6), (x + 1, 12), (x, 18))),
-        Region("left", 0, cluster),
         SplatTerm(cluster * SPLATS_A_CLUSTER + 3),
         Vector(tuple(1e30 * np.eye(CHANNELS)[cluster])),
     ]
@@ -165,14 +147,12 @@ def test_box_is_what_is_in_it_and_not_around_it(scene: Scene) -> None:
     (full_image,) = directions(of(scene, rows), Query(like=["middle:box:0,0,32,24"]), None)  # nothing is around it
     assert full_image @ near > 0.9
     (within,) = directions(scene, Query(like=["middle:box:15,8,18,15"]), None)  # the same is around it
-    (target,) = directions(scene, Query(like=["region:left:0:1"]), None)
     assert within @ target > 0.9
 
 
 def test_stroke_may_slip_over_an_edge(scene: Scene) -> None:
     (stroke,) = directions(scene, Query(like=["middle:stroke:16,4,16,20,26,20"]), None)
-    (middle,) = directions(scene, Query(like=["region:left:0:1"]), None)
-    assert stroke @ middle > 0.95
+    assert stroke @ np.eye(2, CHANNELS)[1] > 0.95
 
 
 def test_threshold_of_examples_is_above_a_least_likeness(scene: Scene) -> None:
@@ -200,8 +180,6 @@ def test_threshold_of_examples_is_above_a_least_likeness(scene: Scene) -> None:
         (PixelBox("middle", 9, 3, 9, 9), InvalidQuery, "x0 < x1"),
         (PixelBox("middle", 0, 0, 2, 2), InvalidQuery, r"got rays with an opacity of [\d.]+%"),
         (Stroke("middle", ((0, 0), (1, 1))), InvalidQuery, "an area that shows the scene"),
-        (Region("left", 1, 0), NotFound, r"0\.\.0"),
-        (Region("left", 0, 3), NotFound, "label"),
         (Vector((1.0,) * 7), InvalidQuery, "8 channels"),
         ("apple", InvalidQuery, "ask by example"),
     ],
@@ -214,13 +192,13 @@ def test_term_without_a_feature_says_why_under_its_name(
     if example != "apple":
         query = Query.of((SplatTerm(0),), (example,))
         with pytest.raises(error, match=r"unlike\.0"):
-            resolve_query(scene, query, None, query.places)
+            resolve_query(scene, query, None)
 
 
 @given(view=NAMES, x=st.integers(0, 9999), y=st.integers(0, 9999))
 def test_any_name_of_a_view_can_be_pointed_at(view: str, x: int, y: int) -> None:
     points = (Pixel(view, x, y), Pixel(f"region:{view}", x, y), Pixel("splat", x, y), Pixel(f"{view}:box", x, y))
-    for example in (*points, Region(view, x, y), PixelBox(view, x, y, y, x), Stroke(view, ((x, y), (y, x), (x, x)))):
+    for example in (*points, PixelBox(view, x, y, y, x), Stroke(view, ((x, y), (y, x), (x, x)))):
         assert parse_example(str(example)) == example
 
 

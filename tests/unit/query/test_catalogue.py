@@ -24,8 +24,8 @@ def test_a_draft_says_that_it_looked_for_no_objects_and_what_finds_them(scene: S
     bare = {field: None for field in vars(LiftResult.of(scene.lift)) if field.startswith(("object", "node"))}
     save_lift(replace(scene.lift, metadata=metadata, **bare), tmp_path / "draft.lift")
     draft = Scene(tmp_path / "draft.lift")
-    for explanation in (draft.catalogue().explanation, draft.tree().explanation):
-        assert "quality=draft" in explanation and "objects=auto" in explanation
+    explanation = draft.tree().explanation
+    assert "quality=draft" in explanation and "objects=auto" in explanation
     with pytest.raises(NotFound, match="objects=auto"):
         draft.export(tmp_path / "object.ply", source=0)
 
@@ -46,10 +46,9 @@ def with_parts(scene: Scene) -> LiftResult:
 def test_parts_have_paths_places_and_names_of_what_their_own_masks_say(scene: Scene, tmp_path: Path) -> None:
     with_parts(scene).save(tmp_path / "parts.lift")
     saved = Scene(tmp_path / "parts.lift", scene.splats, scene.cameras)
-    tree, objects = saved.tree(WORDS, EYE), saved.catalogue(WORDS, EYE).objects
+    tree = saved.tree(WORDS, EYE)
     assert [(node.id, node.kind, node.parent) for node in tree.nodes[:3]] == [(n, "object", None) for n in range(3)]
-    for node, obj in zip(tree.nodes, objects, strict=False):
-        assert {name: getattr(node, name) for name in vars(obj)} == vars(obj)
+    assert tree.objects == tree.nodes[:3] and {node.name for node in tree.objects} == set(WORDS)
     assert [(node.kind, node.path, node.name) for node in tree.nodes[3:]] == [
         ("part", (0, 3), WORDS[1]), ("part", (0, 4), WORDS[2])
     ]  # fmt: skip
@@ -102,6 +101,5 @@ def test_objects_without_splats_are_left_out(scene: Scene, tmp_path: Path) -> No
     }  # fmt: skip
     save_lift(replace(lift, object_views=lift.object_views[[0, 1, 2, 0]], **tree), tmp_path / "l.safetensors")
     other = Scene(tmp_path / "l.safetensors")
-    assert [obj.id for obj in other.catalogue().objects] == [0, 1, 2] and len(other.catalogue().features) == 3
     assert [(obj.id, obj.parts) for obj in other.tree().nodes] == [(0, ()), (1, ()), (2, ())]
-    assert len(other.labels(other.catalogue()).document["instances"]) == 3
+    assert len(other.labels(other.tree()).document["instances"]) == 3

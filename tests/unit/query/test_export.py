@@ -10,12 +10,12 @@ from liftcore.errors import InvalidLift
 from liftcore.io.splats import read_splats
 from liftcore.query.ask import ask
 from liftcore.query.colours import NOT_SEEN_COLOUR, colour_map
-from liftcore.query.export import coloured_ply, object_splats
+from liftcore.query.export import object_splats
 from liftcore.query.question import Answer, Query
 from liftcore.query.scene import Scene
-from liftcore.query.terms import Region
+from liftcore.query.terms import Vector
 from liftcore.scene.harmonics import SH_C0
-from tests.tiny_scene import ply, splat_rows
+from tests.tiny_scene import AXES, ply, splat_rows
 
 
 @pytest.fixture
@@ -27,13 +27,13 @@ def scene(lift_tiny: Callable[..., Path], tmp_path: Path) -> Scene:
 
 
 def of_lamp(scene: Scene, threshold: float = 0.5) -> Answer:
-    return ask(scene, Query.of((Region("left", 0, 2),), threshold=threshold))
+    return ask(scene, Query.of((Vector(tuple(AXES[2])),), threshold=threshold))
 
 
 def test_scores_have_the_colours_of_the_map_and_what_was_not_seen_is_grey(scene: Scene, tmp_path: Path) -> None:
     answer = of_lamp(scene)
     assert not answer.has_feature[-1]
-    (tmp_path / "scores.ply").write_bytes(b"".join(coloured_ply(scene, answer)))
+    scene.export(tmp_path / "scores.ply", answer, "coloured")
     sh = read_splats(tmp_path / "scores.ply").sh
     assert sh is not None
     colours = np.round(255 * (0.5 + SH_C0 * sh[:, 0].double().numpy())).astype(int)
@@ -46,10 +46,10 @@ def test_scores_have_the_colours_of_the_map_and_what_was_not_seen_is_grey(scene:
 
 def test_exports_load_no_splats_and_know_when_their_file_changed(scene: Scene, tmp_path: Path) -> None:
     answer = of_lamp(scene)
-    assert list(coloured_ply(scene, answer)) and "splats" not in scene.__dict__
+    assert list(scene.blocks_of(answer, "coloured")) and "splats" not in scene.__dict__
     assert list(object_splats(scene, answer)) and "raster" not in scene.__dict__
     (tmp_path / "s.ply").write_bytes(ply(splat_rows()))
     other = Scene(scene.path)
-    for make in (object_splats, coloured_ply):
+    for content in ("object", "coloured"):
         with pytest.raises(InvalidLift, match="splats changed since the lift"):
-            make(other, answer)
+            other.blocks_of(answer, content)

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 import liftcore as lc
-from liftcore.query.catalogue import object_features
 from liftcore.query.scores import Features
 from liftcore.query.threshold import find_threshold
 from tests.promises.tiny_files import photo_vectors, row_of_splats, scene_with
@@ -70,7 +69,6 @@ def test_codes_are_labelled_and_coloured_as_their_rows_are(scenes: list[lc.Scene
 
 def test_objects_of_codes_have_the_means_of_their_rows(scenes: list[lc.Scene]) -> None:
     exact, coded = scenes
-    np.testing.assert_allclose(object_features(coded), object_features(exact), atol=1e-6)
     np.testing.assert_allclose(coded.object_means, exact.object_means, atol=1e-6)
     np.testing.assert_allclose(coded.mean, exact.mean, atol=1e-6)
     assert np.array_equal(coded.norms, exact.norms) and np.array_equal(coded.has_feature, exact.has_feature)

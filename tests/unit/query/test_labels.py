@@ -15,8 +15,8 @@ from liftcore.io.splats import read_splats
 from liftcore.query.coco import run_lengths
 from liftcore.query.question import Query
 from liftcore.query.scene import Scene
-from liftcore.query.terms import Region, Vector
-from tests.tiny_scene import CHANNELS, VIEWS, WORDS, text_table
+from liftcore.query.terms import Vector
+from tests.tiny_scene import AXES, CHANNELS, VIEWS, WORDS, text_table
 from tests.unit.query.test_catalogue import with_parts
 from tests.unit.scene.test_gltf import document_of
 
@@ -33,8 +33,8 @@ EYE = np.eye(3, CHANNELS, dtype=np.float32)
 
 
 def test_every_source_gives_instances_that_lie_in_their_boxes(scene: Scene) -> None:
-    answer = scene.ask(Query.of((Region("left", 0, 2),), threshold=0.5))
-    sources = scene.segment(WORDS, EYE), answer, scene.catalogue(WORDS, EYE), scene.catalogue()
+    answer = scene.ask(Query.of((Vector(tuple(AXES[2])),), threshold=0.5))
+    sources = scene.segment(WORDS, EYE), answer, scene.tree(WORDS, EYE), scene.tree()
     for source, classes, instances in zip(sources, (3, 1, 3, 0), (3, 1, 3, 3), strict=True):
         labels = scene.labels(source)
         assert [len(labels.document[kind]) for kind in ("classes", "instances")] == [classes, instances]
@@ -108,6 +108,6 @@ def test_rows_of_labels_keep_the_nodes_that_hold_theirs(tree_scene: Scene) -> No
 
 
 def test_run_lengths_are_columns_and_begin_with_zeros() -> None:
-    assert run_lengths(np.array([[1, 0], [1, 0], [0, 1]])) == {1: [0, 2, 3, 1]}
-    assert run_lengths(np.array([[0, 7], [2, 7]])) == {2: [1, 1, 2], 7: [2, 2]}
-    assert run_lengths(np.zeros((2, 2))) == {}
+    mask = np.array([[1, 0], [1, 0], [0, 1]], np.bool_)
+    assert run_lengths(mask) == [0, 2, 3, 1] and run_lengths(~mask) == [2, 3, 1]
+    assert run_lengths(np.zeros((2, 2), np.bool_)) == [4]

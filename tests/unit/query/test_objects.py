@@ -13,8 +13,8 @@ from liftcore.query.export import object_splats
 from liftcore.query.objects import objects
 from liftcore.query.question import Answer, Query
 from liftcore.query.scene import Scene
-from liftcore.query.terms import Region
-from tests.tiny_scene import SPLATS_A_CLUSTER, ply, splat_rows
+from liftcore.query.terms import Vector
+from tests.tiny_scene import AXES, SPLATS_A_CLUSTER, ply, splat_rows
 
 from .made_up import answer_with
 
@@ -23,7 +23,7 @@ def of(
     scene: Scene, *clusters: int, keep: str = "all", instances: int | None = None, rows: tuple[int, ...] = ()
 ) -> Answer:
     """Return an answer that selected these clusters and rows; its scores rise from .5 to 1 by row."""
-    answer = ask(scene, Query.of((Region("left", 0, 2),), threshold=0.5, keep=keep, instances=instances))
+    answer = ask(scene, Query.of((Vector(tuple(AXES[2])),), threshold=0.5, keep=keep, instances=instances))
     selected = np.zeros(3 * SPLATS_A_CLUSTER, np.bool_)
     for cluster in clusters:
         selected[cluster * SPLATS_A_CLUSTER : (cluster + 1) * SPLATS_A_CLUSTER] = True

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from liftcore.errors import InvalidQuery
-from liftcore.query import opened as scenes
+from liftcore.query import scene as scenes
 from liftcore.query.ask import ask
 from liftcore.query.colours import NO_CLUSTER_COLOUR, cluster_colours
 from liftcore.query.objects import objects
@@ -25,7 +25,7 @@ from liftcore.query.render import (
 )  # fmt: skip
 from liftcore.query.scene import Scene
 from liftcore.query.splat_colours import principal_colours, view_colours
-from liftcore.query.terms import Region
+from liftcore.query.terms import Vector
 from liftcore.raster.reference import ReferenceRaster
 from liftcore.scene.cameras import Camera, Cameras, behind_lens, drawn_by
 from liftcore.scene.compositing import CompositingParams
@@ -34,7 +34,7 @@ from liftcore.scene.drawing import in_photo
 from liftcore.scene.harmonics import SH_C0
 from liftcore.scene.splats import Kernel, Splats
 from tests.scenes import look_at, random_camera, random_splats
-from tests.tiny_scene import HEIGHT, SPLATS_A_CLUSTER, WIDTH
+from tests.tiny_scene import AXES, HEIGHT, SPLATS_A_CLUSTER, WIDTH
 
 from .made_up import answer_with
 
@@ -54,7 +54,7 @@ def scene(lifted: Path) -> Scene:
 
 def of(scene: Scene, *clusters: int, keep: str = "all", rows: tuple[int, ...] = ()) -> Answer:
     """Return an answer that selected these clusters and rows."""
-    answer = ask(scene, Query.of((Region("left", 0, 0),), threshold=0.5, keep=keep))
+    answer = ask(scene, Query.of((Vector(tuple(AXES[0])),), threshold=0.5, keep=keep))
     selected = np.zeros_like(answer.selected)
     for cluster in clusters:
         selected[cluster * SPLATS_A_CLUSTER : (cluster + 1) * SPLATS_A_CLUSTER] = True
@@ -114,7 +114,7 @@ def test_clusters_have_their_colours_and_the_rest_is_grey(scene: Scene) -> None:
 
 
 def test_pictures_have_a_limit(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    answer = ask(scene, Query.of((Region("left", 0, 0),)))
+    answer = ask(scene, Query.of((Vector(tuple(AXES[0])),)))
 
     def draw(channel: str) -> object:
         return view_mask(scene, answer, "middle") if channel == "mask" else render_png(scene, "middle", channel)
@@ -176,7 +176,6 @@ def test_groups_get_distinct_colours_at_every_run() -> None:
     assert principal_colours(np.random.rand(10, 2), np.ones(10)).shape == (10, 3)  # of fewer than three channels
     assert not principal_colours(np.random.rand(10, 4), np.zeros(10)).any()  # and without weight
     colours = cluster_colours(24).astype(int)
-    assert colours[:3].tolist() == [[230, 128, 161], [90, 237, 212], [64, 123, 197]]
     distances = np.abs(colours[:, None] - colours[None]).max(axis=2)[~np.eye(25, dtype=bool)]
     assert distances.min() >= 16 and tuple(colours[-1]) == NO_CLUSTER_COLOUR
 
@@ -210,12 +209,12 @@ def two(scene: Scene) -> Scene:
 
 def test_near_depths_are_bright_and_missing_ones_black(two: Scene) -> None:
     depths, hit = expected_depth(two, "front")
-    image = shown_depth(two, "front")
-    assert image.span == pytest.approx((NEAR, FAR), abs=1e-5)
+    levels, span = shown_depth(two, "front")
+    assert span == pytest.approx((NEAR, FAR), abs=1e-5)
     assert depths[12, [13, 34]].tolist() == pytest.approx([NEAR, FAR], rel=1e-5)
-    assert (image.levels[12, 13], image.levels[12, 34], image.levels[0, 0]) == (255, 1, 0)
+    assert (levels[12, 13], levels[12, 34], levels[0, 0]) == (255, 1, 0)
     assert not hit[0, 0] and not depths[0, 0]
-    assert np.array_equal(image.levels > 0, hit)
+    assert np.array_equal(levels > 0, hit)
 
 
 @pytest.mark.parametrize("kernel", Kernel)
@@ -245,7 +244,7 @@ def test_a_depth_picture_has_its_range_and_can_be_decoded(two: Scene) -> None:
     with Image.open(io.BytesIO(render_png(two, "front", "depth"))) as picture:
         near, far = (float(picture.info[name]) for name in ("depth-near", "depth-far"))
         levels = np.asarray(picture)
-    assert (near, far) == shown_depth(two, "front").span
+    assert (near, far) == shown_depth(two, "front")[1]
     decoded = far + (levels[hit] - 1.0) / 254 * (near - far)
     np.testing.assert_allclose(decoded, depths[hit].clip(near, far), atol=0.51 * (far - near) / 254)
 

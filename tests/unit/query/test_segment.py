@@ -15,7 +15,7 @@ from liftcore.io.splats import read_splats
 from liftcore.query.colours import NO_CLUSTER_COLOUR
 from liftcore.query.render import render
 from liftcore.query.scene import Scene
-from liftcore.query.segment import map_png, named_ply, picture_png, segment, word_map
+from liftcore.query.segment import map_png, picture_png, segment, value_map
 from liftcore.query.splat_colours import view_colours
 from tests.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH
 
@@ -88,7 +88,7 @@ def test_words_without_directions_of_their_own_are_refused(clear: Scene, words: 
 
 def test_pictures_show_the_words_of_the_pixels(clear: Scene) -> None:
     segmentation = segment(clear, ["apple", "book"], EYE[:2])
-    values = word_map(clear, segmentation, "middle")
+    values = value_map(clear, segmentation.values, "middle")
     with Image.open(io.BytesIO(map_png(values, segmentation))) as picture:
         assert picture.mode == "P" and np.array_equal(np.asarray(picture), values)
         legend = json.loads(picture.info["legend"])
@@ -98,12 +98,12 @@ def test_pictures_show_the_words_of_the_pixels(clear: Scene) -> None:
     assert columns["apple"] < columns["book"] < WIDTH / 2 + 3
     assert not pixels[values == 0].any() and (pixels[values == 1] == segmentation.colours[1]).all()
     with Image.open(io.BytesIO(picture_png(render(clear, "middle"), values, segmentation))) as picture:
-        assert picture.width > WIDTH and picture.height >= HEIGHT
+        assert picture.width == WIDTH and picture.height > HEIGHT + 12
 
 
 def test_coloured_splats_have_the_colours_of_their_words(clear: Scene, tmp_path: Path) -> None:
     segmentation = segment(clear, ["apple", "book"], EYE[:2])
-    (tmp_path / "named.ply").write_bytes(b"".join(named_ply(clear, segmentation)))
+    clear.export(tmp_path / "named.ply", segmentation, "coloured")
     colours = view_colours(read_splats(tmp_path / "named.ply"), clear.cameras["middle"]).numpy()
     np.testing.assert_allclose(255 * colours, segmentation.colours[segmentation.values], atol=1e-2)
     assert tuple(segmentation.colours[0]) == NO_CLUSTER_COLOUR

@@ -20,7 +20,7 @@ from liftcore.io.splats import read_places, read_splats
 from liftcore.io.spz import spz_blocks
 from liftcore.lifting.planning.views import visibility
 from liftcore.query.ask import ask, locate
-from liftcore.query.catalogue import catalogue, table_csv
+from liftcore.query.catalogue import table_csv, tree
 from liftcore.query.labels import labels
 from liftcore.query.objects import objects
 from liftcore.query.question import Query
@@ -184,10 +184,13 @@ def positions_of_answers(splats: Splats, cameras: Cameras, views: dict[str, Any]
     best, parts = locate(scene, answer, 5), objects(scene, answer)
     words = segment(scene, ["one", "two"], vectors)
     document = labels(scene, words).document
+    numbers, views_of = torch.arange(len(lift.features)).int() % 2, torch.zeros(2, 5).int()
     with_objects = replace(
-        lift, object=torch.arange(len(lift.features)).int() % 2, object_views=torch.zeros(2, 5).int()
-    )
-    listing = catalogue(Scene(with_objects, splats, cameras))
+        lift, object=numbers, node=numbers, object_views=views_of, node_views=views_of,
+        node_parents=torch.full((2,), -1).int(), node_confidence=torch.ones(2),
+        node_features=torch.ones(2, lift.features.shape[1]).half(),
+    )  # fmt: skip
+    listing = tree(Scene(with_objects, splats, cameras))
     rows = [line.split(",")[5:14] for line in table_csv(listing).decode().splitlines()[1:]]
     return {
         "top": [item.position for item in best.top],
@@ -195,7 +198,7 @@ def positions_of_answers(splats: Splats, cameras: Cameras, views: dict[str, Any]
         "objects": [point for item in parts.objects for point in (item.centre, *item.box)],
         "words": [point for item in words.named_words for point in item.box],
         "labels": [item["oriented_box"]["centre"] for item in document["instances"]],
-        "catalogue": [point for item in listing.objects for point in (item.centre, *item.box)],
+        "tree": [point for item in listing.objects for point in (item.centre, *item.box)],
         "table": np.array(rows, float).reshape(-1, 3),
     }
 

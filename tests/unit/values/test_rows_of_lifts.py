@@ -57,7 +57,7 @@ def test_objects_and_clusters_without_splats_go_and_the_others_are_numbered_anew
         mapped = getattr(result, table)[subset_labels[subset_labels >= 0].long()]
         assert torch.equal(mapped, getattr(subset, table)[getattr(subset, labels)[subset_labels >= 0].long()])
     mask = result.object == last
-    assert len(result[mask].objects(splats[mask]).objects) == 1
+    assert len(result[mask].scene(splats[mask]).tree().objects) == 1
 
 
 def test_a_lift_moves_with_its_splats(scene) -> None:
@@ -84,7 +84,7 @@ def test_splats_that_are_not_those_of_the_lift_are_refused(scene, kind: str) -> 
         with pytest.raises(lc.InvalidSplats, match=r"splats: expected the .* Splats that were lifted, row for row"):
             lift.query(np.eye(1, 6), splats=other)
         with pytest.raises(lc.InvalidSplats, match="row for row"):
-            lift.objects(other)
+            lift.scene(other)
 
 
 def test_lift_of_files_knows_its_splats_in_memory(tmp_path: Path) -> None:
