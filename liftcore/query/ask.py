@@ -126,6 +126,7 @@ def ask_vectors(scene: Scene, positives: Any, negatives: Any = (), **fields: Any
         InvalidQuery: a vector of another length, of zeros or not finite; or a field that `Query` rejects.
     """
     query = Query.of(_vectors(positives), _vectors(negatives), **fields)
+    vars(query)["places"] = ["vector"] * len(query.terms)  # for errors
     rows = directions(scene, query, None)
     references = references_of_space(rows, scene.metadata.text_space)
     return answer_of(scene, ResolvedQuery(query, rows, np.ones(len(rows), np.bool_), references, {}))

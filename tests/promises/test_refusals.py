@@ -32,12 +32,13 @@ def camera(**changes: Any) -> lc.Camera:
 
 
 def result_of(method: str) -> Callable[..., Any]:
-    """Return a call of a method of a lift, which is made once."""
+    """Return a call of a method of a lift, which is made once, or of its scene."""
 
     def call(*arguments: Any, **keywords: Any) -> Any:
         if "lift" not in CACHE:
             CACHE["lift"] = lc.lift(*SCENE.arguments(), preset="row-sum", progress=False)
-        return getattr(CACHE["lift"], method)(*arguments, **keywords)
+        lift = CACHE["lift"]
+        return getattr(lift if hasattr(lift, method) else lift.scene(SCENE.splats), method)(*arguments, **keywords)
 
     return call
 
@@ -117,8 +118,8 @@ ROWS: list[Row] = [
     (QUERY, {"positives": np.ones(5)}, Q, "vector"),
     (QUERY, {"positives": VECTORS, "threshold": "high"}, Q, "threshold"),
     (QUERY, {"positives": VECTORS, "splats": "scene.ply"}, S, "splats"),
-    (SEGMENT, {"words": "ab", "vectors": VECTORS, "splats": SCENE.splats}, Q, "words"),
-    (SEGMENT, {"words": list("abc"), "vectors": VECTORS, "splats": SCENE.splats}, Q, "words"),
+    (SEGMENT, {"words": "ab", "vectors": VECTORS}, Q, "words"),
+    (SEGMENT, {"words": list("abc"), "vectors": VECTORS}, Q, "words"),
     (lc.open_encoder, {"spec": "bert"}, lc.SplatliftError, "encoder"),
     (lc.pack_folder, {"folder": None, "out": "x", "kind": "npy"}, N, "folder"),
     (lc.pack_folder, {"folder": ".", "out": "x", "kind": "mask"}, N, "kind"),
