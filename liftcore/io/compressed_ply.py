@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from liftcore.io.ply import padding_bytes, parse_elements, read_head, tail_warnings
+from liftcore.io.ply import parse_elements, read_head, tail_warnings
 from liftcore.io.quantised import Fields, decoded, field_shapes, logits, smallest_three
 from liftcore.scene.harmonics import constant_terms
 from liftcore.scene.render_mode import mode_of_comments
@@ -31,7 +31,6 @@ def read_compressed_ply(path: Path, *, colour: bool = True) -> Fields:
     total = offset + sum(element.count * element.dtype.itemsize for element in elements)
     if total > size or any(element.list_column for element in elements):
         raise ValueError(f"{total} bytes as its header says, got {size}")
-    tail = size - total - padding_bytes(path, size, size - total)
     for element in elements:
         table = np.memmap(path, np.uint8, "r", 0)[offset : offset + element.count * element.dtype.itemsize]
         tables[element.name] = table.view(element.dtype)
@@ -63,7 +62,7 @@ def read_compressed_ply(path: Path, *, colour: bool = True) -> Fields:
         return fields
 
     fields = decoded(len(vertices), field_shapes(1 + higher if colour else 0), decode)
-    return fields | {"render_mode": mode, "warnings": (*warnings, *tail_warnings(tail))}
+    return fields | {"render_mode": mode, "warnings": (*warnings, *tail_warnings(path, size, total))}
 
 
 def _check_tables(tables: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:

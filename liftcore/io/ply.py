@@ -11,11 +11,11 @@ Torch is imported where splats are made, so that processes without it can look a
 
 from __future__ import annotations
 
-import io
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
 
 MAX_HEADER_BYTES = 256 * 1024
-MAX_HEADER_LINES = 4096
 BLOCK_ROWS = 16_384  # rows converted at a time: a few MB, so that memory stays near the file's size
 MAX_SH_DEGREE = 4
 LOBE_CHANNELS = 6  # of a spherical beta lobe: r g b theta phi beta
@@ -58,6 +57,11 @@ SCAFFOLD = ("f_anchor_feat_0", "f_offset_0")  # of Scaffold-GS, whose networks t
 MODEL = re.compile(r"[xyz]|opacity|beta|filter_3D|(scale|rot|f_dc|f_rest|sh0|shN|sb_params)_\d+|packed_\w+")
 SPELLING = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"}
 SPELLING |= {"f4": "float", "f8": "double"}
+CODES = {name: code for code, name in SPELLING.items()} | {
+    **{f"{'u' * (code[0] == 'u')}int{8 * int(code[1])}": code for code in SPELLING if code[0] != "f"},
+    "float32": "f4",
+    "float64": "f8",
+}  # of a property's type
 WRITTEN_MODE = {RenderModel.ANTIALIASED: "mip", RenderModel.DISCS: "2dgs"}  # as editors read it
 EXPORT = "export the splats again as binary little-endian PLY"
 REWRITE = (
@@ -69,7 +73,7 @@ _REMARKS = ("comment", "obj_info")  # lines that are kept, and not parsed
 PADDING = b"\0 \t\r\n"  # bytes that some programs end a file with
 MAX_PADDING_BYTES = 4096  # that are read
 FLOAT_BYTES = 4  # of a column that a header may lack
-_ELEMENT = re.compile(r"\s*element\s+(\S+)\s+([0-9]{1,18})\s*")
+_COUNT = re.compile("[0-9]{1,18}")
 _GSPLAT = {"x", "y", "z", "f_dc_0", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_3"}
 _SIGNATURES = {
     "Inria 3DGS": {*_GSPLAT, "nx"},
@@ -104,7 +108,7 @@ def read_ply(path: Path, kernel: Kernel | str = "auto", *, colour: bool = True) 
         mode = RenderMode(RenderModel.ANTIALIASED, MIP_SPLATTING) if FILTER in header.names else mode_beside(path)
     kernel = recognise_kernel(header.names, mode) if kernel == "auto" else kernel_named(kernel)
     slots = model_slots(header.names, kernel)
-    warnings += (*tail_warnings(header.tail), *unread_warnings(header.names, slots))
+    warnings += (*header.warnings, *unread_warnings(header.names, slots))
     for name in slots:
         code = header.dtype[name].str[1:]
         if code not in ("f4", "f8"):
@@ -155,7 +159,7 @@ def ply_blocks(splats: Splats) -> Iterator[bytes]:
     lines += [*(f"property {SPELLING[code]} {name}" for name, code in codes.items()), "end_header"]
     dtype = np.dtype([(name, "<" + code) for name, code in codes.items()])
     if source is not None and source.dtype == dtype:
-        lines = source.lines_for(splats.count)
+        lines = source.lines_for(splats.count, dtype)
     yield header_bytes(lines)
     for start in range(0, splats.count, BLOCK_ROWS):
         rows = np.zeros(min(BLOCK_ROWS, splats.count - start), dtype)
@@ -164,23 +168,37 @@ def ply_blocks(splats: Splats) -> Iterator[bytes]:
         yield rows.tobytes()
 
 
-def some_rows(path: Path, mask: np.ndarray) -> Iterator[bytes]:
-    """Yield a PLY with some of its rows, those of a mask [P], byte for byte, a block of rows at a time."""
-    header = _header_of(path, len(mask))
-    lines = header.lines_for(int(np.count_nonzero(mask)))
-    return _rewritten(path, header, lines, lambda block, rows: rows[mask[block]])
-
-
-def _rewritten(
-    path: Path, header: PlyHeader, lines: Sequence[str], change: Callable[[slice, np.ndarray], np.ndarray]
+def rewritten(
+    path: Path,
+    count: int,
+    columns: Mapping[str, np.ndarray] = MappingProxyType({}),
+    mask: np.ndarray | None = None,
 ) -> Iterator[bytes]:
-    """Yield a PLY with another header, whose blocks of rows are changed; read, not mapped, to bound memory."""
-    yield header_bytes(lines)
+    """Yield a PLY with other columns and fewer rows, a block at a time; all else stays byte for byte.
+
+    Args:
+        path: the file, which is read and not mapped, to bound memory. count: P that it must have.
+        columns: name -> [P]. One that the file has stays in its place, a new one comes behind.
+        mask: [P] bool, the rows to keep; None: all.
+    """
+    header = read_header(path)
+    if header.count != count:
+        raise ValueError(f"{count} splats, as many as were lifted, got {header.count}")
+    types = {name: header.dtype[name] for name in header.names}
+    types |= {name: values.dtype.newbyteorder("<") for name, values in columns.items()}
+    dtype = np.dtype([*types.items()])
+    yield header_bytes(header.lines_for(count if mask is None else int(np.count_nonzero(mask)), dtype))
     with path.open("rb", buffering=0) as source:
         source.seek(header.data_offset)
-        for first in range(0, header.count, BLOCK_ROWS):
-            rows = np.fromfile(source, header.dtype, min(BLOCK_ROWS, header.count - first))
-            yield change(slice(first, first + len(rows)), rows).tobytes()
+        for first in range(0, count, BLOCK_ROWS):
+            rows = np.fromfile(source, header.dtype, min(BLOCK_ROWS, count - first))
+            block = slice(first, first + len(rows))
+            if columns:
+                changed_rows = np.empty(len(rows), dtype)
+                for name in types:
+                    changed_rows[name] = columns[name][block] if name in columns else rows[name]
+                rows = changed_rows
+            yield (rows if mask is None else rows[mask[block]]).tobytes()
 
 
 def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
@@ -192,75 +210,25 @@ def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
     Args:
         path: the file.
         colours: [P, 3] f32, the constant terms of the spherical harmonics (``f_dc_*``, or ``sh0_*`` of DBS).
-
-    Yields:
-        The bytes of the copy, in blocks.
     """
-    header = _header_of(path, len(colours))
-    slots = model_slots(header.names, recognise_kernel(header.names))
-    harmonics = {name: slot.index for name, slot in slots.items() if slot.field == "sh"}
-    lobes = {name: slot.index for name, slot in slots.items() if slot.field == "sb_params"}
-    channels = () if harmonics else channel_names(header.names)
-    if not harmonics and not channels:
-        raise ValueError("colours (f_dc_0, ...) to show scores in, got a file without any")
-    levels = np.empty((len(colours), len(channels)))
-    if channels:
+    header, columns = read_header(path), dict[str, np.ndarray]()
+    for name, slot in model_slots(header.names, recognise_kernel(header.names)).items():
+        dtype = header.dtype[name]
+        if slot.field == "sh" and slot.index[0] == 0:
+            columns[name] = colours[:, slot.index[1]].astype(dtype, copy=False)
+        elif slot.field == "sh" or (slot.field == "sb_params" and slot.index[1] < LOBE_COLOURS):
+            constant = np.array(0.0 if slot.field == "sh" else DARK_LOBE, dtype)
+            columns[name] = np.broadcast_to(constant, len(colours))  # takes no memory
+    if not {"f_dc_0", "sh0_0"} & columns.keys():
+        channels = channel_names(header.names)
+        if not channels:
+            raise ValueError("colours (f_dc_0, ...) to show scores in, got a file without any")
         stored = _read_columns(path, header, {}, channels)[1]
-        levels = (0.5 + SH_C0 * colours) * full_level(np.stack([stored[name] for name in channels], axis=1))
-    fixed = {name: 0.0 for name, (row, _) in harmonics.items() if row > 0}
-    fixed |= {name: DARK_LOBE for name, (_, channel) in lobes.items() if channel < LOBE_COLOURS}
-
-    def change(block: slice, rows: np.ndarray) -> np.ndarray:
-        for name, value in fixed.items():
-            rows[name] = value
-        for name, (row, channel) in harmonics.items():
-            if row == 0:
-                rows[name] = colours[block, channel]
-        for channel, name in enumerate(channels):
-            column = levels[block, channel]
-            rows[name] = column if header.dtype[name].kind == "f" else np.rint(column)
-        return rows
-
-    return _rewritten(path, header, header.lines, change)
-
-
-def with_columns(path: Path, columns: Mapping[str, np.ndarray]) -> Iterator[bytes]:
-    """Yield a PLY with further properties behind its own, which stay byte for byte; of one name, the new one stays.
-
-    Args:
-        path: the file. columns: name -> [P] i32 or f32.
-
-    Yields:
-        The bytes of the copy, in blocks.
-    """
-    header = _header_of(path, len(next(iter(columns.values()))))
-    unchanged_names = [name for name in header.names if name not in columns]
-    codes = {name: values.dtype.str[1:] for name, values in columns.items()}
-    dtype = np.dtype(
-        [(name, header.dtype[name]) for name in unchanged_names] + [(name, f"<{codes[name]}") for name in codes]
-    )
-    properties = [line for line in header.lines if line.split()[:1] == ["property"]]
-    replaced = {line for line in properties if line.split()[-1] in columns}
-    *lines, end = (line for line in header.lines if line not in replaced)
-    ending = "\r" if end.endswith("\r") else ""
-    properties = [f"property {SPELLING[code]} {name}{ending}" for name, code in codes.items()]
-
-    def change(block: slice, rows: np.ndarray) -> np.ndarray:
-        changed_rows = np.empty(len(rows), dtype)
-        for name in unchanged_names:
-            changed_rows[name] = rows[name]
-        for name, values in columns.items():
-            changed_rows[name] = values[block]
-        return changed_rows
-
-    return _rewritten(path, header, [*lines, *properties, end], change)
-
-
-def _header_of(path: Path, count: int) -> PlyHeader:
-    header = read_header(path)
-    if header.count != count:
-        raise ValueError(f"{count} splats, as many as were lifted, got {header.count}")
-    return header
+        levels = full_level(np.stack([stored[name] for name in channels], axis=1)) * (0.5 + SH_C0 * colours)
+        for name, column in zip(channels, levels.T, strict=True):
+            dtype = header.dtype[name]
+            columns[name] = (column if dtype.kind == "f" else np.rint(column)).astype(dtype)
+    yield from rewritten(path, len(colours), columns)
 
 
 def _read_columns(
@@ -409,7 +377,7 @@ def model_slots(names: Sequence[str], kernel: Kernel) -> dict[str, Slot]:
     for name in _columns(kernel, 0, 0, beta_names=False):
         if name not in names:
             listing = ", ".join([*names[:8], "..."] if len(names) > 8 else names)
-            got = f"{len(names)} properties without it ({listing}); {_nearest(names)}"
+            got = f"{len(names)} properties without it ({listing}); the nearest dialect is {nearest_dialect(names)}"
             raise ValueError(f"the property {name!r} of a {kernel} splat, got {got}")
     beta_names = "sh0_0" in names
     first, rest = ("sh0", "shN") if beta_names else ("f_dc", "f_rest")
@@ -418,7 +386,7 @@ def model_slots(names: Sequence[str], kernel: Kernel) -> dict[str, Slot]:
     if (base, higher) != (0, 0) and (base != 3 or higher not in complete):
         counts = ", ".join(map(str, complete))
         expected = f"3 properties {first}_* and {counts} properties {rest}_* (degree 0..{MAX_SH_DEGREE})"
-        raise ValueError(f"{expected}, got {base} and {higher}; {_nearest(names)}")
+        raise ValueError(f"{expected}, got {base} and {higher}; {EXPORT}")
     lobes = _count_numbered(names, "sb_params") if kernel is Kernel.BETA else 0
     if lobes % LOBE_CHANNELS:
         raise ValueError(f"a multiple of {LOBE_CHANNELS} properties sb_params_*, got {lobes}")
@@ -446,13 +414,8 @@ def _count_numbered(names: Sequence[str], stem: str) -> int:
     indices = sorted(int(match[1]) for match in map(pattern.fullmatch, names) if match)
     for expected_index, index in enumerate(indices):
         if index != expected_index:
-            got = f"'{stem}_{index}' without it; {_nearest(names)}"
-            raise ValueError(f"the property '{stem}_{expected_index}', got {got}")
+            raise ValueError(f"the property '{stem}_{expected_index}', got '{stem}_{index}' without it; {EXPORT}")
     return len(indices)
-
-
-def _nearest(names: Collection[str]) -> str:
-    return f"the nearest dialect is {nearest_dialect(names)}"
 
 
 # ---- headers
@@ -467,33 +430,43 @@ class PlyHeader:
     dtype: np.dtype  # of a row, a field a column
     data_offset: int  # bytes before the first row
     after: int | None = 0  # bytes behind the last row, of other elements; None when their lists make it unknown
-    tail: int = 0  # bytes behind all of that, which the header does not describe
+    warnings: tuple[str, ...] = ()  # of bytes behind all of that, which the header does not describe
 
     @property
     def names(self) -> tuple[str, ...]:
         """The columns, in the order of the file."""
         return self.dtype.names or ()
 
-    def lines_for(self, count: int) -> list[str]:
-        """Return the lines of a file with ``count`` rows of these columns; all but that number stays as it is."""
+    def lines_for(self, count: int, dtype: np.dtype) -> list[str]:
+        """Return the lines of a file with ``count`` rows of a type; what does not change stays as it is."""
         end = "\r" if self.lines[0].endswith("\r") else ""
-        vertex_line = f"element vertex {count}{end}"
-        is_same = count == self.count
-        return [vertex_line if line.split()[:1] == ["element"] and not is_same else line for line in self.lines]
+
+        def changed(line: str) -> str:
+            words = line.split()
+            if words[:1] == ["element"] and count != self.count:
+                return f"element vertex {count}{end}"
+            if words[:1] == ["property"] and dtype[words[-1]] != self.dtype[words[-1]]:
+                return property_line(words[-1])
+            return line
+
+        def property_line(name: str) -> str:
+            return f"property {SPELLING[dtype[name].str[1:]]} {name}{end}"
+
+        new_names = (name for name in dtype.names or () if name not in self.names)
+        return [*map(changed, self.lines[:-1]), *map(property_line, new_names), self.lines[-1]]
 
 
 def read_header(path: Path) -> PlyHeader:
     """Read and check the header of a splat PLY, at most 256 KiB of the file.
 
-    Bytes behind all elements count in ``tail``, but for zeros and blanks: viewers open such files, too.
+    Zeros and blanks behind all elements count for nothing: viewers open such files, too.
     """
     head, size = read_head(path)
     header = parse_header(head)
     length, stride = size - header.data_offset, header.dtype.itemsize
     data_bytes = header.count * stride + (header.after or 0)
-    tail = 0 if header.after is None else max(0, length - data_bytes)
-    padding = padding_bytes(path, size, tail)
-    has_longer_rows = tail > padding and header.count > 1 and tail % (FLOAT_BYTES * header.count) == 0
+    warnings = () if header.after is None else tail_warnings(path, size, header.data_offset + data_bytes)
+    has_longer_rows = warnings and header.count > 1 and (length - data_bytes) % (FLOAT_BYTES * header.count) == 0
     if length < data_bytes or has_longer_rows:
         hint = "the file is truncated: copy or export it again"
         if has_longer_rows:
@@ -501,21 +474,19 @@ def read_header(path: Path) -> PlyHeader:
         element_bytes = f" and {header.after} bytes of other elements" if header.after else ""
         expected = f"{header.count} rows of {stride} bytes{element_bytes} = {data_bytes} bytes after the header"
         raise ValueError(f"{expected}, got {length} bytes; {hint}")
-    return replace(header, tail=tail - padding)
+    return replace(header, warnings=warnings)
 
 
-def tail_warnings(tail: int) -> tuple[str, ...]:
-    """Warn of bytes behind all that a header describes, if there are any."""
-    return (f"{tail} bytes at the file's end are not described by its header: not read",) if tail else ()
-
-
-def padding_bytes(path: Path, size: int, tail: int) -> int:
-    """Count the bytes of padding among the last ``tail`` of ``size`` bytes: all, if all are zeros or blank."""
-    if not 0 < tail <= MAX_PADDING_BYTES:
-        return 0
+def tail_warnings(path: Path, size: int, described_bytes: int) -> tuple[str, ...]:
+    """Warn of bytes at a file's end that its header does not describe, but for a few zeros or blanks."""
+    tail = size - described_bytes
+    if tail <= 0:
+        return ()
     with path.open("rb") as handle:
-        handle.seek(size - tail)
-        return 0 if handle.read(tail).strip(PADDING) else tail
+        handle.seek(described_bytes)
+        if tail <= MAX_PADDING_BYTES and not handle.read(tail).strip(PADDING):
+            return ()
+    return (f"{tail} bytes at the file's end are not described by its header: not read",)
 
 
 def read_head(path: Path) -> tuple[bytes, int]:
@@ -538,48 +509,44 @@ def parse_header(head: bytes) -> PlyHeader:
     return PlyHeader((*lines[: ends[0]], lines[-1]), first.count, first.dtype, offset, after)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Element:
     """An element of a header."""
 
     name: str
     count: int  # rows
-    dtype: np.dtype  # of a row, little-endian, a field a column; without its lists
-    list_column: str | None  # the first of its columns that is a list
+    columns: dict[str, str] = field(default_factory=dict)  # name -> type, little-endian; without its lists
+    list_column: str | None = None  # one of its columns that is a list
+
+    @property
+    def dtype(self) -> np.dtype:
+        """The type of a row, a field a column."""
+        return np.dtype([*self.columns.items()])
 
 
 def parse_elements(head: bytes) -> tuple[tuple[str, ...], list[Element], int]:
     """Return the lines of a binary little-endian header, its elements, at least one, and its length in bytes."""
-    from plyfile import (
-        PlyData,
-        PlyListProperty,
-        PlyParseError,
-    )  # imported here: processes that read no PLY start faster
-
     lines, offset = _header_lines(head)
-    counts: list[int] = []
-    empty: list[str] = []  # the same header of no rows, which plyfile reads without any data
-    for line in lines:
-        words, element = line.split(), _ELEMENT.fullmatch(line)
-        if words[:1] == ["element"] and element is None:
-            expected = "the name of an element and a count of zero or more"
-            raise _header_error(expected, repr(" ".join(words)[:60]))
-        counts += [int(element[2])] if element else []
-        if words and not line.startswith(_REMARKS):
-            empty.append(f"element {element[1]} 0" if element else " ".join(words))
-    try:
-        ply = PlyData.read(io.BytesIO(header_bytes(empty)))
-    except (PlyParseError, ValueError) as error:
-        raise _header_error("a header of PLY 1.0", f"one that does not parse ({str(error)[:120]})") from None
-    if ply.text or ply.byte_order != "<":
-        kind = "ascii" if ply.text else "binary_big_endian"
-        raise _header_error("'format binary_little_endian 1.0'", f"'format {kind} 1.0'", REWRITE)
-    elements = []
-    for element, count in zip(ply.elements, counts, strict=True):
-        lists = [column.name for column in element.properties if isinstance(column, PlyListProperty)]
-        scalars = [(column.name, "<" + column.val_dtype) for column in element.properties if column.name not in lists]
-        elements.append(Element(element.name, count, np.dtype(scalars), lists[0] if lists else None))
-    if not elements or not (elements[0].dtype.names or elements[0].list_column):
+    elements: list[Element] = []
+    storage = "none"
+    for line in lines[1:-1]:
+        match line.split():
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", storage, "1.0"]:
+                pass
+            case ["element", name, count] if _COUNT.fullmatch(count):
+                elements.append(Element(name, int(count)))
+            case ["property", "list", length, item, name] if elements and {length, item} <= CODES.keys():
+                elements[-1].list_column = name
+            case ["property", kind, name] if elements and kind in CODES and name not in elements[-1].columns:
+                elements[-1].columns[name] = f"<{CODES[kind]}"
+            case _:
+                expected = "lines of PLY 1.0, counts of zero or more and no property twice"
+                raise _header_error(expected, repr(line[:60]))
+    if storage != "binary_little_endian":
+        raise _header_error("'format binary_little_endian 1.0'", f"'format {storage} 1.0'", REWRITE)
+    if not elements or not (elements[0].columns or elements[0].list_column):
         raise _header_error("an element 'vertex' with properties", "a header without one")
     return lines, elements, offset
 
@@ -605,17 +572,10 @@ def _header_lines(head: bytes) -> tuple[tuple[str, ...], int]:
     if not all(line.isascii() or line.startswith(_REMARKS) for line in lines):
         expected, got = "ASCII characters in all lines but comments", "other characters in it"
         raise _header_error(expected, got)
-    if len(lines) > MAX_HEADER_LINES:
-        limit, hint = f"at most {MAX_HEADER_LINES} header lines", "leave out properties that are no splat's"
-        raise ValueError(f"{limit}, got {len(lines)}; {hint}")
-    _refuse_clouds(lines)
-    return lines, end.end()
-
-
-def _refuse_clouds(lines: tuple[str, ...]) -> None:
     if cloud := cloud_without_splats(lines):
         expected = "splats (properties such as 'opacity', 'scale_0', 'rot_0')"
         raise ValueError(f"{expected}, got {cloud[0]} without any of them; {cloud[1]}")
+    return lines, end.end()
 
 
 def cloud_without_splats(lines: Sequence[str]) -> tuple[str, str] | None:

@@ -123,7 +123,10 @@ def write_splats(path: Path | str, splats: Splats, columns: Mapping[str, Any] | 
         expected = f"a path that ends in {' or '.join(WITH_COLUMNS)}, which hold columns"
         raise InvalidSplats("columns", expected=expected, got=repr(suffix))
     if columns:
-        new_columns = {str(name): _column(name, values, splats.count) for name, values in columns.items()}
+        new_columns: dict[str, Tensor] = {}
+        for name, values in columns.items():
+            with reading(f"columns[{name!r}]"[:80], InvalidSplats, f"numbers [{splats.count}]"):
+                new_columns[str(name)] = _column(name, values, splats.count)
         layout = (
             (*splats.layout, *(name for name in new_columns if name not in splats.layout)) if splats.layout else ()
         )
@@ -139,18 +142,18 @@ def _column(name: Any, values: Any, count: int) -> Tensor:
 
     from liftcore.scene.splats import shared_tensor
 
-    argument = f"columns[{name!r}]"[:80]
     if not isinstance(name, str) or not COLUMN.fullmatch(name) or ply.MODEL.fullmatch(name):
-        expected = "a name of letters, digits and underscores that no property of splats has"
-        raise InvalidSplats(argument, expected=expected, got=repr(name)[:80])
+        raise ValueError(
+            f"a name of letters, digits and underscores that no property of splats has, got {name!r}"[:160]
+        )
     try:
         column = shared_tensor(values).cpu()
-    except (TypeError, ValueError, RuntimeError):
-        raise InvalidSplats(argument, expected=f"numbers [{count}]", got=repr(values)[:80]) from None
+    except RuntimeError:
+        raise ValueError(f"numbers [{count}], got {values!r}"[:100]) from None
     column = column[:, 0] if column.ndim == 2 and column.shape[1] == 1 else column
     if column.shape != (count,) or column.is_complex():
         hint = "give each of several columns a name" if column.ndim == 2 else ""
-        raise InvalidSplats(argument, expected=f"numbers [{count}]", got=f"shape {list(column.shape)}", hint=hint)
+        raise ValueError(f"numbers [{count}], got shape {list(column.shape)}; {hint}")
     if column.dtype == torch.bool:
         return column.to(torch.uint8)
     if column.dtype in (torch.float16, torch.bfloat16):
@@ -158,7 +161,7 @@ def _column(name: Any, values: Any, count: int) -> Tensor:
     if column.dtype in (torch.int64, torch.uint64):
         low, high = int(column.min()), int(column.max())
         if low < -(2**31) or high >= 2**31:
-            raise InvalidSplats(argument, expected="whole numbers of 32 bits, as PLY has them", got=f"{low}..{high}")
+            raise ValueError(f"whole numbers of 32 bits, as PLY has them, got {low}..{high}")
         return column.to(torch.int32)
     return column
 
@@ -243,7 +246,7 @@ def require_kernel(path: Path, kernel: Kernel, source: str) -> None:
 def some_rows(path: Path, mask: np.ndarray, suffix: str = ".ply", world: WorldFrame | None = None) -> Iterator[bytes]:
     """Yield some rows of a file, in its order, as the bytes of a PLY or of another written format, in blocks.
 
-    Rows of a PLY stay byte for byte (`liftcore.io.ply.some_rows`); another format becomes a PLY of 3DGS.
+    Rows of a PLY stay byte for byte (`liftcore.io.ply.rewritten`); another format becomes a PLY of 3DGS.
 
     Args:
         path: the file. mask: [P] bool, the rows to keep. suffix: of the output.
@@ -251,7 +254,7 @@ def some_rows(path: Path, mask: np.ndarray, suffix: str = ".ply", world: WorldFr
     """
     write = _writer_of(suffix, "suffix")
     if suffix == ".ply" and format_of(path) is SplatFormat.PLY:
-        return _named(path, ply.some_rows, mask)
+        return _named(path, ply.rewritten(path, len(mask), mask=mask))
     splats = _of_count(path, len(mask))
     frame = {} if world is None else {"world": world}
     return write(replace(splats[mask], extras={}, layout=(), header=(), **frame), None)
@@ -270,11 +273,12 @@ def labelled(path: Path, labels: Labels, suffix: str = ".ply", mask: np.ndarray 
     write = _writer_of(suffix, "suffix")
     if suffix not in WITH_COLUMNS:
         raise InvalidSplats("suffix", expected=" or ".join(WITH_COLUMNS) + ", which hold labels", got=repr(suffix))
+    count = len(next(iter(labels.columns.values())))
     if suffix == ".ply" and mask is None and format_of(path) is SplatFormat.PLY:
-        return _named(path, ply.with_columns, labels.columns)
+        return _named(path, ply.rewritten(path, count, labels.columns))
     import torch
 
-    splats = _of_count(path, len(next(iter(labels.columns.values()))))
+    splats = _of_count(path, count)
     if mask is not None:
         splats, labels = splats[mask], labels.subset(mask)
     columns = {name: torch.from_numpy(values) for name, values in labels.columns.items()}
@@ -294,7 +298,7 @@ def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
     """
     terms = constant_terms(colours / 255).astype(np.float32)
     if format_of(path) is SplatFormat.PLY:
-        return _named(path, ply.recoloured, terms)
+        return _named(path, ply.recoloured(path, terms))
     return ply.ply_blocks(replace(_of_count(path, len(terms), colour=False), sh=terms[:, None]))
 
 
@@ -305,9 +309,9 @@ def _of_count(path: Path, count: int, *, colour: bool = True) -> Splats:
     return splats
 
 
-def _named(path: Path, rewrite: Callable[[Path, Any], Iterator[bytes]], change: Any) -> Iterator[bytes]:
+def _named(path: Path, blocks: Iterator[bytes]) -> Iterator[bytes]:
     with _naming(path):
-        yield from rewrite(path, change)
+        yield from blocks
 
 
 @contextmanager

@@ -195,6 +195,7 @@ def test_a_file_without_colours_or_with_another_count_is_refused(tmp_path: Path)
     path = with_ply(tmp_path, ply_bytes(DIALECTS["no colour"]))
     with pytest.raises(InvalidSplats, match="expected colours"):
         list(recoloured(path, np.zeros((5, 3), np.uint8)))
+    path.write_bytes(ply_bytes(DIALECTS["gsplat"]))
     for copy in (some_rows(path, np.ones(4, bool)), recoloured(path, np.zeros((6, 3), np.uint8))):
         with pytest.raises(InvalidSplats, match="as many as were lifted, got 5"):
             list(copy)
