@@ -42,6 +42,7 @@ MAGIC, JSON_CHUNK, BINARY_CHUNK = b"glTF", b"JSON", b"BIN\0"
 MAX_JSON_BYTES = 64 << 20
 MAX_DEGREE = 3  # of harmonics
 MAX_NODES = 100_000
+FEATURE_ID = "_FEATURE_ID_"  # and a number: an attribute of ids
 MAX_ATTRIBUTES = 320  # of a primitive: those of splats, and MAX_COLUMNS others
 SPLAT_BYTES = 56  # of a decoded splat without its colours
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -60,8 +61,11 @@ def read_gltf(path: Path, *, colour: bool = True) -> Fields:
     Feature ids come as ``instance_id`` and ``class_id`` with 0 for none, other attributes with an underscore by their
     names, in lower case.
     """
-    asset = _Asset(path)
-    parts = [asset.fields(matrix, primitive, colour=colour) for matrix, primitive in asset.splats()]
+    try:
+        asset = _Asset(path)
+        parts = [asset.fields(matrix, primitive, colour=colour) for matrix, primitive in asset.splats()]
+    except (AttributeError, LookupError, TypeError) as error:
+        raise ValueError(f"a document of glTF 2.0, got one with parts that do not fit ({error})") from None
     return joined_fields(parts) | {"world": asset.world}
 
 
@@ -69,7 +73,7 @@ def _hint_of(extension: str) -> str:
     """Return the advice for a file that needs an extension that is not read."""
     if "spz" in extension.lower():
         return "export its splats as .spz, which is read, as .ply, or as .glb without compression"
-    return ""
+    return "export the splats again, as .ply"
 
 
 class _Asset:
@@ -80,80 +84,65 @@ class _Asset:
             head = handle.read(20)
         self.size = path.stat().st_size
         if len(head) < 20 or head[16:20] != JSON_CHUNK or struct.unpack_from("<I", head, 4)[0] != 2:
-            raise _broken("a glTF 2.0 file that begins with JSON", repr(head[4:20]))
-        length = struct.unpack_from("<I", head, 12)[0]
-        if length > min(MAX_JSON_BYTES, self.size - 20):
-            raise _broken(f"at most {MAX_JSON_BYTES} bytes of JSON in the file", str(length))
-        content, offset = np.memmap(path, np.uint8, "r"), 20 + length
-        text, self.binary = content[20:offset].tobytes(), content[:0]
-        if offset + 8 <= self.size and content[offset + 4 : offset + 8].tobytes() == BINARY_CHUNK:
-            (binary_length,) = struct.unpack("<I", content[offset : offset + 4].tobytes())
-            self.binary = content[offset + 8 : offset + 8 + binary_length]
-        try:
-            self.json: Any = json.loads(text)
-        except (ValueError, RecursionError) as error:
-            raise _broken("JSON", str(error)[:120]) from None
-        if not isinstance(self.json, dict):
-            raise _broken("a JSON object", repr(self.json)[:40])
-        unsupported = [
-            name for name in map(str, self._list(self.json, "extensionsRequired")) if name not in SUPPORTED_EXTENSIONS
-        ]
-        if unsupported:
-            got = f"one that requires {unsupported[0][:80]}"
-            raise _broken("a file without other required extensions", got, _hint_of(unsupported[0]))
-        asset = self.json.get("asset")
-        extras = asset.get("extras") if isinstance(asset, dict) else None
-        self.world = world_of(extras[WORLD]) if isinstance(extras, dict) and WORLD in extras else METRES
+            raise ValueError(f"a glTF 2.0 file that begins with JSON, got {head[4:20]!r}")
+        end = 20 + int.from_bytes(head[12:16], "little")
+        if end > min(MAX_JSON_BYTES, self.size):
+            raise ValueError(f"at most {MAX_JSON_BYTES} bytes of JSON in the file, got {end}")
+        content = np.memmap(path, np.uint8, "r")
+        is_binary = content[end + 4 : end + 8].tobytes() == BINARY_CHUNK
+        self.binary = content[end + 8 :][: int.from_bytes(content[end : end + 4].tobytes(), "little") * is_binary]
+        self.json: Any = json.loads(content[20:end].tobytes())
+        for name in self.json.get("extensionsRequired", ()):
+            if name not in SUPPORTED_EXTENSIONS:
+                hint = _hint_of(str(name))
+                raise ValueError(f"a file without other required extensions, got {str(name)[:80]!r}; {hint}")
+        if len(self.json["buffers"]) > 1 or "uri" in self.json["buffers"][0]:
+            got = f"others ({str(self.json['buffers'])[:60]})"
+            raise ValueError(f"a buffer within the file, got {got}; make one .glb of it, with its buffers")
+        extras = self.json["asset"].get("extras", {})
+        self.world = world_of(extras[WORLD]) if WORLD in extras else METRES
 
     def splats(self) -> list[tuple[np.ndarray, dict[str, Any]]]:
         """Return the primitives of splats with their nodes' matrices [4, 4] f64, as the scene has them."""
-        meshes, nodes = self._list(self.json, "meshes"), self._list(self.json, "nodes")
-        scenes = self._list(self.json, "scenes")
-        scene = self.json.get("scene", 0)
-        inner = {
-            child
-            for node in nodes
-            if isinstance(node, dict)
-            for child in self._list(node, "children")
-            if type(child) is int
-        }
+        nodes = self.json["nodes"]
+        inner = {child for node in nodes for child in node.get("children", ())}
         roots = [place for place in range(len(nodes)) if place not in inner]
-        if scenes:
-            roots = self._list(self._at(scenes, scene, "scene"), "nodes")
+        if self.json.get("scenes"):
+            roots = self.json["scenes"][self.json.get("scene", 0)].get("nodes", [])
         origin = np.linalg.inv(self.world.placement(TO_FILE, in_metres=True))
         primitives, queue, visited = [], [(root, origin) for root in reversed(roots)], set[int]()
         while queue:
             place, above = queue.pop()
-            node = self._at(nodes, place, "node")
             if place in visited or max(len(visited), len(primitives)) >= MAX_NODES:
                 got = "one that meets a node twice, or has more nodes"
-                raise _broken(f"a tree of at most {MAX_NODES} nodes with splats", got)
+                raise ValueError(f"a tree of at most {MAX_NODES} nodes with splats, got {got}")
             visited.add(place)
-            matrix = above @ self._matrix(node, place) if TRANSFORM & node.keys() else above
-            queue += [(child, matrix) for child in reversed(self._list(node, "children"))]
+            node = nodes[place]
+            matrix = above @ _matrix(node) if TRANSFORM & node.keys() else above
+            queue += [(child, matrix) for child in reversed(node.get("children", []))]
             if "mesh" in node:
-                mesh = self._at(meshes, node["mesh"], "mesh")
-                primitives += [(matrix, item) for item in self._list(mesh, "primitives") if _is_of_splats(item)]
+                items = self.json["meshes"][node["mesh"]]["primitives"]
+                primitives += [(matrix, item) for item in items if EXTENSION in item.get("extensions", {})]
         if not primitives:
-            raise _broken(f"splats ({EXTENSION})", "a glTF model without any")
+            raise ValueError(f"splats ({EXTENSION}), got a glTF model without any")
         total = sum(self._count(primitive) for _, primitive in primitives)
         if not 0 < total * SPLAT_BYTES <= MOST_GROWTH * self.size:
-            raise _broken("as many splats as the file's size can be of", str(total))
+            raise ValueError(f"as many splats as the file's size can be of, got {total}")
         return primitives
 
     def fields(self, matrix: np.ndarray, primitive: dict[str, Any], *, colour: bool) -> Fields:
         """Return the fields of one primitive, with its extras and warnings."""
-        attributes, warnings = primitive["attributes"], self._require_kernel(primitive)
+        attributes, warnings = primitive["attributes"], _kernel_warnings(primitive)
         count = self._count(primitive)
         try:
             move = Similarity.of(matrix)
         except InvalidInput as error:
             hint = "apply the node's transform to its splats in the program that made it"
-            raise _broken(f"a node's transform of {error.expected}", error.got, hint) from None
+            raise ValueError(f"a node's transform of {error.expected}, got {error.got}; {hint}") from None
         rotation = TO_FILE @ move.rotation
 
         def read(name: str, width: int) -> np.ndarray:
-            return self._attribute(attributes, name, width, count)
+            return self._attribute(attributes.get(name), name, width, count)
 
         places = read("POSITION", 3).astype(np.float64) @ (move.scale * rotation).T + TO_FILE @ move.translation
         quats = np.roll(read(f"{EXTENSION}:ROTATION", 4).astype(np.float64), 1, axis=1)
@@ -165,185 +154,97 @@ class _Asset:
             "log_scales": scales.astype(np.float32),
             "opacity_logits": logits(read(f"{EXTENSION}:OPACITY", 1)[:, 0]).astype(np.float32),
         }
-        extras = primitive.get("extras")
-        mode, odd = None, ()
-        if isinstance(extras, dict) and RENDER_MODE in extras:
+        extras, mode, odd = primitive.get("extras", {}), None, ()
+        if RENDER_MODE in extras:
             mode, odd = mode_of_word(extras[RENDER_MODE], f"{RENDER_MODE!r} of a primitive")
         fields |= {"extras": {}, "warnings": (*warnings, *odd), "render_mode": mode}
         if not colour:
             return fields
-        degree = next(
-            (
-                band - 1
-                for band in (1, 2, 3)
-                if not any(harmonic_name(band, n) in attributes for n in range(2 * band + 1))
-            ),
-            3,
-        )
-        sh = np.empty((count, (degree + 1) ** 2, 3), np.float32)
-        for band in range(degree + 1):
-            coefficients = np.stack([read(harmonic_name(band, place), 3) for place in range(2 * band + 1)], axis=1)
+        bands = [[harmonic_name(band, place) for place in range(2 * band + 1)] for band in range(MAX_DEGREE + 1)]
+        absent = (band for band, names in enumerate(bands) if band and not attributes.keys() & set(names))
+        bands = bands[: next(absent, len(bands))]
+        sh = np.empty((count, len(bands) ** 2, 3), np.float32)
+        for band, names in enumerate(bands):
+            coefficients = np.stack([read(name, 3) for name in names], axis=1)
             sh[:, band**2 : (band + 1) ** 2] = np.einsum("ij,njc->nic", band_rotation(band, rotation), coefficients)
         return fields | {"sh": sh, "extras": self._extras(primitive, count)}
 
     def _extras(self, primitive: dict[str, Any], count: int) -> dict[str, np.ndarray]:
+        """Return feature ids by their label, else by their number, and other columns by name, each [P]."""
         attributes = primitive["attributes"]
         if len(attributes) > MAX_ATTRIBUTES:
-            raise _broken(f"at most {MAX_ATTRIBUTES} attributes", str(len(attributes)))
-        extras = {}
-        for name, feature_set in self._feature_sets(primitive).items():
-            ids = self._attribute(attributes, f"_FEATURE_ID_{feature_set['attribute']}", 1, count)[:, 0].astype(
-                np.int64
-            )
-            none = feature_set.get("nullFeatureId") if type(feature_set.get("nullFeatureId")) is int else -1
-            extras[name] = (
-                np.where(ids == none, 0, ids + (none != 0)).clip(0, np.iinfo(np.int32).max).astype(np.int32)
-            )
+            raise ValueError(f"at most {MAX_ATTRIBUTES} attributes, got {len(attributes)}")
+        sets = {
+            item.get("attribute"): item for item in primitive["extensions"].get(FEATURES, {}).get("featureIds", ())
+        }
+        extras: dict[str, np.ndarray] = {}
+        for name in sorted(attributes):
+            if not re.fullmatch(f"{FEATURE_ID}[0-9]{{1,9}}", name):
+                continue
+            number = int(name.removeprefix(FEATURE_ID))
+            ids_of = sets.get(number, {})
+            label, none = f"{ids_of.get('label')}_id", ids_of.get("nullFeatureId", -1)
+            column = label if label in IDS else IDS[number] if number < 2 else f"feature_id_{number}"
+            ids = self._attribute(attributes[name], name, 1, count)[:, 0].astype(np.int64)
+            ids = np.where(ids == none, 0, ids + (none != 0))
+            extras[column] = ids.clip(0, np.iinfo(np.int32).max).astype(np.int32)
         for name, place in attributes.items():
             column = name[1:].lower() if name == name.upper() else name[1:]
             is_column = COLUMN.fullmatch(column) and not MODEL.fullmatch(column) and column not in extras
-            if name[:1] != "_" or name.startswith("_FEATURE_ID_") or not is_column:
+            if name[:1] != "_" or name.startswith(FEATURE_ID) or not is_column:
                 continue
-            if self._at(self._list(self.json, "accessors"), place, "accessor").get("type") == "SCALAR":
-                values = self._attribute(attributes, name, 1, count)[:, 0]
+            if self.json["accessors"][place].get("type") == "SCALAR":
+                values = self._attribute(place, name, 1, count)[:, 0]
                 extras[column] = values.astype(np.float32 if values.dtype.kind == "f" else np.int32)
         return extras
 
-    def _feature_sets(self, primitive: dict[str, Any]) -> dict[str, dict[str, Any]]:
-        """Return the feature ids of attributes by the names of their columns: by their label, else by their order."""
-        sets_by_column: dict[str, dict[str, Any]] = {}
-        sets = self._list(self._extension(primitive, FEATURES), "featureIds")
-        of_attributes = [
-            feature_set
-            for feature_set in sets
-            if isinstance(feature_set, dict) and type(feature_set.get("attribute")) is int
-        ]
-        numbers = {int(feature_set["attribute"]) for feature_set in of_attributes}
-        attribute_numbers = (
-            int(name[12:])
-            for name in primitive["attributes"]
-            if name.startswith("_FEATURE_ID_") and re.fullmatch("[0-9]{1,9}", name[12:])
-        )
-        for feature_set in [
-            *of_attributes,
-            *({"attribute": place} for place in sorted(attribute_numbers) if place not in numbers),
-        ]:
-            label, place = f"{feature_set.get('label')}_id", feature_set["attribute"]
-            default = IDS[place] if 0 <= place < 2 and IDS[place] not in sets_by_column else f"feature_id_{place}"
-            sets_by_column[label if label in IDS else default] = feature_set
-        return sets_by_column
-
-    def _require_kernel(self, primitive: dict[str, Any]) -> tuple[str, ...]:
-        kind = self._extension(primitive, EXTENSION)
-        compressed = next(iter(self._at_key(kind, "extensions")), None) if "extensions" in kind else None
-        unsupported = f"the extension {compressed!r}" if compressed else None
-        if kind.get("kernel") != "ellipse" and unsupported is None:
-            unsupported = f"the kernel {kind.get('kernel')!r}"
-        if primitive.get("mode") != 0 or "indices" in primitive:
-            unsupported = unsupported or "a primitive that is no list of points"
-        if unsupported:
-            raise _broken("plain splats with the kernel 'ellipse'", unsupported[:100], _hint_of(compressed or ""))
-        space = kind.get("colorSpace")
-        return () if space == SRGB else (f"colours are of {str(space)[:60]!r}, and are taken for sRGB",)
-
-    # -- parts of the file
-
-    def _attribute(self, attributes: dict[str, Any], name: str, width: int, count: int) -> np.ndarray:
-        """Read an attribute [P, width]; normalized integers as f32."""
-        accessor = self._at(self._list(self.json, "accessors"), attributes.get(name), f"accessor of {name}")
-        component, kind, normalized = (accessor.get(key) for key in ("componentType", "type", "normalized"))
-        code = COMPONENTS.get(component) if type(component) is int else None
-        fits = (
-            kind in [name for name, components in WIDTHS.items() if components == width]
-            and accessor.get("count") == count
-        )
-        if code is None or not fits or "sparse" in accessor or "bufferView" not in accessor:
-            raise _broken(f"{count} rows of {width} plain numbers as {name}", repr(accessor)[:80])
-        content = self._view(accessor["bufferView"])
-        view = self._at(self._list(self.json, "bufferViews"), accessor["bufferView"], "buffer view")
-        size = width * np.dtype(code).itemsize
-        stride, first = view.get("byteStride", size), accessor.get("byteOffset", 0)
-        if type(stride) is not int or type(first) is not int or stride < size or first < 0:
-            raise _broken(f"rows of {size} bytes or more as {name}", f"{stride!r} from {first!r}"[:40])
-        if first + (count - 1) * stride + size > len(content):
-            raise _broken(f"{count} rows of {name} in the file", f"{len(content)} bytes")
-        rows = np.lib.stride_tricks.as_strided(content[first:], (count, size), (stride, 1))
-        values = np.ascontiguousarray(rows).view(code)
-        if normalized and values.dtype.kind in "iu":
-            return np.maximum(values.astype(np.float32) / np.iinfo(values.dtype).max, -1)
-        return values
-
-    def _view(self, place: Any) -> np.ndarray:
-        """Return the bytes [n] u8 of a buffer view."""
-        view = self._at(self._list(self.json, "bufferViews"), place, "buffer view")
-        first, size, buffer = view.get("byteOffset", 0), view.get("byteLength"), view.get("buffer")
-        uri = self._at(self._list(self.json, "buffers"), buffer, "buffer").get("uri")
-        if buffer != 0 or uri is not None:
-            got = f"a buffer in {str(uri)[:60]!r}"
-            raise _broken("buffers within the file", got, "make one .glb of it, with its buffers")
-        if (
-            type(first) is not int
-            or type(size) is not int
-            or first < 0
-            or size < 0
-            or first + size > len(self.binary)
-        ):
-            raise _broken("a buffer view that lies in the file", f"{size!r} bytes from {first!r}"[:60])
-        return self.binary[first : first + size]
-
     def _count(self, primitive: dict[str, Any]) -> int:
-        attributes = primitive.get("attributes")
-        if not isinstance(attributes, dict):
-            raise _broken("attributes of a primitive", repr(attributes)[:40])
-        accessor = self._at(self._list(self.json, "accessors"), attributes.get("POSITION"), "accessor of POSITION")
-        count = accessor.get("count")
-        if type(count) is not int or count < 1:
-            raise _broken("a number of splats", repr(count)[:40])
-        return count
+        return self.json["accessors"][primitive["attributes"]["POSITION"]]["count"]
 
-    def _matrix(self, node: dict[str, Any], place: Any) -> np.ndarray:
+    def _attribute(self, place: Any, name: str, width: int, count: int) -> np.ndarray:
+        """Read an attribute [P, width]; normalized integers as f32."""
+        accessor: dict[str, Any] = {}
         try:
-            if "matrix" in node:
-                return np.array(node["matrix"], np.float64).reshape(4, 4).T
-            matrix = np.eye(4)
-            rotation = np.roll(np.array(node.get("rotation", (0, 0, 0, 1)), np.float64), 1)
-            matrix[:3, :3] = rotation_matrices(rotation) * np.array(node.get("scale", (1, 1, 1)), np.float64)
-            matrix[:3, 3] = node.get("translation", (0, 0, 0))
-            return matrix
-        except (TypeError, ValueError, OverflowError):
-            raise _broken("a transform of numbers", f"that of node {place}") from None
-
-    def _extension(self, owner: dict[str, Any], name: str) -> dict[str, Any]:
-        extensions = owner.get("extensions")
-        extension = extensions.get(name) if isinstance(extensions, dict) else None
-        return extension if isinstance(extension, dict) else {}
-
-    def _list(self, owner: Any, key: str) -> list[Any]:
-        values = owner.get(key, []) if isinstance(owner, dict) else None
-        if not isinstance(values, list):
-            raise _broken(f"a list of {key}", repr(values)[:40])
-        return values
-
-    def _at(self, values: list[Any], place: Any, noun: str) -> dict[str, Any]:
-        if type(place) is not int or not 0 <= place < len(values) or not isinstance(values[place], dict):
-            raise _broken(f"a {noun}", f"the number {place!r}"[:60])
-        item: dict[str, Any] = values[place]
-        return item
-
-    def _at_key(self, owner: Any, key: Any) -> dict[str, Any]:
-        value = owner.get(key) if isinstance(owner, dict) and isinstance(key, str) else None
-        if not isinstance(value, dict):
-            raise _broken(f"{str(key)[:40]!r} as an object", repr(value)[:40])
-        return value
+            accessor = self.json["accessors"][place]
+            view = self.json["bufferViews"][accessor["bufferView"]]
+            dtype = np.dtype(COMPONENTS[accessor["componentType"]])
+            content = self.binary[view.get("byteOffset", 0) :][: view["byteLength"]]
+            size, first = width * dtype.itemsize, accessor.get("byteOffset", 0)
+            stride = view.get("byteStride", size)
+            fits = accessor["count"] == count and WIDTHS[accessor["type"]] == width and "sparse" not in accessor
+            if not fits or stride < size or first + (count - 1) * stride + size > len(content):
+                raise ValueError(name)
+            rows = np.ndarray((count, width), dtype, content, first, (stride, dtype.itemsize))
+        except (AttributeError, LookupError, TypeError, ValueError, OverflowError):
+            expected = f"{count} rows of {width} plain numbers in the file as {name}"
+            raise ValueError(f"{expected}, got {repr(accessor)[:80]}") from None
+        if accessor.get("normalized") and dtype.kind in "iu":
+            return np.maximum(rows.astype(np.float32) / np.iinfo(dtype).max, -1)
+        return rows.copy()
 
 
-def _broken(expected: str, got: str, hint: str = "") -> ValueError:
-    return ValueError(f"{expected}, got {got}" + (f"; {hint}" if hint else ""))
+def _matrix(node: dict[str, Any]) -> np.ndarray:
+    """Return the transform [4, 4] f64 of a node."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    matrix = np.eye(4)
+    rotation = np.roll(np.array(node.get("rotation", (0, 0, 0, 1)), np.float64), 1)
+    matrix[:3, :3] = rotation_matrices(rotation) * np.array(node.get("scale", (1, 1, 1)), np.float64)
+    matrix[:3, 3] = node.get("translation", (0, 0, 0))
+    return matrix
 
 
-def _is_of_splats(primitive: Any) -> bool:
-    extensions = primitive.get("extensions") if isinstance(primitive, dict) else None
-    return isinstance(extensions, dict) and isinstance(extensions.get(EXTENSION), dict)
+def _kernel_warnings(primitive: dict[str, Any]) -> tuple[str, ...]:
+    """Refuse what is no plain splats, and warn of colours of another space than sRGB."""
+    kind = primitive["extensions"][EXTENSION]
+    compressed = next(iter(kind.get("extensions", {})), "")
+    got = f"the extension {compressed!r}" if compressed else f"the kernel {kind.get('kernel')!r}"
+    if not compressed and kind.get("kernel") == "ellipse":
+        if primitive.get("mode") == 0 and "indices" not in primitive:
+            space = kind.get("colorSpace")
+            return () if space == SRGB else (f"colours are of {str(space)[:60]!r}, and are taken for sRGB",)
+        got = "a primitive that is no list of points"
+    raise ValueError(f"plain splats with the kernel 'ellipse', got {got[:100]}; {_hint_of(compressed)}")
 
 
 def harmonic_name(band: int, place: int) -> str:

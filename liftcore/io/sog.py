@@ -10,10 +10,8 @@ ours are the file's.
 
 import io
 import json
-import lzma
 import warnings
 import zipfile
-import zlib
 from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -21,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from liftcore.io.files import open_regular, open_zip
+from liftcore.io.files import BROKEN_ZIP, open_regular, open_zip
 from liftcore.io.quantised import MOST_GROWTH, Fields, decoded, field_shapes, logits, smallest_three
 from liftcore.scene.render_mode import mode_of_word
 
@@ -37,16 +35,18 @@ HINT = "export it again with SuperSplat or splat-transform, or as PLY"
 
 def read_sog(path: Path, *, colour: bool = True) -> Fields:
     """Read the fields of a ``.sog`` file, of an unpacked folder, or of the ``meta.json`` in one."""
-    if not is_bundled(path):
-        meta, folder = _meta_of(path), _meta_of(path).parent
-        size = sum(file.stat().st_size for file in sog_files(path))
-        return _Pictures(_in_folder(folder), meta.name, size).fields(colour=colour)
     try:
+        if not is_bundled(path):
+            meta = _meta_of(path)
+            size = sum(file.stat().st_size for file in sog_files(path))
+            return _Pictures(_in_folder(meta.parent), meta.name, size).fields(colour=colour)
         with open_zip(path) as archive:
             member = partial(_read_in_archive, archive, sog_folder(archive.namelist()) or "")
             return _Pictures(member, META, path.stat().st_size).fields(colour=colour)
-    except (zipfile.BadZipFile, zlib.error, lzma.LZMAError, NotImplementedError, RuntimeError) as error:
-        raise _broken("a .sog file", f"one that does not open ({error})") from None
+    except (*BROKEN_ZIP, AttributeError, LookupError, TypeError) as error:
+        if ", got " in str(error):
+            raise
+        raise _broken("a .sog file", f"one that does not open ({error!r})") from None
 
 
 def is_sog_document(document: Any) -> bool:
@@ -72,16 +72,9 @@ def sog_files(path: Path) -> list[Path]:
             document = json.loads(handle.read(MAX_META_BYTES))
     except (ValueError, RecursionError):
         document = None
-    parts = (
-        [part for part in (document or {}).values() if isinstance(part, dict)] if is_sog_document(document) else []
-    )
-    names = {name for part in parts for name in _names_in(part)}
+    parts = document.values() if document and is_sog_document(document) else ()
+    names = {name for part in parts if isinstance(part, dict) for name in part.get("files") or () if _is_beside(name)}
     return sorted([meta, *(meta.parent / name for name in names if (meta.parent / name).is_file())])
-
-
-def _names_in(part: dict[str, Any]) -> list[str]:
-    names = part.get("files")
-    return [name for name in names if _is_beside(name)] if isinstance(names, list) else []
 
 
 def _is_beside(name: Any) -> bool:
@@ -134,11 +127,10 @@ class _Pictures:
             self.meta: Any = json.loads(document)
         except (ValueError, RecursionError) as error:
             raise _broken(f"{META} as JSON", str(error)[:120]) from None
-        version = self.meta.get("version") if isinstance(self.meta, dict) else None
+        version, count = self.meta.get("version"), self.meta.get("count")
         if version != 2:
             raise _broken("version 2", repr(version)[:60])
-        count = self.meta.get("count")
-        bands = self.meta["shN"].get("bands") if isinstance(self.meta.get("shN"), dict) else 0
+        bands = (self.meta.get("shN") or {}).get("bands")
         higher = SH_ROWS[bands] if bands in (1, 2, 3) else 0
         row_bytes = FIELD_BYTES + TERM_BYTES * (1 + higher)
         if type(count) is not int or not 0 < count * row_bytes <= MOST_GROWTH * self.size:
@@ -179,7 +171,7 @@ class _Pictures:
 
     def _harmonics(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the palette [n, K - 1, 3], and each splat's row in it [P]."""
-        bands, count = (self._part("shN").get(key) for key in ("bands", "count"))
+        bands, count = (self.meta["shN"][key] for key in ("bands", "count"))
         if bands not in (1, 2, 3) or type(count) is not int or not 0 < count <= MAX_PALETTE:
             raise _broken(f"1 to 3 bands and a palette of at most {MAX_PALETTE}", f"{bands} and {count}"[:60])
         book, higher = self._numbers("shN", "codebook", 256), SH_ROWS[bands]
@@ -193,18 +185,9 @@ class _Pictures:
             raise _broken(f"labels below {count}", f"the label {labels.max()}")
         return palette, labels
 
-    def _part(self, name: str) -> dict[str, Any]:
-        part = self.meta.get(name)
-        if not isinstance(part, dict):
-            raise _broken(f"{name!r} in {META}", "none")
-        return part
-
     def _numbers(self, part: str, key: str, count: int) -> np.ndarray:
-        values = self._part(part).get(key)
-        try:
-            numbers = np.array(values, np.float64)
-        except (TypeError, ValueError, OverflowError):
-            numbers = np.empty(0)
+        values = (self.meta.get(part) or {}).get(key)
+        numbers = np.array(values if isinstance(values, list) else [], np.float64)
         if numbers.shape != (count,) or not np.abs(numbers).max() <= MAX_TERM:
             raise _broken(f"{count} finite numbers as {key!r} of {part!r}", repr(values)[:60])
         return numbers
@@ -217,10 +200,8 @@ class _Pictures:
         """Read a picture [h, w, 4] u8 of at least ``least`` pixels and not many more."""
         from PIL import Image, UnidentifiedImageError
 
-        names = self._part(part).get("files")
-        if not isinstance(names, list) or len(names) <= index or not isinstance(names[index], str):
-            raise _broken(f"{index + 1} files of {part!r} in {META}", repr(names)[:60])
-        content = self._member(names[index], self.size)
+        name = self.meta[part]["files"][index]
+        content = self._member(name, self.size)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", Image.DecompressionBombWarning)
@@ -229,8 +210,8 @@ class _Pictures:
                     if least <= pixels <= 2 * least + (1 << 16):
                         return np.asarray(picture.convert("RGBA"))
         except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
-            raise _broken(f"a WebP picture as {names[index]!r}", str(error)[:120]) from None
-        raise _broken(f"{least} pixels in {names[index]!r}", f"{pixels}")
+            raise _broken(f"a WebP picture as {name!r}", str(error)[:120]) from None
+        raise _broken(f"{least} pixels in {name!r}", f"{pixels}")
 
     def _member(self, name: str, limit: int) -> bytes:
         content = self.read_member(name, limit + 1) if PurePosixPath(name).name == name else None
