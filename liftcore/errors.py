@@ -88,7 +88,8 @@ def reading(source: object, error: type[SplatliftError], expected: str, hint: st
         got = f"a file that does not open ({fault.strerror or fault})"[:160]
         raise error(str(source), expected=expected, got=got, hint=hint) from None
     except (ValueError, TypeError, LookupError, OverflowError, RecursionError, EOFError, SyntaxError) as fault:
-        seen, separator, got = str(fault).partition(", got ")
+        said = f"no {fault}" if isinstance(fault, KeyError) else str(fault)
+        seen, separator, got = said.partition(", got ")
         got, _, remedy = got.partition("; ") if separator else (seen, "", "")
         raise error(
             str(source), expected=seen if separator else expected, got=got[:160], hint=remedy or hint

@@ -9,6 +9,7 @@ frame of its own. Only the user knows which is that of the splats, so a folder o
 
 import errno
 import os
+import shutil
 import tempfile
 import zipfile
 from collections.abc import Iterable
@@ -21,7 +22,7 @@ from liftcore.errors import InvalidCameras, Unavailable, reading
 from liftcore.io.colmap import MODEL_FILES, has_model, is_whole, model_files, read_colmap, read_image_names
 from liftcore.io.files import BROKEN_ZIP, first_bytes, is_system_file, is_zip, open_regular, open_zip
 from liftcore.io.json_file import FORMATS as JSON_FORMATS
-from liftcore.io.json_file import entry, matrix, number, pixels, read_json
+from liftcore.io.json_file import matrix, number, pixels, read_json
 from liftcore.io.kinds import wrong_kind
 from liftcore.io.photos import PhotosBeside
 from liftcore.io.transforms import FRAME_FILE, cameras_in_frame, is_export, parse_export, parse_transforms, read_frame
@@ -50,7 +51,6 @@ OTHER_FRAME = (
     f"the COLMAP model was read, and {TRANSFORMS} beside it was not: splats that nerfstudio trained are in a frame "
     f"of their own, so put its run's {FRAME_FILE} beside them"
 )
-ONE_RUN = "zip those of one run alone"
 
 
 @dataclass(frozen=True)
@@ -113,33 +113,30 @@ def read_cameras(path: Path | str) -> Cameras:
     """
     path = as_path(path)
     try:
-        return _read(path)
+        with reading(path, InvalidCameras, FORMATS):
+            return _read(path)
     except InvalidCameras as error:
         raise wrong_kind(path, "cameras", InvalidCameras, expected=FORMATS) or error from None
 
 
 def _read(path: Path) -> Cameras:
     if not path.exists():
-        raise InvalidCameras(str(path), expected=FORMATS, got="no such file or folder")
+        raise ValueError(f"{FORMATS}, got no such file or folder")
     source = camera_source(path)
     if source.file is None:
         if source.model is not None:
             return source.read()
         candidates = sorted(path.glob("transforms*.json"))
         hint = f"name one of the files, such as {candidates[0]}" if candidates else ""
-        raise InvalidCameras(str(path), expected=FORMATS, got="a folder without any of them", hint=hint)
-    try:
-        with open_regular(source.file) as handle:
-            start = handle.read(64).lstrip(b"\xef\xbb\xbf \t\r\n")
-        if is_zip(source.file):
-            return _from_zip(source.file, source.frame)
-    except OSError as error:
-        got = f"a file that does not open ({error.strerror})"
-        raise InvalidCameras(str(path), expected=FORMATS, got=got) from None
+        raise ValueError(f"{FORMATS}, got a folder without any of them; {hint}")
+    with open_regular(source.file) as handle:
+        start = handle.read(64).lstrip(b"\xef\xbb\xbf \t\r\n")
+    if is_zip(source.file):
+        return _from_zip(source.file, source.frame)
     if start[:1] not in (b"[", b"{"):
         got = f"a file that begins with {first_bytes(start)}" if start else "an empty file"
         hint = "of a COLMAP model give the folder, or a zip of its cameras.* and images.* together"
-        raise InvalidCameras(str(path), expected=FORMATS, got=got, hint=hint)
+        raise ValueError(f"{FORMATS}, got {got}; {hint}")
     return source.read()
 
 
@@ -265,15 +262,15 @@ def _parse_inria(document: list[Any], source: str) -> Cameras:
             keys = f"objects with {', '.join(list(document[0])[:5])}" if isinstance(document[0], dict) else ""
             raise ValueError(f"{JSON_FORMATS}, got a list of {keys or type(document[0]).__name__}")
         check_count(len(document), source)
-        names = view_names([str(entry(record, "img_name")) for record in document])
+        names = view_names([str(record["img_name"]) for record in document])
 
     def cameras(name: str, record: dict[str, Any]) -> list[Camera]:
         with reading(f"{source} camera {name!r}", InvalidCameras, "a camera"):
-            width, height = (pixels(entry(record, key), key) for key in ("width", "height"))
-            fx, fy = (number(entry(record, key), key) for key in ("fx", "fy"))
+            width, height = (pixels(record[key], key) for key in ("width", "height"))
+            fx, fy = (number(record[key], key) for key in ("fx", "fy"))
         with reading(f"{source} camera {name!r}", InvalidPose, "a pose"):
-            rotation = matrix(entry(record, "rotation"), (3,), 3, "rotation")
-            (position,) = matrix([entry(record, "position")], (1,), 3, "position")
+            rotation = matrix(record["rotation"], (3,), 3, "rotation")
+            (position,) = matrix([record["position"]], (1,), 3, "position")
         pose = viewmat_of(rotation, position)
         return [Camera.pinhole(name, width, height, fx, fy, width / 2, height / 2, viewmat=pose)]
 
@@ -293,7 +290,7 @@ def _from_zip(path: Path, frame_file: Path | None) -> Cameras:
     with archive, scratch_folder("splatlift-") as root:
         names = _unzip(archive, path, root)
         try:
-            source = _source_in_zip(names, root, path, frame_file)
+            source = _source_in_zip(names, root, frame_file)
             if source.file is not None:
                 inner = source.file.parent.relative_to(root).as_posix()
                 source = replace(source, photos=zipfile.Path(archive, "" if inner == "." else f"{inner}/"))
@@ -304,7 +301,7 @@ def _from_zip(path: Path, frame_file: Path | None) -> Cameras:
             raise InvalidCameras(argument, expected=error.expected, got=got, hint=hint) from None
 
 
-def _source_in_zip(names: list[str], root: Path, path: Path, frame_file: Path | None) -> CameraSource:
+def _source_in_zip(names: list[str], root: Path, frame_file: Path | None) -> CameraSource:
     """Return the source of a zip whose camera files lie unzipped in ``root``, at any depth."""
     files = sorted(map(PurePosixPath, names), key=lambda file: (len(file.parts), file))
     frames = [file for file in files if file.name == FRAME_FILE]
@@ -314,11 +311,9 @@ def _source_in_zip(names: list[str], root: Path, path: Path, frame_file: Path | 
     scenes = {_scene_of(model) for model in models} | {file.parent for file in files if _is_transforms(file.name)}
     for noun, places in (("scene", sorted(map(str, scenes))), (FRAME_FILE, [str(frame) for frame in frames])):
         if len(places) > 1:
-            raise InvalidCameras(str(path), expected=f"one {noun}", got=" and ".join(places[:2]), hint=ONE_RUN)
+            raise ValueError(f"one {noun}, got {' and '.join(places[:2])}; zip those of one run alone")
     if not scenes:
-        got, hint = _what_else(names)
-        expected = "a COLMAP model (cameras and images, .bin or .txt) in the zip"
-        raise InvalidCameras(str(path), expected=expected, got=got, hint=hint)
+        raise ValueError(f"a COLMAP model (cameras and images, .bin or .txt) in the zip, got {_what_else(names)}")
     folder = root / scenes.pop()
     source = _source_in_folder(folder, root / frames[0] if frames else frame_file)
     if source.file is None and source.model is None:  # transforms of another name
@@ -345,16 +340,18 @@ def _files(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
 
 def _unzip(archive: zipfile.ZipFile, path: Path, folder: Path) -> list[str]:
     """Unzip the camera files to ``folder``, and return the names of all files in the zip."""
-    count, budget = len(archive.infolist()), MAX_UNZIPPED_BYTES
-    if count > MAX_ZIP_MEMBERS:
-        raise InvalidCameras(str(path), expected=f"at most {MAX_ZIP_MEMBERS} files", got=str(count))
+    if (count := len(archive.infolist())) > MAX_ZIP_MEMBERS:
+        raise ValueError(f"at most {MAX_ZIP_MEMBERS} files, got {count}")
     files = _files(archive)
+    of_cameras = {name: member for name, member in files.items() if _is_of_cameras(PurePosixPath(name).name)}
+    if (size := sum(member.file_size for member in of_cameras.values())) > MAX_UNZIPPED_BYTES:
+        hint = "leave the points out of the zip"
+        raise ValueError(f"at most {MAX_UNZIPPED_BYTES} bytes unzipped, got {size} bytes; {hint}")
     try:
-        for name, member in files.items():
-            last = PurePosixPath(name).name
-            if last in (*MODEL_FILES, FRAME_FILE) or _is_transforms(last):
-                (folder / name).parent.mkdir(parents=True, exist_ok=True)
-                budget -= _unzip_one(archive, member, folder / name, budget)
+        for name, member in of_cameras.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            with archive.open(member) as source, (folder / name).open("wb") as sink:
+                shutil.copyfileobj(source, sink)  # no more than the size that was added up
     except BROKEN_ZIP as error:
         raise _broken_zip(path, error) from None
     return list(files)
@@ -369,31 +366,21 @@ def _broken_zip(path: Path, error: Exception) -> InvalidCameras | Unavailable:
     return InvalidCameras(str(path), expected="a zip of a COLMAP sparse model", got=got)
 
 
-def _unzip_one(archive: zipfile.ZipFile, member: zipfile.ZipInfo, target: Path, budget: int) -> int:
-    size = 0
-    with archive.open(member) as source, target.open("wb") as sink:
-        while block := source.read(min(1 << 20, budget - size + 1)):
-            size += len(block)
-            if size > budget:
-                limit = f"at most {MAX_UNZIPPED_BYTES} bytes unzipped"
-                raise InvalidCameras(
-                    member.filename, expected=limit, got="more", hint="leave the points out of the zip"
-                )
-            sink.write(block)
-    return size
+def _is_of_cameras(name: str) -> bool:
+    return name in (*MODEL_FILES, FRAME_FILE) or _is_transforms(name)
 
 
 def _is_transforms(name: str) -> bool:
     return name.startswith("transforms") and name.endswith(".json")
 
 
-def _what_else(names: Iterable[str]) -> tuple[str, str]:
-    """Describe a zip without a complete model, and advise what to do."""
+def _what_else(names: Iterable[str]) -> str:
+    """Describe a zip without a complete model, and say what to do."""
     for name in sorted(names):
         file = PurePosixPath(name).name
         if file in MODEL_FILES:
             parts = ("cameras", "images") if file.startswith("cameras") else ("images", "cameras")
-            return f"{name!r} without {file.replace(*parts)!r}", "zip both files together"
+            return f"{name!r} without {file.replace(*parts)!r}; zip both files together"
         if file == "cameras.json":
-            return f"{name!r}", "give the JSON file itself"
-    return "none", "zip the folder that has cameras.bin and images.bin"
+            return f"{name!r}; give the JSON file itself"
+    return "none; zip the folder that has cameras.bin and images.bin"

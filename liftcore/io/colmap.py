@@ -3,7 +3,7 @@
 import mmap
 import struct
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -146,8 +146,13 @@ def _read_images(path: Path) -> list[_Image]:
         return list((_binary_images if path.suffix == ".bin" else _text_images)(path))
 
 
-def _reading(path: Path) -> AbstractContextManager[None]:
-    return reading(path, InvalidCameras, "a file of a sparse model", "export the sparse model again")
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    with reading(path, InvalidCameras, "a file of a sparse model", "export the sparse model again"):
+        try:
+            yield
+        except struct.error:
+            raise ValueError(f"a whole file, got one that ends after {path.stat().st_size} bytes") from None
 
 
 def _cameras(name: str, image: _Image, sensors: Mapping[int, _Sensor], files: tuple[Path, Path]) -> list[Camera]:
@@ -166,73 +171,43 @@ def _cameras(name: str, image: _Image, sensors: Mapping[int, _Sensor], files: tu
     return [camera if distortion is None else behind_lens(camera, distortion)]
 
 
-class _Bytes:
-    """A memory-mapped binary file, read forward; every read is checked against its end."""
-
-    def __init__(self, path: Path) -> None:
-        self.source = str(path)
-        with path.open("rb") as handle:
-            size = handle.seek(0, 2)
-            # An empty file cannot be mapped.
-            self.data: Any = mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ) if size else b""
-        refuse_pointer(self.source, bytes(self.data[:64]))
-        self.offset = 0
-
-    def take(self, layout: str) -> tuple[Any, ...]:
-        start = self.offset
-        self.skip(struct.calcsize(layout))
-        return struct.unpack_from(layout, self.data, start)
-
-    def views(self, noun: str, least_bytes: int) -> range:
-        """Return a range over the announced views or cameras, whose number is checked against a scene's limit."""
-        count = self.count(noun, least_bytes)
-        check_count(count, self.source)
-        return range(count)
-
-    def count(self, noun: str, least_bytes: int) -> int:
-        """Read a number of records, which is checked against the rest of the file."""
-        (count,) = self.take("<Q")
-        if count * least_bytes > len(self.data) - self.offset:
-            rest = len(self.data) - self.offset
-            raise ValueError(f"{count} {noun}, got a file that ends {rest} bytes after their number")
-        return count
-
-    def name(self) -> str:
-        end = self.data.find(b"\0", self.offset, self.offset + MAX_NAME_BYTES)
-        if end < 0:
-            raise ValueError("an image name that ends, got none")
-        raw, self.offset = bytes(self.data[self.offset : end]), end + 1
-        return raw.decode("utf-8", errors="replace")
-
-    def skip(self, count: int) -> None:
-        if count > len(self.data) - self.offset:
-            raise ValueError(f"{self.offset + count} bytes or more, got a file that ends after {len(self.data)}")
-        self.offset += count
+def _mapped(path: Path) -> Any:
+    """Map a binary file, whose points are passed over."""
+    with path.open("rb") as handle:
+        is_empty = not handle.seek(0, 2)  # which cannot be mapped
+        data: Any = b"" if is_empty else mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ)
+    refuse_pointer(str(path), bytes(data[:64]))
+    return data
 
 
 def _binary_sensors(path: Path) -> Iterator[tuple[int, _Sensor]]:
-    cameras = _Bytes(path)
-    return (_binary_sensor(cameras) for _ in cameras.views("cameras", 24 + 2 * 8))
+    data, offset = _mapped(path), 8
+    (count,) = struct.unpack_from("<Q", data)
+    check_count(count, str(path))
+    for _ in range(count):
+        number, model, width, height = struct.unpack_from("<IiQQ", data, offset)
+        if not 0 <= model < len(COLMAP_MODELS):
+            raise ValueError(f"a camera of {READ_MODELS}, got camera model id {model}; {UNDISTORT}")
+        parameters = struct.unpack_from(f"<{COLMAP_MODELS[model].parameters}d", data, offset + 24)
+        offset += 24 + 8 * len(parameters)
+        yield number, _Sensor(width, height, COLMAP_MODELS[model], parameters)
 
 
 def _binary_images(path: Path) -> Iterator[_Image]:
-    images = _Bytes(path)
-    return (_binary_image(images) for _ in images.views("images", 64 + 1 + 8))
-
-
-def _binary_sensor(data: _Bytes) -> tuple[int, _Sensor]:
-    number, model, width, height = data.take("<IiQQ")
-    if not 0 <= model < len(COLMAP_MODELS):
-        raise ValueError(f"a camera of {READ_MODELS}, got camera model id {model}; {UNDISTORT}")
-    parameters = data.take(f"<{COLMAP_MODELS[model].parameters}d")
-    return number, _Sensor(width, height, COLMAP_MODELS[model], parameters)
-
-
-def _binary_image(data: _Bytes) -> _Image:
-    _, *pose, camera = data.take("<I7dI")
-    name = data.name()
-    data.skip(data.count("points", POINT_BYTES) * POINT_BYTES)
-    return _Image(name, camera, tuple(pose[:4]), tuple(pose[4:]))
+    data, offset = _mapped(path), 8
+    (count,) = struct.unpack_from("<Q", data)
+    check_count(count, str(path))
+    for _ in range(count):
+        _, *pose, camera = struct.unpack_from("<I7dI", data, offset)
+        end = data.find(b"\0", offset + 64, offset + 64 + MAX_NAME_BYTES)
+        if end < 0:
+            raise ValueError("an image name that ends, got none")
+        name = bytes(data[offset + 64 : end]).decode("utf-8", errors="replace")
+        (points,) = struct.unpack_from("<Q", data, end + 1)
+        offset = end + 9 + points * POINT_BYTES
+        if offset > len(data):
+            raise ValueError(f"{points} points of {name!r}, got a file that ends after {len(data)} bytes")
+        yield _Image(name, camera, tuple(pose[:4]), tuple(pose[4:]))
 
 
 def _text_lines(path: Path) -> Iterator[str]:

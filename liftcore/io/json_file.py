@@ -30,14 +30,6 @@ def read_json(path: Path) -> Any:
             raise ValueError(f"cameras as JSON, got a file that does not parse ({str(error)[:120]})") from None
 
 
-def entry(record: Any, key: str) -> Any:
-    """Return the value of a required key."""
-    if not isinstance(record, dict) or key not in record:
-        got = "an object without it" if isinstance(record, dict) else type(record).__name__
-        raise ValueError(f"an object with {key!r}, got {got}")
-    return record[key]
-
-
 def number(value: Any, name: str) -> float:
     """Check that a value is a finite number, and return it as float."""
     try:

@@ -17,7 +17,7 @@ import numpy as np
 
 from liftcore.errors import InvalidCameras, InvalidInput, reading
 from liftcore.io.colmap import PANORAMA, PINHOLES, Intrinsics, distortion_of
-from liftcore.io.json_file import FORMATS, entry, matrix, number, pixels, read_json
+from liftcore.io.json_file import FORMATS, matrix, number, pixels, read_json
 from liftcore.io.photos import PhotoHeader, PhotosBeside
 from liftcore.scene.cameras import (
     CAMERA_AXES,
@@ -127,7 +127,7 @@ def _named_frames(frames: Any, source: str) -> tuple[list[str], list[dict[str, A
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise ValueError(f"a list of objects as frames, got {repr(frames)[:60]}")
     check_count(len(frames), source)
-    return view_names([str(entry(frame, "file_path")) for frame in frames]), frames
+    return view_names([str(frame["file_path"]) for frame in frames]), frames
 
 
 def nerfstudio_world(cameras: Sequence[Camera]) -> WorldFrame:
@@ -232,11 +232,11 @@ def _distortion(keys: ChainMap[str, Any]) -> Distortion | None:
         hint = PINHOLES if model == PANORAMA or other in ("equirectangular", "latlong") else UNDISTORT
         raise ValueError(f"a perspective camera or {FISHEYE}, got {other or repr(model)[:60]}; {hint}")
     fisheye = model == FISHEYE or bool(keys.get("is_fisheye"))
-    candidates = [found for scope in keys.maps if (found := _nonzero_coefficients(scope)) is not None]
-    if any(coefficients != candidates[0] for coefficients in candidates):  # programs differ in which of them counts
-        alternatives = " and ".join(map(_format_coefficients, candidates))
-        raise ValueError(f"the same distortion as that of all frames, got {alternatives}")
-    values = candidates[0] if candidates else {}
+    sets = [values for scope in keys.maps for values in _coefficients(scope)]
+    if any(values != sets[0] for values in sets):  # programs differ in which of them counts
+        alternatives = " and ".join(map(_format_coefficients, sets))
+        raise ValueError(f"the same distortion wherever it is given, got {alternatives}")
+    values = sets[0] if sets else {}
     unread = next((key for key in values if key not in SUPPORTED_COEFFICIENTS[fisheye]), None)
     if unread:
         kind = "a fisheye" if fisheye else "a perspective camera"
@@ -245,22 +245,15 @@ def _distortion(keys: ChainMap[str, Any]) -> Distortion | None:
     return distortion_of(values, fisheye=fisheye)
 
 
-def _nonzero_coefficients(scope: Mapping[str, Any]) -> dict[str, float] | None:
-    """Return the parameters that are not zero, by name; None where none is named."""
-    params = scope.get("distortion_params")
-    if params is not None and (not isinstance(params, list) or len(params) not in (0, len(DISTORTION_ORDER))):
+def _coefficients(scope: Mapping[str, Any]) -> list[dict[str, float]]:
+    """Return the parameters of a frame or of all frames by name, without zeros: of a list, and of single ones."""
+    params = scope.get("distortion_params") or []
+    if not isinstance(params, list) or len(params) not in (0, len(DISTORTION_ORDER)):
         expected = f"distortion_params, a list of the {len(DISTORTION_ORDER)} numbers {', '.join(DISTORTION_ORDER)}"
         raise ValueError(f"{expected}, got {repr(params)[:60]}")
-    if not params and not any(key in scope for key in DISTORTION):
-        return None
-    by_key = {key: number(scope[key], key) for key in DISTORTION if key in scope}
-    single = {key: value for key, value in by_key.items() if value != 0}
-    values = [number(value, f"distortion_params[{i}]") for i, value in enumerate(params or [])]
-    of_list = {key: value for key, value in zip(DISTORTION_ORDER, values, strict=False) if value != 0}
-    if single and of_list and single != of_list:
-        got = f"{_format_coefficients(single)} and {_format_coefficients(of_list)}"
-        raise ValueError(f"the values of the single parameters in distortion_params, got {got}")
-    return of_list or single
+    of_list: dict[str, Any] = dict(zip(DISTORTION_ORDER, params, strict=False))
+    sets = of_list, {key: scope[key] for key in DISTORTION if key in scope}
+    return [{key: x for key in values if (x := number(values[key], key)) != 0} for values in sets if values]
 
 
 def _format_coefficients(values: Mapping[str, float]) -> str:
@@ -287,10 +280,7 @@ def read_frame(path: Path, applied: Mapping[str, Any], source: str) -> np.ndarra
     """
     document = read_json(path)
     with reading(path, InvalidCameras, "the frame of a run"):
-        transform, scale = (
-            _affine(entry(document, "transform"), "transform"),
-            _scale(entry(document, "scale"), "scale"),
-        )
+        transform, scale = _affine(document["transform"], "transform"), _scale(document["scale"], "scale")
     with reading(source, InvalidCameras, "a transforms.json"):
         before = np.eye(4)
         if applied.get("applied_transform") is not None:

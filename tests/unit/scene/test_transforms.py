@@ -157,8 +157,8 @@ def test_what_was_applied_before_is_not_applied_twice(run: Path, model: Path, ex
 @pytest.mark.parametrize(
     ("file", "key", "value", "message"),
     [
-        (FRAME_FILE, "transform", None, "an object with 'transform'"),
-        (FRAME_FILE, "scale", None, "an object with 'scale'"),
+        (FRAME_FILE, "transform", None, "got no 'transform'"),
+        (FRAME_FILE, "scale", None, "got no 'scale'"),
         (
             FRAME_FILE,
             "transform",
