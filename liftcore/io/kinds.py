@@ -11,14 +11,13 @@ import json
 import os
 import re
 import stat
-import zipfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from itertools import islice
 from pathlib import Path, PurePosixPath
-from typing import Any, TypeVar
+from typing import IO, Any, TypeVar
 
 from liftcore.errors import InvalidInput
 from liftcore.io.colmap import MODEL_FILES
@@ -78,15 +77,7 @@ class SplatFormat(StrEnum):
     CHECKPOINT = "checkpoint"  # of gsplat or nerfstudio: a pickle, if only of tensors
 
 
-SUFFIX = {
-    SplatFormat.PLY: ".ply",
-    SplatFormat.COMPRESSED_PLY: ".ply",
-    SplatFormat.SPLAT: ".splat",
-    SplatFormat.SPZ: ".spz",
-    SplatFormat.SOG: ".sog",
-    SplatFormat.GLTF: ".glb",
-    SplatFormat.CHECKPOINT: ".pt",
-}
+SUFFIX = {SplatFormat.PLY: ".ply", SplatFormat.COMPRESSED_PLY: ".ply", SplatFormat.CHECKPOINT: ".pt"}  # of odd names
 PICKLED = (".pt", ".pth", ".ckpt", ".pkl")
 LOD_META = "lod-meta.json"  # of a streamed SOG
 SPLATS_SENT = (".ply", ".splat", ".spz", ".sog", ".glb")  # over HTTP, where no pickle is opened
@@ -111,7 +102,7 @@ class FileKind:
     @property
     def suffix(self) -> str:
         """Of splats, the usual suffix of their format; empty of others."""
-        return "" if self.format is None else SUFFIX[self.format]
+        return "" if self.format is None else SUFFIX.get(self.format, self.format)
 
 
 _WEB_PAGE = FileKind(
@@ -185,7 +176,6 @@ _BY_SUFFIX: dict[str, FileKind] = {
 _COLMAP_POINTS = ("points3D.bin", "points3D.txt", "frames.bin", "rigs.bin", "frames.txt", "rigs.txt")
 _STEP = re.compile(r"(?:iteration|point_cloud|export|step|ckpt|splat)s?[_-]?0*([0-9]+)")
 _CHECKPOINT = re.compile(r"(^|/)(ckpt_[0-9]+[^/]*\.pt|step-[0-9]+\.ckpt)$")
-_NO_SCENE = re.compile(r"(^|/)(points?3d|sparse_pc|input|fused|dense|mesh|poisson|meshed)[^/]*\.ply$", re.IGNORECASE)
 _OF_FEATURES = re.compile(r"(_features|_filtered|_labels)\.pt$")  # of splat-distiller, beside the checkpoint
 Fault = TypeVar("Fault", bound=InvalidInput)
 
@@ -255,38 +245,33 @@ def identify(path: Path | str) -> FileKind:
 # ---- files
 
 
-def _file(path: Path) -> FileKind:
+def _file(path: Path) -> FileKind:  # noqa: PLR0911 - a rule each
     with open_regular(path) as handle:
         head, size = handle.read(MAX_HEADER_BYTES), handle.seek(0, 2)
-    return _first_match(_file_rules(path, head, size))
-
-
-def _first_match(rules: Iterable[FileKind | None]) -> FileKind:
-    """Return the first kind that fits; the last rule always does."""
-    return next(kind for kind in rules if kind is not None)
-
-
-def _file_rules(path: Path, head: bytes, size: int) -> Iterator[FileKind | None]:
     suffix = path.suffix.lower()
-    yield FileKind(None, "an empty file", "copy or export it again") if not head else None
-    yield _colmap_part(path) if path.name in (*MODEL_FILES, *_COLMAP_POINTS) else None
-    yield _ply(head) if head[:4] in (b"ply\n", b"ply\r") else None
-    yield _splats_as(SplatFormat.SPZ) if begins_like_spz(head) else None
-    yield _zip(path) if head[:2] == b"PK" and is_zip(path) else None
-    damaged = FileKind(None, "a zip that is cut short or damaged", "copy or download it again")
-    yield damaged if head[:4] == b"PK\3\4" else None
-    yield _safetensors(path) if suffix == ".safetensors" or _is_safetensors(head, size) else None
+    if not head:
+        return FileKind(None, "an empty file", "copy or export it again")
+    if path.name in (*MODEL_FILES, *_COLMAP_POINTS):
+        return _colmap_part(path)
+    if head[:4] in (b"ply\n", b"ply\r"):
+        return _ply(head)
+    if begins_like_spz(head):
+        return _splats_as(SplatFormat.SPZ)
+    if head[:2] == b"PK" and is_zip(path):
+        return _zip(path)
+    if head[:4] == b"PK\3\4":
+        return FileKind(None, "a zip that is cut short or damaged", "copy or download it again")
+    if suffix == ".safetensors" or _is_safetensors(head, size):
+        return _safetensors(path)
     by_content = _by_magic(head) or (_by_text(path, head, size) if _is_text(head) else None)
-    is_splat = suffix == ".splat" or (
-        by_content is None and suffix not in _BY_SUFFIX and looks_like_splat(head, size)
-    )
-    yield _splats_as(SplatFormat.SPLAT) if is_splat else None
+    is_unknown = by_content is None and suffix not in _BY_SUFFIX
+    if suffix == ".splat" or (is_unknown and looks_like_splat(head, size)):
+        return _splats_as(SplatFormat.SPLAT)
     meta = path.parent / META
-    is_part = by_content is _PICTURE and meta.is_file() and _is_sog(meta)
-    yield replace(_PICTURE, name="a picture of a SOG", hint=f"give {meta}") if is_part else None
-    yield by_content
-    yield _BY_SUFFIX.get(suffix)
-    yield FileKind(None, f"a file that begins with {first_bytes(head)}", recognised=False)
+    if by_content is _PICTURE and meta.is_file() and _is_sog(meta):
+        return FileKind(None, "a picture of a SOG", f"give {meta}")
+    unknown = FileKind(None, f"a file that begins with {first_bytes(head)}", recognised=False)
+    return by_content or _BY_SUFFIX.get(suffix, unknown)
 
 
 def _splats_as(splat_format: SplatFormat) -> FileKind:
@@ -379,41 +364,39 @@ def _json(path: Path, size: int) -> FileKind:
     return _document(document, path)
 
 
-def _document(document: Any, path: Path) -> FileKind:
+def _document(document: Any, path: Path) -> FileKind:  # noqa: PLR0911 - a rule each
     """Return the kind of a JSON document, by its keys."""
     if isinstance(document, list):
-        return _first_match(_list_rules(document))
-    if isinstance(document, dict):
-        return _first_match(_object_rules(document, path))
-    return FileKind(None, f"JSON ({str(document)[:TEXT_SHOWN]!r})", recognised=False)
-
-
-def _list_rules(document: list[Any]) -> Iterator[FileKind | None]:
-    first = document[0] if document and isinstance(document[0], dict) else {}
-    is_cameras = not document or first.keys() & {"img_name", "transform", "file_path"}
-    yield FileKind("cameras", "cameras") if is_cameras else None
-    hint = "'splatlift pack masks' or 'splatlift pack prompts' makes a feature pack of its folder"
-    yield FileKind(None, "masks as JSON", hint) if "segmentation" in first else None
-    yield FileKind(None, "a JSON list of something else", recognised=False)
-
-
-def _object_rules(document: dict[str, Any], path: Path) -> Iterator[FileKind | None]:
+        first = document[0] if document and isinstance(document[0], dict) else {}
+        if not document or first.keys() & {"img_name", "transform", "file_path"}:
+            return FileKind("cameras", "cameras")
+        if "segmentation" in first:
+            hint = "'splatlift pack masks' or 'splatlift pack prompts' makes a feature pack of its folder"
+            return FileKind(None, "masks as JSON", hint)
+        return FileKind(None, "a JSON list of something else", recognised=False)
+    if not isinstance(document, dict):
+        return FileKind(None, f"JSON ({str(document)[:TEXT_SHOWN]!r})", recognised=False)
     keys = document.keys()
-    yield _splats_as(SplatFormat.SOG) if is_sog_document(document) else None
-    yield _STREAMED if keys >= {"tree", "filenames"} else None
-    yield FileKind("cameras", "cameras") if "frames" in keys else None
-    frame = FileKind(None, f"the frame of a nerfstudio run ({FRAME_FILE})", "give the cameras that it belongs to")
-    yield frame if keys >= {"transform", "scale"} else None
-    is_gltf = "asset" in keys and keys & {"buffers", "accessors", "scenes", "meshes"}
-    has_splats = "KHR_gaussian_splatting" in str(document.get("extensionsUsed", ""))
-    single = replace(_GLTF, name="a .gltf, whose splats lie beside it", hint="make one .glb of it")
-    yield (single if has_splats else _GLTF) if is_gltf else None
-    yield _TILES if keys >= {"root", "geometricError"} else None
-    hint = "'splatlift pack prompts' makes a feature pack of its folder"
-    yield FileKind(None, "masks as JSON (COCO)", hint) if keys >= {"annotations", "images"} else None
-    yield _BY_SUFFIX.get(path.suffix.lower())
+    if is_sog_document(document):
+        return _splats_as(SplatFormat.SOG)
+    if keys >= {"tree", "filenames"}:
+        return _STREAMED
+    if "frames" in keys:
+        return FileKind("cameras", "cameras")
+    if keys >= {"transform", "scale"}:
+        name = f"the frame of a nerfstudio run ({FRAME_FILE})"
+        return FileKind(None, name, "give the cameras that it belongs to")
+    if "asset" in keys and keys & {"buffers", "accessors", "scenes", "meshes"}:
+        has_splats = "KHR_gaussian_splatting" in str(document.get("extensionsUsed", ""))
+        single = FileKind(None, "a .gltf, whose splats lie beside it", "make one .glb of it")
+        return single if has_splats else _GLTF
+    if keys >= {"root", "geometricError"}:
+        return _TILES
+    if keys >= {"annotations", "images"}:
+        return FileKind(None, "masks as JSON (COCO)", "'splatlift pack prompts' makes a feature pack of its folder")
     listing = ", ".join(map(str, list(keys)[:5]))[:TEXT_SHOWN]
-    yield FileKind(None, f"a JSON object with {listing or 'nothing'}", recognised=False)
+    unknown = FileKind(None, f"a JSON object with {listing or 'nothing'}", recognised=False)
+    return _BY_SUFFIX.get(path.suffix.lower(), unknown)
 
 
 def _is_sog(path: Path) -> bool:
@@ -429,14 +412,10 @@ def _zip(path: Path) -> FileKind:
     try:
         with open_zip(path) as archive:
             names = _user_files(archive.namelist())
-            return _first_match(_of_names_in_zip(names, lambda name: _first_bytes(archive, name)))
+            splats = _splat_files(names, lambda name: _begins_with_splats(archive.open(name)))
+            return _of_names_in_zip(names, splats)
     except BROKEN_ZIP as error:
         return FileKind(None, f"a zip that does not open ({str(error)[:120]})", recognised=False)
-
-
-def _first_bytes(archive: zipfile.ZipFile, name: str) -> bytes:
-    with archive.open(name) as member:
-        return member.read(MAX_HEADER_BYTES)
 
 
 def _user_files(names: Iterable[str]) -> list[str]:
@@ -445,23 +424,30 @@ def _user_files(names: Iterable[str]) -> list[str]:
     return [name for name in files if not is_system_file(PurePosixPath(name.replace("\\", "/")))]
 
 
-def _of_names_in_zip(names: list[str], head_of: Callable[[str], bytes]) -> Iterator[FileKind | None]:
+def _of_names_in_zip(names: list[str], splats: tuple[str, ...]) -> FileKind:  # noqa: PLR0911 - a rule each
     lasts = {name.rpartition("/")[2] for name in names}
     suffixes = {PurePosixPath(last).suffix.lower() for last in lasts}
-    yield FileKind(None, "a zip without a file", "zip or export it again") if not names else None
-    yield _STREAMED if LOD_META in lasts else None
-    yield _splats_as(SplatFormat.SOG) if sog_folder(names) is not None else None
-    yield _splats_as(SplatFormat.CHECKPOINT) if any(name.endswith("/data.pkl") for name in names) else None
-    yield _USD if names[0].lower().endswith((".usd", ".usda", ".usdc")) else None
-    yield _ARRAYS if suffixes == {".npy"} else None
-    splats = _splat_files(names, lambda name: _begins_with_splats(head_of(name)))
-    is_cameras = any(CAMERA_FILES.search(name.replace("\\", "/")) for name in names)
-    yield FileKind("cameras", "a zip of cameras", splats=splats) if is_cameras else None
-    yield _zip_with(splats) if splats else None
-    yield FileKind("photos", "photos") if suffixes & IMAGE_SUFFIXES else None
-    yield _zip_with(packs) if (packs := [name for name in names if name.endswith(".safetensors")]) else None
-    by_suffix = next((kind for last in lasts if (kind := _BY_SUFFIX.get(PurePosixPath(last).suffix.lower()))), None)
-    yield replace(_zip_with(names), hint=by_suffix.hint if by_suffix else "unzip it and give the file itself")
+    if not names:
+        return FileKind(None, "a zip without a file", "zip or export it again")
+    if LOD_META in lasts:
+        return _STREAMED
+    if sog_folder(names) is not None:
+        return _splats_as(SplatFormat.SOG)
+    if any(name.endswith("/data.pkl") for name in names):
+        return _splats_as(SplatFormat.CHECKPOINT)
+    if names[0].lower().endswith((".usd", ".usda", ".usdc")):
+        return _USD
+    if suffixes == {".npy"}:
+        return _ARRAYS
+    if any(CAMERA_FILES.search(name.replace("\\", "/")) for name in names):
+        return FileKind("cameras", "a zip of cameras", splats=splats)
+    if not splats and suffixes & IMAGE_SUFFIXES:
+        return FileKind("photos", "photos")
+    packs = [name for name in names if name.endswith(".safetensors")]
+    if splats or packs:
+        return _zip_with(splats or packs)
+    hints = [_BY_SUFFIX[suffix].hint for suffix in sorted(suffixes & _BY_SUFFIX.keys())]
+    return replace(_zip_with(names), hint=hints[0] if hints else "unzip it and give the file itself")
 
 
 def _zip_with(names: Sequence[str]) -> FileKind:
@@ -471,8 +457,10 @@ def _zip_with(names: Sequence[str]) -> FileKind:
     return FileKind(None, f"a zip with {names[0]}{several} in it", f"unzip it and give {names[0]}", splats=splats)
 
 
-def _begins_with_splats(head: bytes) -> bool:
-    """Return whether the first bytes are a PLY's that has splats."""
+def _begins_with_splats(file: IO[bytes]) -> bool:
+    """Return True if a file, which is closed, is a PLY of splats by its first bytes."""
+    with file:
+        head = file.read(MAX_HEADER_BYTES)
     return head[:3] == b"ply" and _ply(head).kind == "splats"
 
 
@@ -490,37 +478,37 @@ def _splat_files(names: Iterable[str], has_splats: Callable[[str], bool]) -> tup
     ]
     likely.sort(key=order)
     plys = [name for name in likely if name.lower().endswith(".ply")]
-    wrong = {name for name in plys if _NO_SCENE.search(name.replace("\\", "/"))}
-    wrong |= {name for name in [name for name in plys if name not in wrong][:MOST_HEADERS] if not has_splats(name)}
+    wrong = {name for name in plys[:MOST_HEADERS] if not has_splats(name)}
     return tuple(name for name in likely if name not in wrong)
 
 
 # ---- folders
 
 
-def _folder(path: Path) -> FileKind:
-    return _first_match(_folder_rules(path))
-
-
-def _folder_rules(path: Path) -> Iterator[FileKind | None]:
-    yield _splats_as(SplatFormat.SOG) if (path / META).is_file() and _is_sog(path / META) else None
-    yield _STREAMED if (path / LOD_META).is_file() else None
+def _folder(path: Path) -> FileKind:  # noqa: PLR0911 - a rule each
+    if (path / META).is_file() and _is_sog(path / META):
+        return _splats_as(SplatFormat.SOG)
+    if (path / LOD_META).is_file():
+        return _STREAMED
     names = _names_below(path)
     splats = _splat_files(names, lambda name: _has_splats(path / name))
     label = f"a folder with {len(splats)} files of splats in it" if len(splats) > 1 else ""
-    yield FileKind("cameras", label or "a folder of cameras", splats=splats) if _has_cameras(path) else None
-    yield FileKind(None, label or "a folder of splats", f"give {path / splats[0]}", splats=splats) if splats else None
+    if _has_cameras(path):
+        return FileKind("cameras", label or "a folder of cameras", splats=splats)
+    if splats:
+        return FileKind(None, label or "a folder of splats", f"give {path / splats[0]}", splats=splats)
     suffixes = {PurePosixPath(name).suffix.lower() for name in names}
-    is_langsplat = all(any(name.endswith(end) for name in names) for end in ("_f.npy", "_s.npy"))
-    hint = f"'splatlift pack langsplat {path} -o PACK.safetensors' makes a feature pack of it"
-    yield FileKind(None, "a folder of LangSplat's features", hint) if is_langsplat else None
-    hint = f"'splatlift pack npy {path}' or 'splatlift pack masks {path}' makes a feature pack of it"
-    yield FileKind(None, "a folder of NumPy arrays", hint) if ".npy" in suffixes else None
-    tensors = [str(path / name) for name in names if name.endswith(".safetensors")]
-    hint = f"give the file itself, such as {tensors[0]}" if tensors else ""
-    yield FileKind(None, "a folder with safetensors files in it", hint) if tensors else None
-    yield FileKind("photos", "a folder of photos") if suffixes & IMAGE_SUFFIXES else None
-    yield FileKind(None, "a folder without any of them" if names else "an empty folder", recognised=False)
+    if all(any(name.endswith(end) for name in names) for end in ("_f.npy", "_s.npy")):
+        hint = f"'splatlift pack langsplat {path} -o PACK.safetensors' makes a feature pack of it"
+        return FileKind(None, "a folder of LangSplat's features", hint)
+    if ".npy" in suffixes:
+        hint = f"'splatlift pack npy {path}' or 'splatlift pack masks {path}' makes a feature pack of it"
+        return FileKind(None, "a folder of NumPy arrays", hint)
+    if tensors := [path / name for name in names if name.endswith(".safetensors")]:
+        return FileKind(None, "a folder with safetensors files in it", f"give the file itself, such as {tensors[0]}")
+    if suffixes & IMAGE_SUFFIXES:
+        return FileKind("photos", "a folder of photos")
+    return FileKind(None, "a folder without any of them" if names else "an empty folder", recognised=False)
 
 
 def _has_cameras(path: Path) -> bool:
@@ -533,8 +521,8 @@ def _has_cameras(path: Path) -> bool:
 
 
 def _has_splats(path: Path) -> bool:
-    with suppress(OSError), open_regular(path) as handle:
-        return _begins_with_splats(handle.read(MAX_HEADER_BYTES))
+    with suppress(OSError):
+        return _begins_with_splats(open_regular(path))
     return False
 
 
@@ -566,9 +554,3 @@ def page_table() -> dict[str, Any]:
             for suffix, kind in sorted((_BY_SUFFIX | dict.fromkeys(PICKLED, _BY_SUFFIX[".pkl"])).items())
         },
     }  # fmt: skip
-
-
-__all__ = [
-    "CONVERT", "EXPORT_PLY", "PICKLED", "SPLATS_SENT", "SUFFIX", "TRAINED", "FileKind", "SplatFormat", "identify",
-    "keys_of", "page_table", "wrong_kind",
-]  # fmt: skip
