@@ -5,7 +5,6 @@ import lzma
 import os
 import secrets
 import stat
-import struct
 import sys
 import zipfile
 import zlib
@@ -15,7 +14,7 @@ from io import BufferedReader
 from pathlib import Path, PurePath
 from typing import IO
 
-from liftcore.errors import InvalidCameras, InvalidInput, Unavailable
+from liftcore.errors import InvalidCameras, InvalidInput, Unavailable, reading
 from liftcore.runtime.arguments import as_list, as_path, check_choice
 
 LFS_POINTER = b"version https://git-lfs.github.com/spec/"
@@ -29,10 +28,6 @@ SYSTEM_FILES = frozenset((
     "thumbs.db", "ehthumbs.db", "desktop.ini", "__macosx", "@eadir", "$recycle.bin", "#recycle", "@recycle",
     "lost+found", "system volume information",
 ))  # fmt: skip
-MAX_DIRECTORY_BYTES = 16 << 20  # of a zip's list of files; zipfile makes an object of each
-_END = struct.Struct("<4s4H2LH")  # of a zip: its list's size is the sixth field
-_END64_LOCATOR = struct.Struct("<4sLQL")
-_END64 = struct.Struct("<4sQ2H2L4Q")
 LFS_HINT = "run 'git lfs pull' in the repository where it lies"
 OUTPUT_TYPES = {  # name, suffixes, and a word of the kind or name of a file that is replaced; "": of no known kind
     "splats": ("splats", (".ply", ".splat", ".spz", ".glb", ".usdc", ".usdz"), "splats"),
@@ -98,32 +93,9 @@ def is_zip(path: Path) -> bool:
 
 
 def open_zip(path: Path) -> zipfile.ZipFile:
-    """Open a zip, whose list of files is checked against a limit before zipfile reads it."""
-    with open_regular(path) as handle:
-        size = _directory_bytes(handle)
-    if size > MAX_DIRECTORY_BYTES:
-        raise zipfile.BadZipFile(f"its list of files takes {size} bytes, more than {MAX_DIRECTORY_BYTES}")
+    """Open a zip that is a regular file."""
+    open_regular(path).close()
     return zipfile.ZipFile(path)
-
-
-def _directory_bytes(handle: IO[bytes]) -> int:
-    """Read the size of a zip's list of files from the record at its end; 0 if there is none."""
-    end = handle.seek(0, 2)
-    handle.seek(max(0, end - _END.size - 0xFFFF))
-    tail = handle.read()
-    place = tail.rfind(b"PK\5\6")
-    if place < 0 or len(tail) - place < _END.size:
-        return 0
-    size = _END.unpack_from(tail, place)[5]
-    locator = place - _END64_LOCATOR.size
-    if locator >= 0 and tail[locator : locator + 4] == b"PK\6\7":
-        before = end - len(tail) + locator - _END64.size
-        for record_at in (before, _END64_LOCATOR.unpack_from(tail, locator)[2]):  # readers use either
-            handle.seek(max(0, min(end, record_at)))
-            record = handle.read(_END64.size)
-            if len(record) == _END64.size and record[:4] == b"PK\6\6":
-                size = max(size if size != 0xFFFFFFFF else 0, _END64.unpack(record)[8])
-    return size
 
 
 @contextmanager
@@ -171,26 +143,25 @@ def check_output(path: Path | str, inputs: Path | str | Iterable[Path | str], ki
     check_choice("kind", kind, OUTPUT_TYPES)
     path = as_path(path, "output")
     label, suffixes, word = OUTPUT_TYPES[kind]
-    with writing(path):
+    with reading("output", InvalidInput, "a file to write"), writing(path):
         if path.is_dir():
-            raise InvalidInput("output", expected="a file to write", got=f"the folder {path}")
+            raise ValueError(f"a file to write, got the folder {path}")
         if path.exists() and any(map(path.samefile, _files_of(map(Path, as_list(inputs))))):
-            raise InvalidInput("output", expected="another file than the inputs", got=str(path))
+            raise ValueError(f"another file than the inputs, got {path}")
         name = path.name.lower()
         if not name.endswith(suffixes) or name.endswith(".compressed.ply"):
-            expected = f"a name of {label}, ending in {' or '.join(suffixes)}"
-            raise InvalidInput(
-                "output", expected=expected, got=str(path), hint=CONVERT_PLY if ".ply" in suffixes else ""
-            )
+            hint = CONVERT_PLY if ".ply" in suffixes else ""
+            raise ValueError(f"a name of {label}, ending in {' or '.join(suffixes)}, got {path}; {hint}")
         if path.is_file() and path.stat().st_size:
             present = identify(path)
             if word not in (present.kind or present.name) or (not word and present.recognised):
-                expected, got = f"a new file, or one of {label} to replace", f"{path}, which is {present.name}"
                 hint = "name another file, or remove that one first"
-                raise InvalidInput("output", expected=expected, got=got, hint=hint)
+                raise ValueError(
+                    f"a new file, or one of {label} to replace, got {path}, which is {present.name}; {hint}"
+                )
         folder = next(parent for parent in path.absolute().parents if os.path.lexists(parent))
         if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
-            raise InvalidInput("output", expected="a folder that can be written", got=str(folder))
+            raise ValueError(f"a folder that can be written, got {folder}")
     return path
 
 

@@ -6,7 +6,6 @@ import io
 import struct
 import threading
 import zipfile
-import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -16,7 +15,7 @@ from typing import Any
 
 from liftcore.errors import InvalidCameras, InvalidPhotos, NotFound
 from liftcore.io.files import BROKEN_ZIP, is_system_file, open_zip
-from liftcore.io.photos import LARGEST_TAG, ORIENTATION, UPRIGHT, PhotoHeader
+from liftcore.io.photos import UPRIGHT, header_of
 from liftcore.scene.views import cameras_of_views, view_names
 
 MAX_PHOTOS = 10_000  # photos
@@ -159,10 +158,10 @@ def _index(path: Path, modified_ns: int) -> PhotoIndex:
 def in_camera_orientation(
     photo: Iterator[bytes], camera_size: Callable[[], tuple[int, int] | None]
 ) -> tuple[Iterator[bytes], bool]:
-    """Make a browser show a JPEG or PNG as its camera sees it: return its blocks, and True if they were changed.
+    """Make a browser show a JPEG or PNG as its camera sees it: return its blocks, and True if some are left out.
 
-    A browser applies the EXIF orientation. If the camera is of the stored pixels (`liftcore.io.photos`), the tag
-    becomes 1, and no other byte changes but a PNG's checksum.
+    A browser applies the EXIF orientation. If the camera is of the stored pixels (`liftcore.io.photos`), the blocks
+    come without EXIF.
 
     Args:
         photo: the blocks of the file.
@@ -171,41 +170,16 @@ def in_camera_orientation(
     from PIL import Image
 
     first = next(photo, b"")
-    place = _orientation_place(first)
-    if place is None:
+    is_png = first.startswith(b"\x89PNG")
+    begin = first.find(b"eXIf" if is_png else b"Exif\0\0") - 4  # of its chunk or segment
+    if begin < 0:
         return chain([first], photo), False
     content = first + b"".join(photo)
-    (orientation,) = struct.unpack_from(f"{place[1]}H", content, place[0])
-    if not UPRIGHT < orientation <= LARGEST_TAG:
+    with Image.open(io.BytesIO(content), formats=[*FORMATS.values()]) as image:
+        header = header_of(image)
+    if header.orientation == UPRIGHT or header.turns_for(camera_size()):
         return iter([content]), False
-    with Image.open(io.BytesIO(content), formats=[*FORMATS.values()]) as image:  # whose size alone is read
-        header = PhotoHeader(*image.size, orientation)
-    if header.turns_for(camera_size()):
-        return iter([content]), False
-    return iter([_with_upright_tag(content, *place)]), True
-
-
-def _orientation_place(photo: bytes) -> tuple[int, str] | None:
-    """Find the offset and byte order of the EXIF orientation in the head of a JPEG or PNG; None if it has none."""
-    is_png = photo.startswith(b"\x89PNG")
-    begin = photo.find(b"eXIf" if is_png else b"Exif\0\0")
-    tiff = begin + (4 if is_png else 6)
-    order = {b"II": "<", b"MM": ">"}.get(photo[tiff : tiff + 2])
-    if begin < 0 or order is None or len(photo) < tiff + 8:
-        return None
-    table = tiff + struct.unpack_from(f"{order}I", photo, tiff + 4)[0]
-    entries = struct.unpack_from(f"{order}H", photo, table)[0] if table + 2 <= len(photo) else 0
-    places = range(table + 2, min(table + 2 + 12 * entries, len(photo) - 11), 12)
-    tags = (place for place in places if struct.unpack_from(f"{order}H", photo, place)[0] == ORIENTATION)
-    return next(((place + 8, order) for place in tags), None)
-
-
-def _with_upright_tag(photo: bytes, place: int, order: str) -> bytes:
-    content = bytearray(photo)
-    struct.pack_into(f"{order}H", content, place, UPRIGHT)
-    if photo.startswith(b"\x89PNG"):  # whose chunks end with a checksum of their name and content
-        begin = photo.find(b"eXIf")
-        end = begin + 4 + struct.unpack_from(">I", photo, begin - 4)[0]
-        if end + 4 <= len(photo):
-            struct.pack_into(">I", content, end, zlib.crc32(content[begin:end]))
-    return bytes(content)
+    size = 12 + int.from_bytes(content[begin : begin + 4], "big")
+    if not is_png:
+        size = 2 + int.from_bytes(content[begin + 2 : begin + 4], "big")
+    return iter([content[:begin] + content[begin + size :]]), True

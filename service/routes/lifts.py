@@ -171,7 +171,7 @@ def get_photo(lift: str, view: View, request: Request, deps: Deps, owner: Caller
     media_type, size, blocks = photo
     blocks, is_changed = in_camera_orientation(blocks, camera_size)
     etag = f'"{hashlib.sha256(f"{photos.id} {view} {is_changed}".encode()).hexdigest()}"'
-    headers = cache_headers(etag) | {"Content-Length": str(size)}
+    headers = cache_headers(etag) | ({} if is_changed else {"Content-Length": str(size)})
     return unchanged(request, etag) or StreamingResponse(blocks, media_type=media_type, headers=headers)
 
 
