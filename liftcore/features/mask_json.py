@@ -144,13 +144,10 @@ def _box_mask(box: Any, size: tuple[int, int] | None) -> StoredMask:
 
 def _add_data_set(document: MaskDocument, content: Mapping[str, Any], *, unannotated_negative: bool) -> None:
     """Add the images of a COCO data set."""
-    entries = {entry.get("id"): entry for entry in content["images"] if isinstance(entry, dict)}
-    categories = {
-        entry.get("id"): entry["name"]
-        for entry in content.get("categories") or ()
-        if isinstance(entry, dict) and isinstance(entry.get("name"), str)
-    }
-    images = {number: ImageMasks(_image_name(entry), file=entry["file_name"]) for number, entry in entries.items()}
+    entries = {entry["id"]: entry for entry in content["images"]}
+    categories = {entry["id"]: str(entry["name"]) for entry in content.get("categories") or ()}
+    names = {number: str(entry["file_name"]) for number, entry in entries.items()}
+    images = {number: ImageMasks(ROBOFLOW.sub("", name), file=name) for number, name in names.items()}
     _drop_upload_prefixes([*images.values()])
     for number, record in enumerate(mask_records(content)):
         with reading(f"{document.path} mask {number}", InvalidFeatures, "a mask with a phrase", AS_COCO):
@@ -165,13 +162,6 @@ def _add_data_set(document: MaskDocument, content: Mapping[str, Any], *, unannot
         image.annotated = bool(image.phrases) or unannotated_negative
 
 
-def _image_name(entry: Mapping[str, Any]) -> str:
-    name = entry.get("file_name")
-    if not isinstance(name, str):
-        raise ValueError("a file_name of each image, got none")
-    return ROBOFLOW.sub("", name)
-
-
 def _drop_upload_prefixes(images: Sequence[ImageMasks]) -> None:
     """Remove Label Studio's prefixes from the names if all images have one and not all are digits, as of dates."""
     paths = [PurePosixPath((image.image or "").replace("\\", "/")) for image in images]
@@ -183,16 +173,10 @@ def _drop_upload_prefixes(images: Sequence[ImageMasks]) -> None:
 
 def _tracked(content: Mapping[str, Any]) -> ImageMasks:
     """Read the objects of Grounded SAM 2's tracking in a frame."""
-    phrases: dict[int, str | None] = {}
-    for number, record in content["labels"].items():
-        phrase = _text_of(record, *PHRASE_KEYS) if isinstance(record, dict) else None
-        if phrase is None or not str(number).isdecimal():
-            raise ValueError(f"labels of an id and a class_name, got {number}: {repr(record)[:80]}")
-        phrases[int(number)] = phrase
-    name = _text_of(content, "mask_name")
-    if name is None:
-        raise ValueError(f"mask_name, a file of ids, got {repr(content['mask_name'])[:80]}")
-    return ImageMasks(None, phrases=[phrase for phrase in phrases.values() if phrase], ids=name, id_phrases=phrases)
+    phrases: dict[int, str | None] = {
+        int(number): record["class_name"] for number, record in content["labels"].items()
+    }
+    return ImageMasks(None, phrases=[*map(str, phrases.values())], ids=str(content["mask_name"]), id_phrases=phrases)
 
 
 def views_of_images(names: Sequence[str]) -> dict[str, str]:

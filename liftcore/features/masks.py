@@ -125,7 +125,7 @@ def _labels(path: Path, rows: int | None, unlabelled: int) -> tuple[np.ndarray, 
         return _picture_labels(path, rows, unlabelled)
     if path.suffix.lower() == RUNS:
         masks = _stored_masks(path, rows)
-        return (label_levels(masks, str(path)) if masks else UNLABELLED), len(masks)
+        return (label_levels(masks) if masks else UNLABELLED), len(masks)
     stored = open_array(path, kinds=NUMBERS + "b")
     if not stored.size:
         _check_count(0, rows)
@@ -137,7 +137,7 @@ def _labels(path: Path, rows: int | None, unlabelled: int) -> tuple[np.ndarray, 
     if stored.ndim != 3:
         raise ValueError(f"booleans [M, H, W], got {stored.dtype} {list(stored.shape)}")
     _check_count(len(stored), rows)
-    return label_levels(list(stored), str(path)), len(stored)  # planes of the mapped file, not read yet
+    return label_levels(list(stored)), len(stored)  # planes of the mapped file, not read yet
 
 
 def _check_count(count: int, rows: int | None) -> None:

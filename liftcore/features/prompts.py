@@ -229,7 +229,7 @@ def _regions(name: str, view: _View, rows: Mapping[str, int], vectors: np.ndarra
         elif (key := normalize_text(phrase)) in view.phrases:
             masks[key] = masks[key] | mask if key in masks else mask
     if masks:
-        labels = label_levels(list(masks.values()), str(view.file))
+        labels = label_levels(list(masks.values()))
     else:
         labels = np.full((1, 1, 1) if void is None else (1, *void.shape), NO_LABEL, np.int32)
     if view.was_searched(rows):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 
-from liftcore.errors import InvalidCameras, NotFound
+from liftcore.errors import InvalidCameras, NotFound, reading
 from liftcore.runtime.arguments import nearest
 from liftcore.runtime.one_line import join_names, one_line
 from liftcore.scene.compositing import MAX_SIDE
@@ -186,20 +186,13 @@ class Camera:
             InvalidCameras: there is no such field, or as the constructor has it.
         """
         K = _matrix(changes.pop("K", self.K)).copy()
-        for place, key in (((0, 0), "fx"), ((1, 1), "fy"), ((0, 2), "cx"), ((1, 2), "cy")):
-            if key in changes and K.shape == (3, 3):
-                value = changes.pop(key)
-                try:
-                    K[place] = value
-                except (TypeError, ValueError):
-                    self._refuse(key, "a number of pixels", repr(value)[:MAX_TEXT])
-        field_names = [field.name for field in fields(self)]
-        for key in changes:
-            if key not in field_names:
-                self._refuse(
-                    repr(key), f"one of {', '.join([*field_names, 'fx', 'fy', 'cx', 'cy'])}", "an unknown field"
-                )
-        return replace(self, K=K, **changes)
+        names = [field.name for field in fields(self)]
+        argument, expected = f"camera {self.name!r} {' '.join(changes)}", f"one of {', '.join(names)}, fx, fy, cx, cy"
+        with reading(argument, InvalidCameras, expected):
+            for place, key in (((0, 0), "fx"), ((1, 1), "fy"), ((0, 2), "cx"), ((1, 2), "cy")):
+                if key in changes:
+                    K[place] = changes.pop(key)
+            return replace(self, K=K, **changes)
 
     def _check_intrinsics(self) -> None:
         K = self.K
@@ -364,16 +357,22 @@ class Cameras(Mapping[str, Camera]):
         self.of_nerfstudio = of_nerfstudio
         self.world = world
         self.warnings = tuple(warnings)
-        cameras = _cameras_in(views)
-        if isinstance(views, Mapping):
-            renamed_views = [view if view.name == name else view.replace(name=name) for name, view in views.items()]
+        if not isinstance(views, Mapping):
+            is_sequence = isinstance(views, Iterable) and not isinstance(views, str | np.ndarray)
+            cameras: list[Any] = [*views] if is_sequence else [views]
+            named_views = [(getattr(camera, "name", ""), camera) for camera in cameras]
         else:
-            renamed_views = cameras
-        if not renamed_views:
+            named_views = [*views.items()]
+        if not named_views:
             raise InvalidCameras("cameras", expected="at least one view", got="none")
-        check_count(len(renamed_views), "cameras")
+        check_count(len(named_views), "cameras")
         self._by_name: dict[str, Camera] = {}
-        for camera in renamed_views:
+        for name, view in named_views:
+            if not isinstance(view, Camera) or not isinstance(name, str):
+                got, hint = f"{type(view).__name__} {view!r}"[:80], "read_cameras(path) makes them of a file"
+                expected = "a Camera for each name, a text as of a photo"
+                raise InvalidCameras("cameras", expected=expected, got=f"{got} of {name!r}"[:120], hint=hint)
+            camera = view if view.name == name else view.replace(name=name)
             if camera.name in self._by_name:
                 got = f"{camera.name!r} twice"
                 hint = SAME_NAMES if camera.name else "give a dict of names to cameras, or Camera(..., name=...)"
@@ -425,21 +424,6 @@ class Cameras(Mapping[str, Camera]):
     def distorted(self) -> tuple[str, ...]:
         """The names of the views whose photos are distorted."""
         return tuple(name for name, camera in self._by_name.items() if camera.lens is not None)
-
-
-def _cameras_in(views: Any) -> list[Camera]:
-    """Return the cameras of a mapping or a sequence, and refuse anything else, such as a path."""
-    values = views.values() if isinstance(views, Mapping) else views
-    is_sequence = isinstance(values, Iterable) and not isinstance(values, str | np.ndarray)
-    cameras: list[Any] = list(values) if is_sequence else [values]
-    names = [name for name in views if not isinstance(name, str)] if isinstance(views, Mapping) else []
-    if names:
-        raise InvalidCameras("cameras", expected="names that are texts, as of photos", got=repr(names[0])[:80])
-    wrong = [item for item in cameras if not isinstance(item, Camera)]
-    if wrong:
-        got, hint = f"{type(wrong[0]).__name__} {wrong[0]!r}"[:80], "read_cameras(path) makes them of a file"
-        raise InvalidCameras("cameras", expected="a Camera for each name", got=got, hint=hint)
-    return cameras
 
 
 def viewmat_of(camera_to_world: np.ndarray, centre: np.ndarray) -> np.ndarray:

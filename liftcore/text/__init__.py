@@ -1,7 +1,6 @@
 """Public: text encoders behind one protocol, from words to unit vectors. Importing this loads no torch."""
 
 import logging
-from collections import OrderedDict
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Protocol
@@ -25,7 +24,7 @@ TABLES = (".safetensors", ".npy", ".npz", ".pt")  # of these only the first is r
 TEMPLATES = (1, 7, 80)  # numbers of sentences that a word is put into: 1 is the word alone, 7 and 80 are CLIP's
 NO_WORDS = "none"  # the text space of features that no text encoder shares
 OWN_WORDS = "prompts"  # the text space of features whose packs contain their words
-CACHE_SIZE = 1_024  # texts; two megabytes at 512 channels
+CACHE_SIZE = 1_024  # texts, of which all are forgotten beyond; two megabytes at 512 channels
 log = logging.getLogger(__name__)
 
 
@@ -165,18 +164,13 @@ class CachingEncoder:
     def __init__(self, encoder: TextEncoder, size: int = CACHE_SIZE) -> None:
         self.source, self.name, self.channels = encoder, encoder.name, encoder.channels
         self.words: Sequence[str] = getattr(encoder, "words", ())  # that it is limited to; empty: it encodes any text
-        self._size = size
-        self._rows: OrderedDict[str, np.ndarray] = OrderedDict()
+        self._size, self._rows = size, dict[str, np.ndarray]()
 
     def encode(self, texts: Sequence[str]) -> np.ndarray:
         """Encode n texts as [n, F] f32 unit rows. Errors of the other encoder are raised and not cached."""
-        new = [text for text in dict.fromkeys(texts) if text not in self._rows]
-        rows = dict(zip(new, self.source.encode(new), strict=True)) if new else {}
-        for text in texts:
-            if text in self._rows:
-                rows[text] = self._rows[text]
-                self._rows.move_to_end(text)
-        self._rows.update((text, rows[text]) for text in new)
-        while len(self._rows) > self._size:
-            self._rows.popitem(last=False)
-        return np.stack([rows[text] for text in texts]) if texts else np.empty((0, self.channels), np.float32)
+        check_texts(texts)
+        if len(self._rows.keys() | set(texts)) > self._size:
+            self._rows.clear()
+        if new := [text for text in dict.fromkeys(texts) if text not in self._rows]:
+            self._rows.update(zip(new, self.source.encode(new), strict=True))
+        return np.stack([self._rows[text] for text in texts]) if texts else np.empty((0, self.channels), np.float32)

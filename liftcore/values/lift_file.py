@@ -16,7 +16,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import re
 import unicodedata
 from contextlib import suppress
 from pathlib import Path
@@ -25,13 +24,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from liftcore.errors import InvalidInput, InvalidLift
-from liftcore.io.files import open_regular, visible_files
+from liftcore.io.files import open_regular
 from liftcore.io.kinds import wrong_kind
 from liftcore.io.safetensors_file import check_arrays, map_tensors
 from liftcore.runtime.arguments import as_path
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
     from torch import Tensor
 
@@ -42,8 +41,6 @@ FORMAT = "splatlift-lift/2"
 TENSORS = ("features", "total_weight", "has_feature")
 CONFIDENCE = "confidence"  # in lifts that were reweighted
 NEAR = 3  # folders of an input's path, and above a lift, among which it is looked for
-MOST_BESIDE = 16  # files of one kind beside a lift, that are read to know one of them
-DIGEST = re.compile("[0-9a-f]{64}")  # SHA-256, as `sha256_of` has it
 CLUSTER_TENSORS = ("cluster", "cluster_features")  # in lifts with aggregation only
 OBJECT_TENSORS = ("object", "object_views")  # in lifts that looked for objects
 NODE_TENSORS = ("node", "node_parents", "node_views", "node_confidence", "node_features")  # beside objects
@@ -229,7 +226,7 @@ def _digest_of_several(files: Sequence[Path], folder: Path) -> str:
 
 
 def found_input(role: str, recorded: InputFile, metadata: LiftMetadata, lift: Path | None) -> Path | None:
-    """Find an input of a lift: at its recorded path, beside the lift, or in the lift's store; else None.
+    """Find an input of a lift: at its recorded path, or near the lift; else None.
 
     Cameras match if those of the lifted views are unchanged, whatever other views there are.
 
@@ -237,7 +234,9 @@ def found_input(role: str, recorded: InputFile, metadata: LiftMetadata, lift: Pa
         role: splats, cameras or features. lift: the lift's file; None looks at the recorded path alone.
     """
     path = Path(recorded.path)
-    places = [path] if lift is None else [path, *_candidates_beside(lift, path), *_in_store(lift, recorded.sha256)]
+    places, parts = [path], path.parts[1:]
+    for above in () if lift is None else Path(os.path.abspath(lift)).parents[: NEAR + 1]:
+        places += [above.joinpath(*parts[-count:]) for count in range(1, min(len(parts), NEAR) + 1)]
     for place in places:
         if place.exists():
             with suppress(InvalidInput, OSError):
@@ -245,21 +244,6 @@ def found_input(role: str, recorded: InputFile, metadata: LiftMetadata, lift: Pa
                 if candidate.sha256 == recorded.sha256 or (role == "cameras" and has_poses(place, metadata)):
                     return place
     return None
-
-
-def _candidates_beside(lift: Path, path: Path) -> Iterator[Path]:
-    """Yield paths near the lift where an input may be: under its name, with some folders; else by its suffix."""
-    folder, parts = Path(os.path.abspath(lift)).parent, path.parts[1:]
-    for above in (folder, *folder.parents[:NEAR]):
-        yield from (above.joinpath(*parts[-count:]) for count in range(1, min(len(parts), NEAR) + 1))
-    if path.suffix:
-        yield from [other for other in visible_files(folder, f"*{path.suffix}") if other != lift][:MOST_BESIDE]
-
-
-def _in_store(lift: Path, sha256: str) -> Iterator[Path]:
-    """Yield the places of an input beside ``lifts/ID.safetensors`` of a service: ``blobs/ab/abcd....ply``."""
-    if DIGEST.fullmatch(sha256):  # the stored value of another lift may be a pattern, not a digest
-        yield from Path(os.path.abspath(lift)).parent.parent.glob(f"blobs/{sha256[:2]}/{sha256}.*")
 
 
 def has_poses(place: Path, metadata: LiftMetadata) -> bool:

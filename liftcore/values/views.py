@@ -12,8 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from liftcore.errors import InvalidFeatures
+from liftcore.errors import InvalidFeatures, reading
 from liftcore.io.npy import without_unit_axes
+from liftcore.runtime.arguments import check_choice
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.splats import shared_tensor
 from liftcore.values.fit import FITS, Fit
@@ -62,58 +63,42 @@ class Regions:
     """[M, F] f16 or f32"""
 
     def __init__(self, labels: Array, codebook: Array, *, context: str = "") -> None:
-        rows = _features(codebook, "M, F", f"{context} codebook".strip())
-        object.__setattr__(self, "codebook", rows)
-        object.__setattr__(self, "labels", _labels(labels, len(rows), f"{context} labels".strip()))
+        with reading(f"{context} codebook".strip(), InvalidFeatures, "floats [M, F]"):
+            object.__setattr__(self, "codebook", _features(codebook, "M, F"))
+        with reading(f"{context} labels".strip(), InvalidFeatures, "integers [L, h, w]"):
+            object.__setattr__(self, "labels", _labels(labels, len(self.codebook)))
 
     @classmethod
     def from_masks(
         cls,
         masks: Array | Sequence[Array],
         vectors: Array,
-        levels: Sequence[int] | None = None,
         *,
         context: str = "",
     ) -> Self:
         """Return regions of masks that may overlap, as those of SAM, with a vector each.
 
-        A pixel under several masks has a label of each, on a level of its own: it reads all their vectors, and none
-        of them is lost. An empty mask is on no pixel; masks [0, H, W] with vectors [0, F] are a view without labels.
+        A pixel under several masks has a label of each, on a level of its own (`label_levels`): it reads all their
+        vectors, and none of them is lost. An empty mask is on no pixel; masks [0, H, W] with vectors [0, F] are a
+        view without labels.
 
         Args:
             masks: [M, H, W] of booleans, or a sequence of M of [H, W]; also [M, 1, H, W], as SAM's predictor gives
                 them. They need not have the photo's size.
             vectors: [M, F] of floats, row k of mask k.
-            levels: M whole numbers from 0 on, the level of each mask, such as SAM's sub-part, part and whole; masks
-                of one level must not overlap. None: large masks first, each on the first level that has room for it
-                (`label_levels`). The setting ``levels`` of a lift can take one of them alone.
             context: text before the argument's name in errors, such as a view.
 
         Raises:
-            InvalidFeatures: masks that are no booleans, of another number than the vectors, or in which two of a
-                level overlap; or as the constructor has it.
+            InvalidFeatures: masks that are no booleans, or of another number than the vectors; or as the constructor
+                has it.
         """
-        argument = f"{context} masks".strip()
         if np.ndim(vectors) == 2 and not len(vectors) and np.shape(masks)[:1] == (0,):  # nothing was found here
             size = np.shape(masks)[-2:] if np.ndim(masks) >= 3 else (1, 1)
             return cls(np.full(size, NO_LABEL, np.int32), np.zeros((1, vectors.shape[1]), np.float32))
-        try:
-            tensors = [mask for mask in masks if isinstance(mask, Tensor)] if isinstance(masks, Sequence) else []
-            planes = (torch.stack(tensors) if tensors else shared_tensor(masks)).cpu()
-        except (TypeError, ValueError, RuntimeError) as error:
-            got = f"{type(masks).__name__} ({str(error)[:80]})"
-            raise InvalidFeatures(argument, expected="booleans [M, H, W]", got=got) from None
-        planes = planes[:, 0] if planes.ndim == 4 and planes.shape[1] == 1 else without_unit_axes(planes, 3)
-        if planes.ndim != 3 or planes.dtype != torch.bool or not planes.numel():
-            hint = "masks of numbers are booleans by masks > 0.5" if planes.dtype != torch.bool else ""
-            expected = "booleans [M, H, W], at least one mask and no side empty"
-            raise InvalidFeatures(argument, expected=expected, got=_kind(planes), hint=hint)
-        codebook = _features(vectors, "M, F", f"{context} vectors".strip())
-        if len(codebook) != len(planes):
-            expected, got = f"{len(codebook)} masks, one a vector", f"{len(planes)} of shape {list(planes.shape[1:])}"
-            raise InvalidFeatures(argument, expected=expected, got=got, hint="row k of the vectors is of mask k")
-        planes = planes.numpy()
-        labels = label_levels(list(planes), argument) if levels is None else _levels_of(planes, levels, context)
+        with reading(f"{context} vectors".strip(), InvalidFeatures, "floats [M, F]"):
+            codebook = _features(vectors, "M, F")
+        with reading(f"{context} masks".strip(), InvalidFeatures, "booleans [M, H, W]"):
+            labels = label_levels(list(_planes(masks, len(codebook))))
         return cls.unchecked(torch.from_numpy(labels).to(codebook.device), codebook)
 
     def __repr__(self) -> str:
@@ -157,11 +142,10 @@ class FeatureGrid:
     """of the map to its photo; "" for not known"""
 
     def __init__(self, grid: Array, *, fit: Fit | Literal[""] = "", context: str = "") -> None:
-        cells = _features(grid, "h, w, F", f"{context} grid".strip())
-        if fit not in ("", *FITS):
-            expected = f"one of {', '.join(FITS)}"
-            raise InvalidFeatures(f"{context} fit".strip(), expected=expected, got=repr(fit)[:80])
-        object.__setattr__(self, "grid", cells)
+        with reading(f"{context} grid".strip(), InvalidFeatures, "floats [h, w, F]"):
+            object.__setattr__(self, "grid", _features(grid, "h, w, F"))
+        if fit:
+            check_choice(f"{context} fit".strip(), fit, FITS, InvalidFeatures)
         object.__setattr__(self, "fit", fit)
 
     def __repr__(self) -> str:
@@ -189,7 +173,7 @@ class FeatureGrid:
 ViewFeatures = Regions | FeatureGrid
 
 
-def label_levels(masks: Sequence[np.ndarray], location: str) -> np.ndarray:
+def label_levels(masks: Sequence[np.ndarray]) -> np.ndarray:
     """Return [L, h, w] i32: label k where mask k is, -1 for none; an empty mask has no label.
 
     The largest mask comes first, of equals the one that was given first, and each goes to the first level on which
@@ -197,7 +181,7 @@ def label_levels(masks: Sequence[np.ndarray], location: str) -> np.ndarray:
     levels as rows of their own needs only the masks of a pixel, so there their level does not matter.
 
     Args:
-        masks: [h, w] bool each, at least one, all of one size; each is read twice. location: the argument, in errors.
+        masks: [h, w] bool each, at least one, all of one size; each is read twice.
     """
     boxes, areas = zip(*map(_extent, masks), strict=True)
     # Space for all levels that there may be: pages of those that are never written take no memory.
@@ -213,12 +197,9 @@ def label_levels(masks: Sequence[np.ndarray], location: str) -> np.ndarray:
             depth = np.zeros(masks[0].shape, np.int32)
             for mask in masks:
                 depth += mask
-            raise InvalidFeatures(
-                location,
-                expected=f"masks that lie on {MAX_LEVELS} levels without overlap",
-                got=f"{len(masks)} masks, up to {depth.max()} of them over one pixel",
-                hint="leave out those that are nearly the same, as SamAutomaticMaskGenerator does by box_nms_thresh",
-            )
+            got = f"{len(masks)} masks, up to {depth.max()} of them over one pixel"
+            hint = "leave out those that are nearly the same, as SamAutomaticMaskGenerator does by box_nms_thresh"
+            raise ValueError(f"masks that lie on {MAX_LEVELS} levels without overlap, got {got}; {hint}")
         if level == level_count:
             labels[level] = NO_LABEL
             level_count += 1
@@ -235,78 +216,65 @@ def _extent(mask: np.ndarray) -> tuple[tuple[slice, slice], int]:
     return box, int(np.count_nonzero(mask[box]))
 
 
-def _levels_of(masks: np.ndarray, levels: Sequence[int], location: str) -> np.ndarray:
-    """Return [L, h, w] i32 of masks [M, h, w] bool on the levels that the caller names."""
-    argument, expected = (
-        f"{location} levels".strip(),
-        f"{len(masks)} whole numbers in 0..{MAX_LEVELS - 1}, one a mask",
-    )
-    numbers = np.asarray(levels)
-    if numbers.shape != masks.shape[:1] or numbers.dtype.kind not in "iu":
-        raise InvalidFeatures(argument, expected=expected, got=repr(levels)[:80])
-    if not 0 <= int(numbers.min()) <= int(numbers.max()) < MAX_LEVELS:
-        raise InvalidFeatures(argument, expected=expected, got=f"{int(numbers.min())}..{int(numbers.max())}")
-    labels = np.full((int(numbers.max()) + 1, *masks.shape[1:]), NO_LABEL, np.int32)
-    for number, level in enumerate(numbers.tolist()):
-        label = labels[level][masks[number]]
-        if (label != NO_LABEL).any():
-            got = f"mask {number} over mask {int(label.max())} on level {level}"
-            hint = "leave levels out, and each overlap gets a level of its own"
-            raise InvalidFeatures(argument, expected="masks of a level that do not overlap", got=got, hint=hint)
-        labels[level][masks[number]] = number
-    return labels
+def _planes(masks: Array | Sequence[Array], count: int) -> np.ndarray:
+    """Return masks [M, h, w] bool on the CPU, one for each of so many vectors."""
+    tensors = [mask for mask in masks if isinstance(mask, Tensor)] if isinstance(masks, Sequence) else []
+    try:
+        planes = (torch.stack(tensors) if tensors else shared_tensor(masks)).cpu()
+    except RuntimeError as error:
+        raise ValueError(str(error)[:80]) from None
+    planes = planes[:, 0] if planes.ndim == 4 and planes.shape[1] == 1 else without_unit_axes(planes, 3)
+    if planes.ndim != 3 or planes.dtype != torch.bool or not planes.numel():
+        expected = "booleans [M, H, W], at least one mask and no side empty"
+        raise ValueError(f"{expected}, got {_kind(planes)}; masks of numbers are booleans by masks > 0.5")
+    if len(planes) != count:
+        got = f"{len(planes)} of shape {list(planes.shape[1:])}"
+        raise ValueError(f"{count} masks, one a vector, got {got}; row k of the vectors is of mask k")
+    return planes.numpy()
 
 
-def check_finite(values: Tensor, location: str) -> None:
+def check_finite(values: Tensor) -> None:
     """Refuse NaN, infinity, and what no encoder gives and whose squares would be infinite."""
     # The extremes carry NaN and infinity along, and cost a tenth of testing every value.
     low, high = torch.aminmax(values) if values.numel() else values.new_zeros(2)
     if not (float(low) >= -LARGEST and float(high) <= LARGEST):  # in float64: float16 would take the bound for inf
         bad = int((~(values.float().abs() <= LARGEST)).sum())
         got = f"{bad} of {values.numel()} that are NaN, infinite or larger"
-        raise InvalidFeatures(location, expected=f"finite values within +-{LARGEST:g}", got=got)
+        raise ValueError(f"finite values within +-{LARGEST:g}, got {got}")
 
 
-def _features(values: object, axes: str, location: str) -> Tensor:
+def _features(values: object, axes: str) -> Tensor:
     """Return [.., F] f16 or f32, contiguous and finite."""
-    try:
-        tensor = shared_tensor(values)
-    except (TypeError, ValueError):
-        raise InvalidFeatures(location, expected=f"floats [{axes}]", got=type(values).__name__) from None
-    tensor = without_unit_axes(tensor, len(axes.split()))
+    tensor = without_unit_axes(shared_tensor(values), len(axes.split()))
     fits = tensor.ndim == len(axes.split()) and tensor.numel() and tensor.dtype in FLOATS
     if not fits or tensor.shape[-1] > MAX_CHANNELS:
         hint = f"at most {MAX_CHANNELS} channels, no side empty"
-        raise InvalidFeatures(location, expected=f"floats [{axes}]", got=_kind(tensor), hint=hint)
+        raise ValueError(f"floats [{axes}], got {_kind(tensor)}; {hint}")
     tensor = tensor if tensor.dtype in (torch.float16, torch.float32) else tensor.float()
-    check_finite(tensor, location)
+    check_finite(tensor)
     return tensor.contiguous()
 
 
-def _labels(values: object, rows: int, location: str) -> Tensor:
+def _labels(values: object, rows: int) -> Tensor:
     """Return [L, h, w] i32, contiguous, each -1 or below ``rows``."""
-    try:
-        tensor = shared_tensor(values)
-    except (TypeError, ValueError):
-        raise InvalidFeatures(location, expected="integers [L, h, w]", got=type(values).__name__) from None
+    tensor = shared_tensor(values)
     tensor = without_unit_axes(tensor.to(torch.int64) if tensor.dtype in WIDENED else tensor, 3)
     if tensor.ndim == 3 and tensor.shape[-1] == 1 < len(tensor):  # [h, w, 1]: no photo is a pixel wide
         tensor = tensor[..., 0]
     if tensor.ndim not in (2, 3) or not tensor.numel() or tensor.dtype not in INTEGERS:
         hint = PLANES if tensor.dtype == torch.bool else ""
-        raise InvalidFeatures(location, expected="integers [L, h, w], no side empty", got=_kind(tensor), hint=hint)
+        raise ValueError(f"integers [L, h, w], no side empty, got {_kind(tensor)}; {hint}")
     if tensor.ndim == 3 and len(tensor) > MOST_LEVELS:
         hint = "put maps whose labels do not overlap together, or lift some of them"
-        raise InvalidFeatures(location, expected=f"at most {MOST_LEVELS} levels", got=_kind(tensor), hint=hint)
+        raise ValueError(f"at most {MOST_LEVELS} levels, got {_kind(tensor)}; {hint}")
     low, high = (int(value) for value in torch.aminmax(tensor))
     if tensor.ndim == 3 and len(tensor) == rows > 2 and (low, high) == (0, 1):  # would be of the first two rows alone
         got = f"{_kind(tensor)} of zeros and ones, a plane for each of the {rows} rows"
-        raise InvalidFeatures(location, expected="integers [L, h, w] of rows", got=got, hint=PLANES)
+        raise ValueError(f"integers [L, h, w] of rows, got {got}; {PLANES}")
     if low < NO_LABEL or high >= rows:
-        expected = f"rows of its codebook (0..{rows - 1}) or {NO_LABEL} for none"
         got = f"the label {low if low < NO_LABEL else high}"
         hint = "label k is row k of the vectors, through all levels; where 0 means none, save labels - 1"
-        raise InvalidFeatures(location, expected=expected, got=got, hint=hint)
+        raise ValueError(f"rows of its codebook (0..{rows - 1}) or {NO_LABEL} for none, got {got}; {hint}")
     return tensor.to(torch.int32).reshape(-1, *tensor.shape[-2:]).contiguous()
 
 

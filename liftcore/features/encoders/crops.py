@@ -18,7 +18,7 @@ from scipy.ndimage import find_objects
 from torch import Tensor
 from torch.nn import functional
 
-from liftcore.errors import InvalidInput
+from liftcore.errors import InvalidInput, reading
 from liftcore.features.encoders import Pixels
 from liftcore.features.encoders.clip import space_of, training_pixels
 from liftcore.features.encoders.encode import prepare, read_image
@@ -86,7 +86,8 @@ def crop_vectors(
             continue
         batches = (torch.stack(list(islice(crops, BATCH))) for _ in range(0, rows, BATCH))
         features = torch.cat([encoder.encode(batch) for batch in batches])
-        check_finite(features, f"vectors of the masks of {view!r}")
+        with reading(f"vectors of the masks of {view!r}", InvalidInput, "finite values"):
+            check_finite(features)
         vectors[view] = features.half().numpy()
         progress("encode", count, len(masks), "views")
     return vectors, readings

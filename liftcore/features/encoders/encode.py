@@ -13,7 +13,7 @@ import torch
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
-from liftcore.errors import InvalidInput
+from liftcore.errors import InvalidFeatures, InvalidInput, reading
 from liftcore.features.encoders import ImageEncoder, Pixels, open_image_encoder
 from liftcore.features.folders import files_below, folders_of, grids_of
 from liftcore.io.cameras import read_cameras
@@ -120,7 +120,8 @@ def encode_images(
             shorter = size or model.pixels.shorter
             for names, stack in _batches(photos, model.pixels, shorter, batch, sizes, readings):
                 for name, grid in zip(names, model.encode(stack), strict=True):
-                    check_finite(grid, f"features of image {name!r}")
+                    with reading(f"features of image {name!r}", InvalidFeatures, "finite values"):
+                        check_finite(grid)
                     cells = torch.nn.functional.normalize(grid, dim=-1) if normalised else grid
                     if float(cells.abs().max()) > LARGEST_F16:
                         wide.append(name)

@@ -93,7 +93,7 @@ def test_unknown_model_of_open_clip_is_an_error(
         open_encoder(f"open_clip:{model.format(code=tmp_path / 'code.pt')}")
 
 
-def test_a_remembered_text_is_read_once_and_the_oldest_is_forgotten() -> None:
+def test_a_remembered_text_is_read_once_until_too_many_are_remembered() -> None:
     encoded: list[str] = []
 
     class Counting:
@@ -107,7 +107,7 @@ def test_a_remembered_text_is_read_once_and_the_oldest_is_forgotten() -> None:
     first = encoder.encode(["a", "bb", "a"])
     assert first[:, 0].tolist() == [1.0, 2.0, 1.0] and encoded == ["a", "bb"]
     encoder.encode(["a", "ccc"])
-    assert encoded == ["a", "bb", "ccc"]
-    encoder.encode(["bb"])
-    assert encoded == ["a", "bb", "ccc", "bb"]
+    assert encoded == ["a", "bb", "a", "ccc"]
+    encoder.encode(["ccc"])
+    assert encoded == ["a", "bb", "a", "ccc"]
     assert encoder.encode([]).shape == (0, 2) and (encoder.name, encoder.channels) == ("counting", 2)

@@ -58,10 +58,10 @@ def test_rows_may_come_in_another_order_and_keep_an_origin_of_map_coordinates() 
 @pytest.mark.parametrize(
     ("keep", "message"),
     [
-        (np.ones(59, bool), r"keep: expected booleans \[60\], .* got a mask of 59"),
+        (np.ones(59, bool), r"keep: expected booleans \[60\], .* 59; a mask has an entry for each row"),
         (np.zeros(60, bool), "keep: expected at least one row, got none of 60"),
-        ([0, 60], "keep: .* got row 60 of 60"),
-        (7, r"keep: .*, got 7; a single row is keep=\[row\]"),
+        ([0, 60], "keep: .* index 60 is out of bounds"),
+        (7, r"keep: .*, got 7; .* a single row is keep=\[row\]"),
     ],
 )
 def test_what_chooses_no_rows_is_refused(keep: Any, message: str) -> None:

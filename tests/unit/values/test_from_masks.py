@@ -37,22 +37,15 @@ def test_overlapping_masks_lift_as_the_sum_of_what_each_says() -> None:
         np.testing.assert_allclose(W[:, [number]].toarray(), column.toarray(), rtol=1e-6)
 
 
-def test_levels_that_are_named_are_kept() -> None:
-    regions = lc.Regions.from_masks(OVERLAPPING, VECTORS, levels=[0, 2, 0, 1])
-    assert regions.labels.tolist() == [[[0, 0, -1, 2]], [[-1, -1, -1, -1]], [[-1, 1, 1, -1]]]
-
-
 @pytest.mark.parametrize(
-    ("masks", "vectors", "levels", "message"),
+    ("masks", "vectors", "message"),
     [
-        (OVERLAPPING.astype(np.float32), VECTORS, None, r"masks: expected booleans \[M, H, W\].*got float32.*> 0.5"),
-        ([np.ones((2, 2), bool), np.ones((2, 3), bool)], VECTORS, None, "masks: expected booleans"),
-        (OVERLAPPING[:3], VECTORS, None, r"masks: expected 4 masks, one a vector, got 3 .*row k of the vectors"),
-        (OVERLAPPING, VECTORS.astype(int), None, r"vectors: expected floats \[M, F\], got int64"),
-        (OVERLAPPING, VECTORS, [0, 0, 0, 0], "levels: .* do not overlap, got mask 1 over mask 0 on level 0"),
-        (OVERLAPPING, VECTORS, [0, -1, 0, 0], "levels: expected 4 whole numbers in 0..31, .*got -1..0"),
+        (OVERLAPPING.astype(np.float32), VECTORS, r"masks: expected booleans \[M, H, W\].*got float32.*> 0.5"),
+        ([np.ones((2, 2), bool), np.ones((2, 3), bool)], VECTORS, "masks: expected booleans"),
+        (OVERLAPPING[:3], VECTORS, r"masks: expected 4 masks, one a vector, got 3 .*row k of the vectors"),
+        (OVERLAPPING, VECTORS.astype(int), r"vectors: expected floats \[M, F\], got int64"),
     ],
 )
-def test_wrong_masks_are_refused_by_their_name(masks: Any, vectors: Any, levels: Any, message: str) -> None:
+def test_wrong_masks_are_refused_by_their_name(masks: Any, vectors: Any, message: str) -> None:
     with pytest.raises(lc.InvalidFeatures, match=message):
-        lc.Regions.from_masks(masks, vectors, levels)
+        lc.Regions.from_masks(masks, vectors)
