@@ -88,11 +88,11 @@ def reading(source: object, error: type[SplatliftError], expected: str, hint: st
         got = f"a file that does not open ({fault.strerror or fault})"[:160]
         raise error(str(source), expected=expected, got=got, hint=hint) from None
     except (ValueError, TypeError, LookupError, OverflowError, RecursionError, EOFError, SyntaxError) as fault:
-        said = f"no {fault}" if isinstance(fault, KeyError) else str(fault)
-        seen, separator, got = said.partition(", got ")
-        got, _, remedy = got.partition("; ") if separator else (seen, "", "")
+        text = f"no {fault}" if isinstance(fault, KeyError) else str(fault)
+        expectation, separator, got = text.partition(", got ")
+        got, _, remedy = got.partition("; ") if separator else (expectation, "", "")
         raise error(
-            str(source), expected=seen if separator else expected, got=got[:160], hint=remedy or hint
+            str(source), expected=expectation if separator else expected, got=got[:160], hint=remedy or hint
         ) from None
 
 

@@ -441,7 +441,7 @@ class PlyHeader:
         """Return the lines of a file with ``count`` rows of a type; what does not change stays as it is."""
         end = "\r" if self.lines[0].endswith("\r") else ""
 
-        def changed(line: str) -> str:
+        def changed_line(line: str) -> str:
             words = line.split()
             if words[:1] == ["element"] and count != self.count:
                 return f"element vertex {count}{end}"
@@ -453,7 +453,7 @@ class PlyHeader:
             return f"property {SPELLING[dtype[name].str[1:]]} {name}{end}"
 
         new_names = (name for name in dtype.names or () if name not in self.names)
-        return [*map(changed, self.lines[:-1]), *map(property_line, new_names), self.lines[-1]]
+        return [*map(changed_line, self.lines[:-1]), *map(property_line, new_names), self.lines[-1]]
 
 
 def read_header(path: Path) -> PlyHeader:
