@@ -18,7 +18,6 @@ from liftcore.io.gltf import (
     JSON_CHUNK,
     LABELS,
     MAGIC,
-    MAX_DEGREE,
     RENDER_MODE,
     SRGB,
     TO_FILE,
@@ -27,12 +26,10 @@ from liftcore.io.gltf import (
     harmonic_name,
 )
 from liftcore.io.labels import IDS, stored_columns
-from liftcore.io.quantised import gaussian_rows
+from liftcore.io.quantised import gaussians_in
 from liftcore.runtime.version import __version__
-from liftcore.scene.harmonics import band_rotation, constant_terms
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.origin import FILE_ORIGIN
-from liftcore.scene.quaternions import product_matrix
 
 if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
@@ -122,35 +119,22 @@ class _Binary:
 def _primitive(
     binary: _Binary, splats: Splats, columns: Mapping[str, np.ndarray], sets: Sequence[str]
 ) -> dict[str, Any]:
-    rows = list(gaussian_rows(splats))
-
-    def concatenate(name: str) -> np.ndarray:
-        return np.concatenate([getattr(block, name) for block in rows])
-
-    means, opacities, colours = (
-        (concatenate("means") * np.diag(TO_FILE)).astype("<f4"),
-        concatenate("opacities"),
-        concatenate("colours"),
-    )
-    sh = None if splats.sh is None else splats.sh.cpu().numpy()
-    sh = constant_terms(colours)[:, None] if sh is None else sh[:, : (MAX_DEGREE + 1) ** 2]
-    srgb = colours.clip(0, 1)
+    rows = gaussians_in(splats, TO_FILE)
+    srgb = rows.colours.clip(0, 1)
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    extents = {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
-    quats = np.roll(concatenate("quats") @ product_matrix(TO_FILE).T, -1, axis=1)
+    extents = {"min": rows.means.min(axis=0).tolist(), "max": rows.means.max(axis=0).tolist()}
     attributes = {
-        "POSITION": binary.attribute(means, **extents),
+        "POSITION": binary.attribute(rows.means, **extents),
         "COLOR_0": binary.attribute(  # for viewers that draw points only
-            np.round(255 * np.column_stack([linear, opacities])).astype("<u1"), normalized=True
+            np.round(255 * np.column_stack([linear, rows.opacities])).astype("<u1"), normalized=True
         ),
-        f"{EXTENSION}:ROTATION": binary.attribute(quats.astype("<f4")),
-        f"{EXTENSION}:SCALE": binary.attribute(concatenate("scales").astype("<f4")),
-        f"{EXTENSION}:OPACITY": binary.attribute(opacities.astype("<f4")),
+        f"{EXTENSION}:ROTATION": binary.attribute(rows.quats),
+        f"{EXTENSION}:SCALE": binary.attribute(rows.scales),
+        f"{EXTENSION}:OPACITY": binary.attribute(rows.opacities),
     }
-    for band in range(round(sh.shape[1] ** 0.5)):
-        coefficients = np.einsum("ij,njc->nic", band_rotation(band, TO_FILE), sh[:, band**2 : (band + 1) ** 2])
+    for band in range(round(rows.sh.shape[1] ** 0.5)):
         for place in range(2 * band + 1):
-            attributes[harmonic_name(band, place)] = binary.attribute(coefficients[:, place].astype("<f4"))
+            attributes[harmonic_name(band, place)] = binary.attribute(rows.sh[:, band**2 + place])
     for name, column in columns.items():
         attribute_name = f"_{name.upper() if name == name.lower() else name}"
         attribute = f"_FEATURE_ID_{sets.index(name)}" if name in sets else attribute_name

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liftcore.scene.harmonics import SH_C0
+from liftcore.scene.harmonics import SH_C0, band_rotation, constant_terms
+from liftcore.scene.quaternions import product_matrix
 
 if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
@@ -24,6 +25,7 @@ MOST_GROWTH = 100  # decoded bytes for a byte of a compressed file: real scenes 
 GREY = 0.6  # of splats that have no colours
 THIN = 0.01  # of a disc's smaller scale: the thickness that it is shown with
 REST_INDICES = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # indices of a quaternion without each one
+MOST_SH_ROWS = 16  # of what other formats hold: degree 3
 LARGEST_SCALE = 80.0  # log: its exponential is a float32
 
 Fields = dict[str, Any]  # arguments of `Splats` by their names
@@ -146,3 +148,27 @@ def gaussian_rows(splats: Splats) -> Iterator[GaussianRows]:
             colours=np.full((len(size), 3), GREY, "f4") if sh is None else 0.5 + SH_C0 * sh[block, 0],
             sh=np.zeros((len(size), 0, 3), "f4") if sh is None else sh[block, 1:],
         )
+
+
+def gaussians_in(splats: Splats, axes: np.ndarray) -> GaussianRows:
+    """Return all splats as 3D Gaussians in another frame, with x y z w and harmonics of degree 0 to 3 in ``sh``.
+
+    Args:
+        axes: [3, 3] f64, 1 and -1 on its diagonal: from the frame of PLYs and cameras to that one.
+    """
+    blocks = list(gaussian_rows(splats))
+    means, scales, quats, opacities, colours = (
+        np.concatenate([getattr(block, name) for block in blocks])
+        for name in ("means", "scales", "quats", "opacities", "colours")
+    )
+    sh = constant_terms(colours)[:, None] if splats.sh is None else splats.sh.cpu().numpy()[:, :MOST_SH_ROWS]
+    bands = [sh[:, band**2 : (band + 1) ** 2] for band in range(round(sh.shape[1] ** 0.5))]
+    bands = [np.einsum("ij,njc->nic", band_rotation(band, axes), part) for band, part in enumerate(bands)]
+    return GaussianRows(
+        means=(means * np.diag(axes)).astype("<f4"),
+        scales=scales.astype("<f4"),
+        quats=np.roll(quats @ product_matrix(axes).T, -1, axis=1).astype("<f4"),
+        opacities=opacities.astype("<f4"),
+        colours=colours,
+        sh=np.concatenate(bands, axis=1).astype("<f4"),
+    )

@@ -21,16 +21,13 @@ import numpy as np
 
 from liftcore.errors import InvalidSplats, Unavailable
 from liftcore.io.labels import IDS, KINDS, rows_by_id, stored_columns
-from liftcore.io.quantised import gaussian_rows
+from liftcore.io.quantised import gaussians_in
 from liftcore.runtime.folders import scratch_folder
-from liftcore.scene.harmonics import band_rotation, constant_terms
-from liftcore.scene.quaternions import product_matrix
 
 if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
 
 TO_FILE = np.diag([1.0, -1.0, -1.0])  # RDF to RUB, and back
-MAX_DEGREE = 3  # of harmonics
 MODULES = ("Gf", "Sdf", "Tf", "Usd", "UsdGeom", "UsdSemantics", "UsdUtils", "UsdVol", "Vt")
 FIELD = "ParticleField3DGaussianSplat"
 WORLD = "splatlift_world"  # of the layer's custom data: up and metres a unit as JSON, null where not known
@@ -89,37 +86,22 @@ def usd_blocks(splats: Splats, document: Mapping[str, Any] | None = None, suffix
 def _write_field(stage: Any, name: str, splats: Splats, columns: Mapping[str, np.ndarray]) -> Any:
     """Write a particle field, and return its prim."""
     pxr = open_library()
-    rows = list(gaussian_rows(splats))
-
-    def concatenate(name: str) -> np.ndarray:
-        return np.concatenate([getattr(block, name) for block in rows])
-
-    means, colours = (concatenate("means") @ TO_FILE).astype("f4"), concatenate("colours")
-    sh = (
-        constant_terms(colours)[:, None] if splats.sh is None else splats.sh.cpu().numpy()[:, : (MAX_DEGREE + 1) ** 2]
-    )
-    rotated = np.concatenate(
-        [
-            np.einsum("ij,njc->nic", band_rotation(band, TO_FILE), sh[:, band**2 : (band + 1) ** 2])
-            for band in range(round(sh.shape[1] ** 0.5))
-        ],
-        axis=1,
-    )
-    quats = np.roll(concatenate("quats") @ product_matrix(TO_FILE).T, -1, axis=1)  # in memory the real part is last
+    rows = gaussians_in(splats, TO_FILE)
     field = pxr.UsdVol.ParticleField3DGaussianSplat.Define(stage, f"/Scene/{name}")
 
     def vectors(values: np.ndarray) -> Any:
         return pxr.Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, "f4"))
 
-    field.CreatePositionsAttr(vectors(means))
-    field.CreateScalesAttr(vectors(concatenate("scales")))
-    field.CreateOrientationsAttr(pxr.Vt.QuatfArray.FromNumpy(np.ascontiguousarray(quats, "f4")))
-    field.CreateOpacitiesAttr(pxr.Vt.FloatArray.FromNumpy(concatenate("opacities").astype("f4")))
-    field.CreateRadianceSphericalHarmonicsDegreeAttr(round(sh.shape[1] ** 0.5) - 1)
-    field.CreateRadianceSphericalHarmonicsCoefficientsAttr(vectors(rotated.reshape(-1, 3)))
+    field.CreatePositionsAttr(vectors(rows.means))
+    field.CreateScalesAttr(vectors(rows.scales))
+    # In memory the real part is last.
+    field.CreateOrientationsAttr(pxr.Vt.QuatfArray.FromNumpy(np.ascontiguousarray(rows.quats)))
+    field.CreateOpacitiesAttr(pxr.Vt.FloatArray.FromNumpy(rows.opacities))
+    field.CreateRadianceSphericalHarmonicsDegreeAttr(round(rows.sh.shape[1] ** 0.5) - 1)
+    field.CreateRadianceSphericalHarmonicsCoefficientsAttr(vectors(rows.sh.reshape(-1, 3)))
     field.CreateSortingModeHintAttr("cameraDistance")
-    reach = 3 * concatenate("scales").max(axis=1, keepdims=True)
-    low, high = (means - reach).min(axis=0).tolist(), (means + reach).max(axis=0).tolist()
+    reach = 3 * rows.scales.max(axis=1, keepdims=True)
+    low, high = (rows.means - reach).min(axis=0).tolist(), (rows.means + reach).max(axis=0).tolist()
     field.CreateExtentAttr(pxr.Vt.Vec3fArray([pxr.Gf.Vec3f(*low), pxr.Gf.Vec3f(*high)]))
     primvars = pxr.UsdGeom.PrimvarsAPI(field)
     for key, column in columns.items():

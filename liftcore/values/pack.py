@@ -198,6 +198,7 @@ def as_views(
     return Views(channels, "", "", None, sources)
 
 
+@reading("features", InvalidFeatures, "feature packs")
 def read_features(*paths: str | Path) -> Views:
     """Open feature packs as one set of views; only headers are read.
 
@@ -209,21 +210,19 @@ def read_features(*paths: str | Path) -> Views:
     sources: dict[str, _Stored] = {}
     channels: dict[int, str] = {}
     for pack in packs:
-        for view, stored in _composed_names(_views(pack)).items():
+        for view, stored in _composed_names(pack.views).items():
             if view in sources:
-                got = f"{view!r} in {sources[view].pack.path} and {pack.path}"
-                raise InvalidFeatures("features", expected="each view in one pack", got=got)
-            sources[view] = _Stored(pack, stored)
-            channels.setdefault(_check_specs(sources[view]), sources[view].where)
+                raise ValueError(f"each view in one pack, got {view!r} in {sources[view].pack.path} and {pack.path}")
+            sources[view] = source = _Stored(pack, stored)
+            with reading(source.where, InvalidFeatures, "labels with a codebook, or a grid"):
+                channels.setdefault(_check_specs(source.specs), source.where)
         if len(sources) > MAX_VIEWS:
-            got = f"{len(sources)} up to {pack.path}"
-            raise InvalidFeatures("features", expected=f"at most {MAX_VIEWS} views", got=got, hint=FEWER_VIEWS)
+            raise ValueError(f"at most {MAX_VIEWS} views, got {len(sources)} up to {pack.path}; {FEWER_VIEWS}")
     if not sources:
-        raise InvalidFeatures("features", expected="at least one view", got=f"{len(packs)} packs without any")
+        raise ValueError(f"at least one view, got {len(packs)} packs without any")
     if len(channels) > 1:
-        (first_count, first_place), (second_count, second_place) = list(channels.items())[:2]
-        got = f"{first_count} in {first_place} and {second_count} in {second_place}"
-        raise InvalidFeatures("features", expected="the same channels in every view", got=got)
+        got = " and ".join(f"{count} in {place}" for count, place in list(channels.items())[:2])
+        raise ValueError(f"the same channels in every view, got {got}")
     normalised = {"true": True, "false": False}.get(_shared_metadata(packs, "normalised").lower())
     encoder, text_space = _shared_metadata(packs, "encoder"), _shared_metadata(packs, "text_space")
     table = _table(packs, next(iter(channels)))
@@ -414,6 +413,7 @@ class _PackFile:
     handle: Any  # an open safetensors mapping
     specs: dict[str, TensorSpec]
     metadata: dict[str, str]
+    views: list[str]
 
 
 @dataclass(frozen=True)
@@ -454,19 +454,21 @@ def _open(path: Path) -> _PackFile:
     try:
         with reading(path, InvalidFeatures, expected, hint):
             check_header(path)
+            try:
+                handle: Any = safe_open(str(path), framework="pt")
+                names = handle.keys()
+                if len(names) > MAX_TENSORS:
+                    limit = f"at most {MAX_VIEWS} views, of two tensors each"
+                    raise ValueError(f"{limit}, got {len(names)} tensors; {FEWER_VIEWS}")
+                slices = {name: handle.get_slice(name) for name in names}
+                specs = {
+                    name: TensorSpec(part.get_dtype(), _axes(name, part.get_shape())) for name, part in slices.items()
+                }
+                return _PackFile(path, handle, specs, handle.metadata() or {}, _view_names(names))
+            except SafetensorError as error:
+                raise ValueError(f"{expected}, got a file that does not open as one ({str(error)[:120]})") from None
     except InvalidFeatures as error:
         raise wrong_kind(path, "features", InvalidFeatures, expected=expected) or error from None
-    try:
-        handle: Any = safe_open(str(path), framework="pt")
-        if len(names := handle.keys()) > MAX_TENSORS:
-            limit = f"at most {MAX_VIEWS} views, of two tensors each"
-            raise InvalidFeatures(str(path), expected=limit, got=f"{len(names)} tensors", hint=FEWER_VIEWS)
-        slices = {name: handle.get_slice(name) for name in names}
-        specs = {name: TensorSpec(part.get_dtype(), _axes(name, part.get_shape())) for name, part in slices.items()}
-        return _PackFile(path, handle, specs, handle.metadata() or {})
-    except (SafetensorError, OSError) as error:
-        got = f"a file that does not open as one ({str(error)[:120]})"
-        raise InvalidFeatures(str(path), expected=expected, got=got) from None
 
 
 def _axes(name: str, shape: Sequence[int]) -> tuple[int, ...]:
@@ -476,34 +478,30 @@ def _axes(name: str, shape: Sequence[int]) -> tuple[int, ...]:
     return tuple(shape[extra:]) if all(side == 1 for side in shape[:extra]) else tuple(shape)
 
 
-def _views(pack: _PackFile) -> list[str]:
+def _view_names(tensors: Sequence[str]) -> list[str]:
     views: dict[str, None] = {}
-    for key in pack.specs:
+    for key in tensors:
         view, _, part = key.rpartition("/")
-        if key == TABLE and len(pack.specs) > 1:
+        if key == TABLE and len(tensors) > 1:
             continue
         if not view or part not in PARTS:
-            expected = "tensors 'VIEW/labels' with 'VIEW/codebook', or 'VIEW/grid'"
-            error = InvalidFeatures(str(pack.path), expected=expected, got=repr(key)[:120])
-            raise wrong_kind(pack.path, "features", InvalidFeatures, expected=expected) or error
+            raise ValueError(f"tensors 'VIEW/labels' with 'VIEW/codebook', or 'VIEW/grid', got {key[:120]!r}")
         views[view] = None
     return list(views)
 
 
-def _check_specs(stored: _Stored) -> int:
+def _check_specs(specs: Mapping[str, TensorSpec]) -> int:
     """Check the header of one view; its channels."""
-    specs = stored.specs
     if set(specs) not in ({"grid"}, {"labels", "codebook"}):
-        raise InvalidFeatures(stored.where, expected="labels with a codebook, or a grid", got=" with ".join(specs))
-    axes = {"grid": "h w F", "codebook": "M F", "labels": "L h w"}
+        raise ValueError(f"labels with a codebook, or a grid, got {' with '.join(specs)}")
+    axes = {"grid": "h, w, F", "codebook": "M, F", "labels": "L, h, w"}
     for part, spec in specs.items():
-        expected_axes = "h w" if part == "labels" and len(spec.shape) == 2 else axes[part]
+        expected_axes = "h, w" if part == "labels" and len(spec.shape) == 2 else axes[part]
         types = LABEL_TYPES if part == "labels" else FEATURE_TYPES
         fits = len(spec.shape) == len(expected_axes.split()) and all(spec.shape) and spec.dtype in types
         if not fits or (part != "labels" and spec.shape[-1] > MAX_CHANNELS):
-            expected = f"{' or '.join(types)} [{expected_axes.replace(' ', ', ')}], no side empty"
-            got = f"{spec.dtype} {list(spec.shape)}"
-            raise InvalidFeatures(f"{stored.where} {part}", expected=expected, got=got)
+            expected = f"{part} {' or '.join(types)} [{expected_axes}], no side empty"
+            raise ValueError(f"{expected}, got {spec.dtype} {list(spec.shape)}")
     return specs["grid" if "grid" in specs else "codebook"].shape[-1]
 
 
@@ -513,28 +511,22 @@ def _table(packs: Sequence[_PackFile], channels: int) -> TableEncoder | None:
     for pack in packs:
         if TABLE not in pack.specs:
             continue
+        argument = f"{pack.path} {TABLE}"
+        rows = pack.handle.get_tensor(TABLE)
+        rows = (rows.float() if rows.dtype == torch.bfloat16 else rows).numpy()
         try:
-            rows = pack.handle.get_tensor(TABLE)
-            rows = (rows.float() if rows.dtype == torch.bfloat16 else rows).numpy()
-            tables[pack.path] = TableEncoder.of(
-                f"words of {pack.path.name}", pack.metadata.get("words", "null"), rows
-            )
+            table = TableEncoder.of(f"words of {pack.path.name}", pack.metadata.get("words", "null"), rows)
         except InvalidTable as error:
-            argument = f"{pack.path} {TABLE}"
             raise InvalidFeatures(argument, expected=error.expected, got=error.got, hint=error.hint) from None
-        if tables[pack.path].channels != channels:
-            expected, got = f"{channels} channels, as its views have", str(tables[pack.path].channels)
-            raise InvalidFeatures(f"{pack.path} {TABLE}", expected=expected, got=got)
-    first = next(iter(tables), None)
-    for path, table in tables.items():
-        if first and not (
-            table.words == tables[first].words and (table.embeddings == tables[first].embeddings).all()
-        ):
+        if table.channels != channels:
+            expected = f"{channels} channels, as its views have"
+            raise InvalidFeatures(argument, expected=expected, got=str(table.channels))
+        first = next(iter(tables), pack.path)
+        tables[pack.path] = table
+        if table.words != tables[first].words or (table.embeddings != tables[first].embeddings).any():
             hint = "write the masks of all views into one pack"
-            raise InvalidFeatures(
-                "features", expected="one table in all packs", got=f"two in {first} and {path}", hint=hint
-            )
-    return tables[first] if first else None
+            raise ValueError(f"one table in all packs, got two in {first} and {pack.path}; {hint}")
+    return next(iter(tables.values()), None)
 
 
 def _level_names(packs: Sequence[_PackFile]) -> tuple[str, ...]:
@@ -555,6 +547,5 @@ def _shared_metadata(packs: Sequence[_PackFile], key: str) -> str:
     paths = {value: path for value, path in values.items() if value}
     if len(paths) > 1:
         got = " and ".join(f"{value[:80]!r} in {path}" for value, path in paths.items())
-        hint = "features of different spaces cannot make one lift"
-        raise InvalidFeatures("features", expected=f"one {key} in all packs", got=got, hint=hint)
+        raise ValueError(f"one {key} in all packs, got {got}; features of different spaces cannot make one lift")
     return next(iter(paths), "")
