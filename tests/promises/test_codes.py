@@ -62,14 +62,28 @@ def test_codes_answer_as_exact_features_do(exact: lc.LiftResult, coded: lc.LiftR
     assert (scores[~exact.has_feature.numpy()] == -1).all()
 
 
+def test_codes_are_labelled_clicked_and_named_as_their_rows_are(coded: lc.LiftResult) -> None:
+    columns = {"object": torch.arange(COUNT).int() % 5, "object_views": torch.zeros(5, 5).int()}
+    lifts = [replace(lift, **columns) for lift in (coded, coded.with_exact_features())]
+    of_codes, of_rows = (lc.Scene(lift, row_of_splats(COUNT)) for lift in lifts)
+    labels, expected = (scene.segment([*WORDS, "sofa"], encoder="lvis") for scene in (of_codes, of_rows))
+    assert np.array_equal(labels.labels, expected.labels) and (labels.labels >= 0).mean() > 0.8
+    clicked, expected = (scene.ask(lc.Query(like=["splat:5"]), places=False) for scene in (of_codes, of_rows))
+    assert expected.count and np.array_equal(clicked.selected, expected.selected)
+    vectors = lc.open_encoder("lvis").encode(list(WORDS))
+    listing, expected = (scene.catalogue(WORDS, vectors) for scene in (of_codes, of_rows))
+    assert [item.name for item in listing.objects] == [item.name for item in expected.objects]
+    np.testing.assert_allclose(listing.features, expected.features, atol=1e-5)
+
+
 def test_codes_have_the_same_bits_for_any_threads(exact: lc.LiftResult, coded: lc.LiftResult) -> None:
     threads = torch.get_num_threads()
     for count in (1, 3):
         torch.set_num_threads(count)
-        again = exact.as_codes()
+        coded_again = exact.as_codes()
         torch.set_num_threads(threads)
         for name in ("code", "features"):
-            assert np.array_equal(again.arrays()[name], coded.arrays()[name])
+            assert np.array_equal(coded_again.arrays()[name], coded.arrays()[name])
 
 
 def test_codes_are_saved_read_cropped_and_moved_as_codes(

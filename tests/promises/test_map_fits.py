@@ -1,14 +1,16 @@
-"""Maps of photos that were stretched, padded or cropped: the fit is said, warned about, and told by photos."""
+"""Maps of photos that were stretched, padded, cropped or taken through a lens: each lies where its photo shows it."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import liftcore as lc
 import numpy as np
 import pytest
+import torch
 from liftcore.evaluate import check_scene
 from PIL import Image
 
@@ -101,3 +103,57 @@ def test_a_fit_is_recorded_by_pack_and_told_by_check(
         messages = [text for text in report.wrong if "--map-fit" in text]
         is_right = (fit or "stretch") == true_fit
         assert messages == [] if is_right else f"--map-fit {true_fit}" in messages[0], (fit, report)
+
+
+LENS = {"k1": -0.45, "k2": 0.15}  # bends corners by a quarter of their distance
+
+
+def patches_on_photo(camera: lc.Camera) -> np.ndarray:
+    """Return the patch [H, W] that each pixel of a photo through LENS shows, by iteration; -1 for none."""
+    v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    distorted = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy])
+    places = distorted
+    for _ in range(50):
+        r2 = np.square(places).sum(axis=0)
+        places = distorted / (1 + LENS["k1"] * r2 + LENS["k2"] * r2**2)
+    rays = np.stack([*places, np.ones_like(u)], axis=2) @ camera.viewmat[:3, :3]
+    points = camera.centre - rays * (camera.centre[2] / rays[..., 2:])
+    on_plane = np.abs(points[..., :2]).max(axis=2) < 2
+    return np.where(on_plane, patch_of(points[..., 0], points[..., 1]), -1)
+
+
+def test_maps_and_masks_of_a_distorted_photo_lie_where_it_shows_things(
+    scene: tuple[lc.Splats, lc.Cameras, np.ndarray], tmp_path: Path
+) -> None:
+    splats, cameras, patches = scene
+    truth = {name: patches_on_photo(camera) for name, camera in cameras.items()}
+    book = np.eye(16, dtype=np.float32)
+    views = {name: lc.Regions(labels.astype(np.int32), book) for name, labels in truth.items()}
+    frames = [
+        {
+            "file_path": name, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy,
+            "transform_matrix": (np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1, -1, 1])).tolist(),
+        }
+        for name, camera in cameras.items()
+    ]  # fmt: skip
+    right, masks = {}, {}
+    for name, lens in (("lens", LENS), ("none", {})):
+        path = tmp_path / f"{name}.json"
+        path.write_text(json.dumps({"w": WIDTH, "h": HEIGHT, "frames": frames, **lens}))
+        with_lens = lc.read_cameras(path)
+        result = lc.lift(splats, with_lens, views, preset="row-sum", progress=False)
+        has_feature = result.has_feature.numpy()
+        right[name] = (result.features.float().argmax(dim=1).numpy() == patches)[has_feature].mean()
+        assert ("distorted photos" in " ".join(result.diagnostics["warnings"])) == bool(lens)
+        exact = lc.LiftResult.of(replace(result, features=torch.from_numpy(book[patches]), has_feature=patches >= 0))
+        exact_scene, common, union = lc.Scene(exact, splats, with_lens), 0, 0
+        for patch in range(16):
+            expected = truth["v0"] == patch
+            places = np.argwhere(expected)
+            y, x = places[np.square(places - places.mean(axis=0)).sum(axis=1).argmin()]
+            answer = exact_scene.ask(lc.Query(like=[f"v0:{x},{y}"], threshold=0.5))
+            mask = exact_scene.mask(answer, "v0")
+            common, union = common + (mask & expected).sum(), union + (mask | expected).sum()
+        masks[name] = common / union
+    assert right["lens"] > 0.93 and right["lens"] > right["none"] + 0.03, right
+    assert masks["lens"] > 0.65 and masks["lens"] > masks["none"] + 0.1, masks

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import liftcore as lc
@@ -43,6 +44,15 @@ SETTINGS: dict[str, dict[str, Any]] = {
 }
 
 
+def rows_of(view: lc.Regions | lc.FeatureGrid, A: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield the rows of A and B of a view: of a grid once, of regions for each level where it has a label."""
+    if isinstance(view, lc.FeatureGrid):
+        yield A, read_grid(view.grid.double().numpy())
+        return
+    for labels in view.labels.numpy().reshape(len(view.labels), -1):
+        yield A[labels >= 0], view.codebook.double().numpy()[labels[labels >= 0]]
+
+
 def dense_lift(scene: RandomScene, name_of_settings: str) -> tuple[np.ndarray, np.ndarray]:
     """Return X [P, F] and the weights D [P] that it is divided by, in float64."""
     count, settings = scene.splats.count, SETTINGS[name_of_settings]
@@ -54,14 +64,9 @@ def dense_lift(scene: RandomScene, name_of_settings: str) -> tuple[np.ndarray, n
             A = A**2
         if largest := {"argmax": 1, "top-k": 3}.get(settings["preset"]):
             A = np.where(np.sort(A, axis=1)[:, -largest, None] <= A, A, 0)
-        if isinstance(view, lc.FeatureGrid):
-            sums += A.T @ read_grid(view.grid.double().numpy())
-            D += A.sum(axis=0)
-            continue
-        for labels in view.labels.numpy().reshape(len(view.labels), -1):
-            is_labelled = labels >= 0
-            sums += A[is_labelled].T @ view.codebook.double().numpy()[labels[is_labelled]]
-            D += A[is_labelled].sum(axis=0)
+        for rows, targets in rows_of(view, A):
+            sums += rows.T @ targets
+            D += rows.sum(axis=0)
     return np.divide(sums, D[:, None], out=np.zeros_like(sums), where=D[:, None] > 0), D
 
 
@@ -82,6 +87,21 @@ def test_lift_equals_its_dense_definition(name: str, kernel: str, grids: bool) -
     antialiased = name == "antialiased"
     total = sum(weights_of(scene, view, antialiased=antialiased).sum(axis=0) for view in scene.views)
     np.testing.assert_allclose(result.total_weight.numpy(), total, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("grids", [False, True])
+def test_reference_is_the_least_loss_that_any_features_have(grids: bool) -> None:
+    scene = random_scene(11, count=25, views=3, grids=grids)
+    parts = [part for name, view in scene.views.items() for part in rows_of(view, weights_of(scene, name))]
+    A, B = (np.concatenate(part) for part in zip(*parts, strict=True))
+    settings: dict[str, Any] = {"preset": "row-sum", "dtype": "float32", "reference_channels": 512}
+    result = lc.lift(*scene.arguments(), **settings, progress=False)
+    facts, least = result.diagnostics["reference"], np.linalg.lstsq(A, B, rcond=1e-12)[0]
+    own_loss, least_loss = (float(np.square(A @ X - B).sum()) for X in (result.features.double().numpy(), least))
+    assert facts["ratio"] == pytest.approx(own_loss / least_loss, rel=0.03) and facts["converged"]
+    assert facts["optimum"] * len(B) == pytest.approx(least_loss, rel=0.1)
+    assert facts["bound"] == 1 + facts["beta"]["max"]
+    assert "reference" not in lc.lift(*scene.arguments(), preset="row-sum", progress=False).diagnostics
 
 
 def test_a_lift_of_every_third_pixel_speaks_for_all_of_them() -> None:

@@ -100,32 +100,6 @@ def test_weights_at_pixels_are_their_renders(scene):
         lc.weights_at(splats, "v0", pixels)  # pyright: ignore[reportArgumentType]
 
 
-def test_stages_are_reported_in_order_and_the_plan_after_the_first_views(tmp_path):
-    splats, cameras, pack = write_scene(tmp_path, 3)
-    calls = []
-    plans = []
-
-    def on_progress(stage, completed, total, unit):
-        calls.append((stage, completed, total, unit))
-
-    def on_plan(plan):
-        plans.append((plan, {stage: completed for stage, completed, *_ in calls}))
-
-    result = lift_files(splats, cameras, [pack], lc.LiftSettings.of(), progress=on_progress, on_plan=on_plan)
-    [(plan, before)] = plans
-    assert before == {"read": 1, "digest": 1, "compile": 1, "plan": 1, "geometry": 3}
-    assert plan.facts() == result.metadata.diagnostics["plan"]
-    for stage in ("read", "digest", "compile", "plan", "diagnose"):
-        assert [call for call in calls if call[0] == stage] == [(stage, 0, 1, "steps"), (stage, 1, 1, "steps")]
-    order = list(dict.fromkeys(stage for stage, *_ in calls))
-    before, after = ["read", "digest", "compile", "plan", "geometry"], ["reweight", "solve", "diagnose"]
-    assert order == [*before, "objects", "consensus", *after]
-    assert set(order) <= result.metadata.timings.keys()
-    for stage in order:
-        counts = [call[1] for call in calls if call[0] == stage]
-        assert counts == sorted(counts)
-
-
 def test_warnings_of_memory_go_to_the_callback_else_to_the_log(tmp_path, monkeypatch, caplog):
     little_memory = "the rest of the lift may take 9.0 GiB and 1.0 GiB are free"
     monkeypatch.setattr("liftcore.lifting.planning.plan.check_memory", lambda parts, free: [little_memory])
@@ -166,19 +140,6 @@ def test_render_refuses_to_drop_a_gradient_that_is_recorded(scene):
     for mode in (torch.no_grad(), torch.inference_mode()):
         with mode:
             assert torch.equal(lc.render(splats, cameras["v0"], values), expected)
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="with a GPU these calls run on it")
-def test_the_current_card_may_be_named_by_its_number(scene):
-    _, splats, cameras, views = scene
-    for device in ("cuda:0", torch.device("cuda:0"), torch.device("cuda")):
-        with pytest.raises(lc.Unavailable, match="device"):
-            lc.lift(splats, cameras, views, device=device)
-    for call in (lc.lift, lc.plan):
-        with pytest.raises(
-            lc.InvalidSettings, match=r"cuda:0, the current GPU, got 'cuda:3'.*CUDA_VISIBLE_DEVICES=3"
-        ):
-            call(splats, cameras, views, device="cuda:3")
 
 
 @contextmanager
@@ -229,25 +190,6 @@ def test_torch_modes_change_no_bit_and_hold_in_the_callers_iterator(scene, mode)
         within = tensors_of(iterator(modes_of_views))
         assert modes() == around and set(modes_of_views) == {around}
     assert all(torch.equal(a, b) for a, b in zip(expected, within, strict=True))
-
-
-def test_repr_of_public_values_is_one_line_with_their_size(scene):
-    _, splats, cameras, views = scene
-    result = lc.lift(splats, cameras, views, preset="row-sum")
-    vectors, words = torch.eye(2, result.features.shape[1]), ["a" * 90, "b"]
-    lift_scene = result.scene(splats, cameras)
-    segmentation, tree = lift_scene.segment(words, vectors), lift_scene.tree(words, vectors)
-    sized = [splats, result, lc.region_weights(splats, cameras, views), segmentation, lc.plan(splats, cameras, views)]
-    values = [cameras, cameras["v0"].replace(name="x" * 300), *views.values(), lc.FeatureGrid(np.ones((3, 4, 5)))]
-    values += [tree, *tree.objects, *segmentation.named_words, lift_scene]
-    values += [result.query(vectors, splats=splats, threshold=0.1), lc.Query(text=["a" * 99], like=["splat:1"])]
-    values += [lc.LiftSettings.of(**dict(lc.LiftSettings.of(quality="fast"))), lc.CompositingParams(stride=3)]
-    values += [lc.LocalEngine(), lc.open_encoder("lvis"), lc.WorldFrame(up=(0, -3, 0), metres_per_unit=0.1)]
-    for value in (*sized, *values):
-        line = repr(value)
-        assert line.startswith(type(value).__name__ + "(") and line.endswith(")")
-        assert len(line) <= 120 and "\n" not in line and len(str(value)) <= 120
-    assert all(str(splats.count) in repr(value) for value in sized)
 
 
 def test_what_a_caller_set_stays_when_a_call_names_another_quality_or_preset() -> None:

@@ -176,18 +176,3 @@ def test_other_engines_go_on_from_the_pieces_of_each_stage(scene: dict[str, Any]
     expected = lc.lift(**scene, preset=settings)
     assert_same(result, expected)
     assert result.diagnostics["reweighting"] == expected.diagnostics["reweighting"]
-
-
-@pytest.mark.parametrize(
-    ("overrides", "got"),
-    [
-        ({"aggregation": True}, "aggregation=True"),
-        ({"smoothness": 2.0}, "smoothness=2.0"),
-        ({"reference_channels": 1}, "reference_channels=1"),
-    ],
-)
-def test_what_needs_all_rays_or_features_is_refused_before(
-    scene: dict[str, Any], overrides: dict[str, Any], got: str
-) -> None:
-    with pytest.raises(lc.InvalidSettings, match=f"engine: expected settings that work on blocks.*got {got}; set"):
-        lc.lift(*scene.values(), engine=LocalEngine(), **overrides)

@@ -13,10 +13,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from liftcore.errors import InvalidFeatures
-from liftcore.evaluate import inspect_file
 from liftcore.features.mask_files import read_runs
 from liftcore.features.masks import mask_views
-from liftcore.features.packing import pack_folder
 from liftcore.values.pack import read_features, write_pack
 from liftcore.values.views import MAX_LEVELS, Regions, label_levels
 from tests.run_lengths import compressed, lengths_of, sam_records
@@ -78,27 +76,6 @@ def test_views_are_named_as_their_cameras_are_and_with_their_folders(tmp_path: P
     views = mask_views(tmp_path)
     assert [*views] == ["a", "c", "camA/0", "frame.0001"]
     assert {views[view].labels.tolist() == [LABELS.tolist()] for view in views} == {True}
-
-
-EMPTY_FILES: dict[str, dict[str, Any]] = {
-    "planes": {"b.npy": VECTORS[:0], "b_masks.npy": MASKS[:0]},
-    "lists of nothing": {"b.npy": np.array([]), "b_masks.npy": np.array([])},
-    "records": {"b.npy": VECTORS[:0], "b.json": []},
-    "picture": {"b.npy": VECTORS[:0], "b.png": 0 * GREY},
-}
-
-
-@pytest.mark.parametrize("kind", EMPTY_FILES)
-def test_view_in_which_nothing_was_found_has_no_label(kind: str, tmp_path: Path) -> None:
-    save(tmp_path, {"a.npy": VECTORS, "a_masks.npy": MASKS, **EMPTY_FILES[kind]})
-    pack_folder(tmp_path, tmp_path / "p.safetensors", "masks")
-    views: Any = read_features(tmp_path / "p.safetensors")
-    assert (views["b"].labels == -1).all() and views["b"].codebook.shape[1] == 5
-    assert views["a"].labels.max() == 2
-    warnings = inspect_file(tmp_path / "p.safetensors", "features")["warnings"]
-    assert [text for text in warnings if "view" in text or "row" in text] == ["1 views have no label at all"]
-    view = Regions.from_masks(MASKS[:0], VECTORS[:0])
-    assert (view.labels == -1).all() and view.labels.shape[-2:] == LABELS.shape
 
 
 @pytest.mark.parametrize(

@@ -2,30 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 
-from liftcore.errors import InvalidFeatures
-from liftcore.scene.cameras import Camera, Cameras, behind_lens
+from liftcore.scene.cameras import Camera, behind_lens
 from liftcore.scene.distortion import Brown, Distortion, Fisheye
 from liftcore.values.lens import as_pinhole_sees
-from liftcore.values.levels import at_levels
-from liftcore.values.pack import pair, read_features, write_pack
 from liftcore.values.views import FeatureGrid, Regions
-from tests.scenes import random_grid, random_regions
-
-
-def test_one_level_is_that_level_alone_and_all_else_stays_as_it_is():
-    regions, grid = random_regions(1, 3), random_grid(1)
-    result = at_levels(regions, 2, "v0")
-    assert isinstance(result, Regions)
-    assert torch.equal(result.labels, regions.labels[2:]) and result.codebook is regions.codebook
-    assert at_levels(regions, "rows", "v0") is regions
-    assert all(at_levels(grid, levels, "v0") is grid for levels in ("rows", 0))
-
 
 BARREL = Brown(k1=-0.25, k2=0.04, p1=0.002, p2=-0.001)
 PINCUSHION = Brown(k1=0.2)
@@ -79,32 +63,3 @@ def test_a_cell_reads_the_grid_where_its_ray_lies(distortion: Distortion, dtype:
             expected = [np.clip(place[0], 0.5 / 15, 14.5 / 15), np.clip(place[1], 0.5 / 11, 10.5 / 11), 1.0]
             tolerance = 1e-3 if dtype == torch.float16 else 1e-6
             assert np.abs(observation.grid[r, c].double().numpy() - expected).max() < tolerance
-
-
-def test_packs_tell_before_a_map_is_read_what_size_it_will_have(tmp_path: Path) -> None:
-    maps = {
-        "bent": Regions(torch.zeros(2, 22, 30, dtype=torch.int32), torch.ones(1, 3)),
-        "cells": FeatureGrid(torch.ones(11, 15, 3)),
-        "plain": Regions(torch.zeros(1, 22, 30, dtype=torch.int32), torch.ones(1, 3)),
-    }
-    write_pack(tmp_path / "f.safetensors", maps, {})
-    pinhole = Camera.pinhole("plain", 60, 44, 48.0, 47.0, 29.0, 23.0, np.eye(4))
-    cameras = Cameras((camera(BARREL, "bent"), camera(PINCUSHION, "cells"), pinhole))
-    packs, unpaired = pair(read_features(tmp_path / "f.safetensors"), cameras)
-    assert unpaired == []
-    for name in maps:
-        specs, observation = packs.specs(name), packs[name]
-        part = observation.labels if isinstance(observation, Regions) else observation.grid
-        assert next(iter(specs.values())).shape == part.shape
-    assert packs["bent"].codebook.shape == (1, 3)
-    assert [packs.map_size(name) for name in maps] == [(30, 22), (15, 11), (30, 22)]  # of the photos, as they lie
-    assert tuple(packs.specs("plain")["labels"].shape) == (1, 22, 30)
-
-
-def test_masks_in_place_of_labels_are_refused_with_a_way_on() -> None:
-    labels = np.arange(12).reshape(3, 4) % 3
-    planes = labels == np.arange(3)[:, None, None]
-    for masks in (planes, planes.astype(np.uint8)):
-        with pytest.raises(InvalidFeatures, match=r"labels: .*Regions\.from_masks\(masks"):
-            Regions(masks, np.eye(3, dtype=np.float32))
-    assert Regions(labels[..., None], np.eye(3, dtype=np.float32)).labels.tolist() == [labels.tolist()]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from safetensors.torch import load_file, save_file
 from liftcore.errors import InvalidFeatures
 from liftcore.io.safetensors_file import write_tensors
 from liftcore.scene.cameras import Camera, Cameras
-from liftcore.values.pack import as_views, pair, read_features, write_pack
+from liftcore.values.pack import as_views, pair, read_features
 from liftcore.values.views import FeatureGrid, Regions, ViewFeatures
 
 MAP = np.arange(24, dtype=np.float32).reshape(3, 2, 4)  # [F, h, w]
@@ -54,26 +53,6 @@ def test_tensors_of_any_order_are_stored_in_row_order(tmp_path) -> None:
 
 
 CODEBOOK = torch.arange(12.0).reshape(4, 3)
-
-
-@pytest.mark.parametrize(
-    ("views", "message"),
-    [
-        ({}, "at least one view"),
-        ({"a": MAP}, r"view 'a': expected Regions or FeatureGrid, got ndarray; make FeatureGrid"),
-        ({"a": FeatureGrid(MAP), "b": FeatureGrid(MAP[..., :1])}, "the same channels"),
-    ],
-)
-def test_views_that_cannot_be_right_are_refused_and_not_written(views: Any, message: str, tmp_path: Path) -> None:
-    for source in (views, iter(views.items())):
-        with pytest.raises(InvalidFeatures, match=message):
-            as_views(source)
-    if "FeatureGrid" not in message:  # which its type excludes
-        with pytest.raises(InvalidFeatures, match=message):
-            write_pack(tmp_path / "pack", views, {})
-    with pytest.raises(InvalidFeatures, match="'a' twice"):
-        as_views(iter([("a", FeatureGrid(MAP)), ("a", FeatureGrid(MAP))]))
-    assert not list(tmp_path.iterdir())
 
 
 def labels(*values: int, dtype: torch.dtype = torch.int16) -> torch.Tensor:
@@ -164,12 +143,3 @@ def test_a_pack_with_both_forms_of_a_name_is_refused(tmp_path: Path) -> None:
     save_file({f"{name}/grid": torch.ones(2, 2, 3) for name in (DECOMPOSED, COMPOSED)}, tmp_path / "a.pack")
     with pytest.raises(InvalidFeatures, match=r"each view once.*forms of Unicode"):
         read_features(tmp_path / "a.pack")
-
-
-def test_packs_of_more_views_together_than_a_scene_has_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("liftcore.values.pack.MAX_VIEWS", 3)
-    packs = [saved(tmp_path / f"{k}.safetensors", {f"{k}{i}/grid": torch.ones(1, 1, 2) for i in "ab"}) for k in "cd"]
-    with pytest.raises(InvalidFeatures, match=r"at most 3 views, got 4 up to .*d\.safetensors"):
-        read_features(*packs)

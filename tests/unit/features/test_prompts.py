@@ -138,18 +138,6 @@ def test_masks_that_overlap_count_for_both_phrases(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("names", "message"),
-    [
-        ("{}", "JSON from values"),
-        ('{"3": "a"}', "the value 7"),
-    ],
-)
-def test_names_that_do_not_fit_their_pictures_are_refused(names: str, message: str, tmp_path: Path) -> None:
-    with pytest.raises(InvalidFeatures, match=message):
-        prompt_views(save(tmp_path, {**LABELS, "names.json": names}), tmp_path / "names.json")
-
-
-@pytest.mark.parametrize(
     ("files", "message"),
     [
         ({"a.png": MASKS["left"]["Lamp"]}, "outside of folders of phrases, without names"),

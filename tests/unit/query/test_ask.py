@@ -74,20 +74,6 @@ def test_splats_without_weight_do_not_decide_the_threshold(exact: Scene) -> None
     assert answer.selected[COUNT] and answer.count > reference.count  # the outliers are selected even so
 
 
-def test_what_cannot_be_asked_is_refused(scene: Scene) -> None:
-    def of_space(space: str) -> Scene:
-        return Scene(replace(scene.lift, metadata=scene.metadata.model_copy(update={"text_space": space})))
-
-    for request, message in (
-        (lambda: ask(scene, "x", Axes(5)), r"8 channels.*axes with 5"),
-        (lambda: ask(of_space(""), "x"), r"text space: not named\), got no encoder"),
-        (lambda: ask(of_space("axes"), "x"), r"text space: axes\), got no encoder"),
-        (lambda: Query.of(("a",) * 65), "at most 64"),
-    ):
-        with pytest.raises(InvalidQuery, match=message):
-            request()
-
-
 def test_words_of_a_table_are_asked_without_torch(tiny_lift: Path) -> None:
     code = (
         "import sys; from pathlib import Path; from liftcore.query.ask import ask, locate; "

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -36,19 +35,6 @@ def test_spelling_variants_find_the_same_word_and_others_name_the_nearest(table:
         with pytest.raises(InvalidQuery, match=f"nearest: {nearest}") as info:
             encoder.encode([text])
         assert info.value.nearest == (nearest.replace("\\", ""),)
-
-
-@pytest.mark.parametrize("texts", ["mug", ["mug", 7], iter(["mug"]), 7, None])
-def test_what_is_no_list_of_texts_is_refused(texts: Any) -> None:
-    with pytest.raises(InvalidQuery, match="texts: expected a list of texts"):
-        open_encoder("lvis").encode(texts)
-
-
-def test_shipped_words_need_no_file_and_are_those_of_clip() -> None:
-    encoder = open_encoder("lvis")
-    cup, mug, sofa = encoder.encode(["a cup", "mug", "sofa"])
-    assert encoder.channels == 512 and abs(np.linalg.norm(cup) - 1) < 1e-6
-    assert cup @ mug > cup @ sofa + 0.05
 
 
 @pytest.fixture(scope="module")

@@ -8,16 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from camera_files import CAMERAS, IMAGES, binary_files, text_files, with_json, write_files
+from camera_files import CAMERAS, binary_files, text_files, with_json, write_files
 
 from liftcore.errors import InvalidCameras, InvalidFeatures
 from liftcore.evaluate.inspect import inspect_file
 from liftcore.io.cameras import read_cameras
-from liftcore.scene.distortion import Brown, Fisheye, Lens
 from liftcore.scene.views import require_pairs
 
-FIRST_IMAGE = IMAGES[:1]
-OPENCV = Brown(k1=0.01, k2=-0.02, p1=0.001, p2=0.002)
 DISTORTED = {**CAMERAS, 1: (2, "SIMPLE_RADIAL", (500.0, 320.0, 240.0, 0.1))}
 TRANSFORMS = {
     "fl_x": 5,
@@ -30,28 +27,6 @@ TRANSFORMS = {
 @pytest.fixture
 def model(tmp_path: Path) -> Path:
     return write_files(tmp_path / "model", binary_files())
-
-
-@pytest.mark.parametrize(
-    ("number", "name", "parameters", "lens"),
-    [
-        (4, "OPENCV", (500.0, 510.0, 320.0, 240.0, *[0.0] * 4), None),
-        (4, "OPENCV", (500.0, 510.0, 320.0, 240.0, 0.01, -0.02, 0.001, 0.002), OPENCV),
-        (5, "OPENCV_FISHEYE", (500.0, 510.0, 320.0, 240.0, *[0.0] * 4), Fisheye()),
-        (15, "FISHEYE", (500.0, 510.0, 320.0, 240.0), Fisheye()),
-    ],
-)
-def test_distorted_photos_and_all_of_a_fisheye_have_a_lens(
-    number: int, name: str, parameters: tuple[float, ...], lens: Brown | Fisheye | None, tmp_path: Path
-) -> None:
-    fy = 510.0 if 510.0 in parameters else 500.0
-    for files in (binary_files, text_files):
-        cameras = read_cameras(
-            write_files(tmp_path / files.__name__, files({1: (number, name, parameters)}, FIRST_IMAGE))
-        )
-        view = cameras["frame 1"]
-        assert view.lens == (None if lens is None else Lens(640, 480, 500.0, fy, 320.0, 240.0, lens))
-        assert cameras.distorted == (("frame 1",) if lens else ())
 
 
 RECORD = {

@@ -84,15 +84,3 @@ def test_camera_to_world_poses_of_either_convention_give_the_camera(rows: int) -
             actual = lc.Camera.from_camera_to_world(matrix[:rows], *intrinsics, convention=convention, name="v0")  # pyright: ignore
             np.testing.assert_allclose(actual.viewmat, camera.viewmat, atol=1e-12)
             np.testing.assert_allclose(actual.centre, pose[:3, 3], atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("pose", "convention", "message"),
-    [
-        (np.eye(4), "colmap", "convention: expected 'opencv' or 'opengl' or 'blender', got 'colmap'"),
-        (np.eye(4)[[3, 1, 2, 0]], "opencv", "pose: expected 0 0 0 1 as the last row"),
-    ],
-)
-def test_wrong_poses_are_refused(pose: Any, convention: Any, message: str) -> None:
-    with pytest.raises(lc.InvalidCameras, match=message):
-        lc.Camera.from_camera_to_world(pose, np.eye(3), 4, 4, convention=convention)

@@ -18,10 +18,9 @@ import torch
 from liftcore.errors import InvalidSplats
 from liftcore.io.gltf import TO_FILE
 from liftcore.io.gltf_writer import gltf_blocks
-from liftcore.io.kinds import SplatFormat
 from liftcore.io.labels import Labels
 from liftcore.io.quantised import gaussian_rows
-from liftcore.io.splats import format_of, labelled, read_places, read_splats, write_splats
+from liftcore.io.splats import labelled, read_splats, write_splats
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
 from tests.scenes import random_splats
@@ -73,19 +72,18 @@ def join(path: Path, document: dict[str, Any], binary: bytes) -> Path:
     return path
 
 
-def test_a_file_of_another_program_is_read_as_the_ply_that_it_was_made_of() -> None:
-    expected = read_splats(FILES / "degree3.sog.decoded.ply")
-    assert format_of(FILES / "degree3.glb") is SplatFormat.GLTF
-    assert_same(read_splats(FILES / "degree3.glb"), expected)
-    np.testing.assert_allclose(read_places(FILES / "degree3.glb"), expected.means, atol=1e-6)
-
-
 def test_what_the_format_has_no_word_for_is_kept(tmp_path: Path) -> None:
     splats = replace(some_splats(), render_mode="antialiased")
     assert read_splats(write(tmp_path / "s.glb", splats)).antialiased
     far = some_splats().transformed(np.column_stack([np.eye(3), (500_000.0, 5_400_000.0, 300.0)]))
     assert any(far.origin)
     assert_same(read_splats(write(tmp_path / "s.glb", far)), far)
+
+
+@pytest.mark.parametrize("kernel", [Kernel.GAUSSIAN_2D, Kernel.BETA])
+def test_other_kernels_are_written_as_gaussians(kernel: Kernel, tmp_path: Path) -> None:
+    splats = some_splats(kernel)
+    assert_same(read_splats(write(tmp_path / "s.glb", splats)), splats)
 
 
 def test_nodes_move_what_they_hold(tmp_path: Path) -> None:

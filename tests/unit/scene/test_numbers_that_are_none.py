@@ -86,14 +86,3 @@ def test_places_of_a_file_are_numbers(tmp_path: Path) -> None:
     rows[5, 0] = np.nan
     (tmp_path / "s.ply").write_bytes(ply(rows))
     np.testing.assert_array_equal(read_places(tmp_path / "s.ply"), read_splats(tmp_path / "s.ply").means.numpy())
-
-
-def test_whole_and_empty_opacities_and_flat_splats_are_numbers() -> None:
-    values = geometry_of(random_splats(3, COUNT))
-    values["opacity_logits"][:2] = torch.tensor([np.inf, -np.inf])
-    values["log_scales"][2, 1], values["quats"][3] = -np.inf, 0.0
-    splats = Splats(**values)
-    assert splats.warnings == () and all(
-        torch.equal(getattr(splats, name), values[name]) for name in ("opacity_logits", "log_scales", "quats")
-    )
-    assert bool(torch.isfinite(lc.render(splats, random_camera(0), torch.ones(COUNT))).all())

@@ -191,16 +191,6 @@ def test_harmonics_are_the_colour_where_red_green_and_blue_are_too(tmp_path: Pat
     assert sh is not None and sh[:, 0, 0].tolist() == [0, 1, 2, 3, 4]
 
 
-def test_a_file_without_colours_or_with_another_count_is_refused(tmp_path: Path) -> None:
-    path = with_ply(tmp_path, ply_bytes(DIALECTS["no colour"]))
-    with pytest.raises(InvalidSplats, match="expected colours"):
-        list(recoloured(path, np.zeros((5, 3), np.uint8)))
-    path.write_bytes(ply_bytes(DIALECTS["gsplat"]))
-    for copy in (some_rows(path, np.ones(4, bool)), recoloured(path, np.zeros((6, 3), np.uint8))):
-        with pytest.raises(InvalidSplats, match="as many as were lifted, got 5"):
-            list(copy)
-
-
 def peak_of(work: Callable[[], object]) -> int:
     """Return the peak of the bytes that Python and NumPy allocate during a call."""
     tracemalloc.start()

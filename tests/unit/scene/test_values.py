@@ -13,13 +13,13 @@ import pytest
 import torch
 from camera_files import IMAGES, binary_files, text_files, with_json, write_files
 
-from liftcore.errors import InvalidCameras, InvalidFeatures, NotFound
+from liftcore.errors import InvalidCameras, NotFound
 from liftcore.io.cameras import read_cameras
 from liftcore.io.transforms import transforms_of
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
-from liftcore.scene.views import require_pairs, view_names
+from liftcore.scene.views import view_names
 from tests.inria_file import write_inria_cameras
 
 K = np.array([[50.0, 0.0, 32.0], [0.0, 51.0, 24.0], [0.0, 0.0, 1.0]])
@@ -159,8 +159,3 @@ def test_more_views_than_a_scene_may_have_are_refused_before_they_are_read(
         path = with_json(tmp_path, [{"img_name": "a"}] * 3)
     with pytest.raises(InvalidCameras, match=r"at most 2 views, got 3 or more; lift fewer photos"):
         read_cameras(path)
-
-
-def test_names_that_do_not_pair_are_refused_with_how_views_are_named() -> None:
-    with pytest.raises(InvalidFeatures, match=r"none in common; .*a view is named after its image"):
-        require_pairs(["left", "right"], ["IMG_1", "IMG_2"])

@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from liftcore.io.cameras import read_cameras
 from liftcore.lifting.checkpoint import Checkpoint
 from liftcore.lifting.files import lift_files
 from liftcore.query.result import LiftResult
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.runtime.device import CPU, Device
 from liftcore.values.lift_file import TENSORS
-from liftcore.values.pack import write_pack
 from liftcore.values.settings import LiftSettings
-from liftcore.values.views import FeatureGrid, Regions
-from tests.scenes import observed, write_scene
+from tests.scenes import write_scene
 
 pytestmark = pytest.mark.slow
 
@@ -87,40 +83,6 @@ def test_killed_lift_goes_on_from_its_last_view_to_the_same_bits(
     resumed = lifted(scene, threads=1, checkpoint=checkpoint)
     assert rasterized_views == ["v0", "v1", "v2"]  # none twice
     assert_same(uninterrupted, resumed)
-
-
-@pytest.mark.parametrize("grids", [False, True])
-def test_other_features_of_the_same_regions_walk_no_view_again(
-    tmp_path: Path, rasterized_views: list[str], grids: bool
-) -> None:
-    splats, cameras, features = write_scene(tmp_path, 8, grids)
-    checkpoint, settings = Checkpoint(tmp_path / "kept"), LiftSettings.of(diagnostic_rays=50)
-    lifted((splats, cameras, features), settings, checkpoint=checkpoint)
-    rasterized_views.clear()
-    second = tmp_path / "other.safetensors"
-    write_pack(
-        second,
-        {name: _other_encoder(observation) for name, observation in _views(cameras, 8, grids)},
-        {"encoder": "other"},
-    )
-    stored = settings.model_copy(update={"dtype": "float32"})
-    resumed = lifted((splats, cameras, second), stored, checkpoint=checkpoint)
-    assert rasterized_views == []
-    assert resumed.features.shape[1] == 5
-    assert_same(lifted((splats, cameras, second), stored), resumed)
-
-
-def _views(cameras: Path, seed: int, grids: bool) -> list[tuple[str, Regions | FeatureGrid]]:
-    """Return the views of the pack that `write_scene` writes."""
-    return [(camera.name, observed(seed, k, grids=grids)) for k, camera in enumerate(read_cameras(cameras).values())]
-
-
-def _other_encoder(observation: Regions | FeatureGrid) -> Regions | FeatureGrid:
-    """The same regions or cells with features of 5 channels."""
-    codebook = torch.randn(*observation.codebook.shape[:1], 5, generator=torch.Generator().manual_seed(0))
-    if isinstance(observation, Regions):
-        return replace(observation, codebook=codebook)
-    return FeatureGrid(codebook.reshape(*observation.grid.shape[:2], 5))
 
 
 def test_checkpoint_of_another_device_is_never_used(

@@ -34,14 +34,6 @@ def test_json_may_write_whole_numbers_with_a_point() -> None:
     assert isinstance(settings.stride, int)
 
 
-@pytest.mark.parametrize("read_settings", [LiftSettings.of_json, lambda values: LiftSettings.of(**values)])
-def test_errors_are_in_the_words_of_settings(read_settings: Any) -> None:
-    with pytest.raises(
-        InvalidSettings, match=r"^lambda: expected one of preset, quality, .*, got an unknown setting; nearest: "
-    ):
-        read_settings({"lambda": 1.2})
-
-
 def test_published_schema_has_every_setting_and_what_a_new_lift_may_have() -> None:
     fields = LiftSettings.model_json_schema()["properties"]
     assert set(fields) == set(LiftSettings.model_fields)
