@@ -85,7 +85,6 @@ def test_ten_tasks_are_done_without_a_manual(
     assert page.value(SAVE_OBJECTS).startswith("The file is saved.")  # export all with names
     page.press("#hand button[title='Ctrl+Z']")  # undo
     page.until(f"splatlift.editor.selection.step === 0 && !splatlift.editor.isBusy && {FIND_COLOUR}")
-    assert page.value("splatlift.query.current.count") == 20
     object_id = page.value("splatlift.objects.selections[0].id")
     ask(page, "Lamp and a bit")  # find it by its name
     assert page.value("splatlift.query.current.sets") == [f"selection:{object_id}"]
