@@ -74,6 +74,9 @@ def _rebuild(
     return error
 
 
+MOST_SEEN = 1000  # characters of what a reader saw, such as two paths
+
+
 @contextmanager
 def reading(source: object, error: type[SplatliftError], expected: str, hint: str = "") -> Iterator[None]:
     """Raise ``error`` about a file or a value for what its reader raises.
@@ -92,7 +95,7 @@ def reading(source: object, error: type[SplatliftError], expected: str, hint: st
         expectation, separator, got = text.partition(", got ")
         got, _, remedy = got.partition("; ") if separator else (expectation, "", "")
         raise error(
-            str(source), expected=expectation if separator else expected, got=got[:160], hint=remedy or hint
+            str(source), expected=expectation if separator else expected, got=got[:MOST_SEEN], hint=remedy or hint
         ) from None
 
 
