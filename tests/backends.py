@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
 
 
-def gpu_raster(splats: Splats, block: int = 1 << 24) -> GpuRaster:
+def gpu_raster(splats: Splats) -> GpuRaster:
     """Return the GPU backend, on a GPU if there is one, else in Triton's interpreter."""
     from liftcore.raster.gpu.raster import GpuRaster
 
-    return GpuRaster(splats, torch.device("cuda:0" if torch.cuda.is_available() else "cpu"), block)
+    return GpuRaster(splats, torch.device("cuda:0" if torch.cuda.is_available() else "cpu"))
 
 
 @dataclass(frozen=True)

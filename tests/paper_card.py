@@ -64,7 +64,7 @@ def lay(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, answer in answers.items():
         monkeypatch.setattr(torch.cuda, name, lambda *_, answer=answer: answer)
     monkeypatch.setattr("liftcore.runtime.device._missing", lambda: None)
-    for module in ("rays", "tiles", "weights"):
+    for module in ("tiles", "weights"):
         monkeypatch.setattr(f"liftcore.raster.gpu.{module}.launch", _launch)
 
 

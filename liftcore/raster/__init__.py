@@ -25,7 +25,7 @@ def open_raster(splats: Splats, device: Device, threads: int | None = None) -> R
         return CpuRaster(splats, threads)
     from liftcore.raster.gpu.raster import GpuRaster  # loads triton
 
-    return GpuRaster(splats, device.place)
+    return GpuRaster(splats, device.place, threads)
 
 
 def check_splats_and_threads(splats: Splats, threads: int | None) -> Splats:

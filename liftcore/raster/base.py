@@ -26,7 +26,7 @@ class RayRows:
     """Rows of A for single rays, sparse."""
 
     indptr: Tensor  # [n + 1] i64, CSR row pointers
-    splats: Tensor  # [nnz] i32, near to far; in ascending order by the reference
+    splats: Tensor  # [nnz] i32, near to far by the CPU, in ascending order by others
     weights: Tensor  # [nnz] f32
 
 
@@ -88,7 +88,7 @@ class Raster(Protocol):
         ...
 
     def ray_rows(self, camera: Camera, pixels: Tensor, params: CompositingParams) -> RayRows:
-        """Return the rows of A for the rays of pixels [n, 2] i32 (x, y) of the full view, for any stride."""
+        """Return the rows of A for pixels [n, 2] i32 (x, y) of the full view that are rays of the stride."""
         ...
 
     def footprints(self, camera: Camera, params: CompositingParams) -> Tensor:
@@ -121,11 +121,3 @@ def check_params(kernel: Kernel, camera: Camera, params: CompositingParams) -> N
     if not all(0 <= first < min(params.stride, side) for first, side in zip(params.offset, sides, strict=True)):
         expected = f"a pixel (x, y) of the image, each below the stride {params.stride}"
         raise InvalidInput("offset", expected=expected, got=str(params.offset))
-
-
-def strided_places(params: CompositingParams, pixels: Tensor) -> Tensor | None:
-    """Return the pixels [n, 2] (x, y) as pixels of the strided view; None if any is not among its rays."""
-    if params.stride == 1:
-        return pixels
-    steps = pixels - pixels.new_tensor(params.offset)
-    return None if bool((steps % params.stride).any()) else steps // params.stride

@@ -22,7 +22,7 @@ from triton.backends.compiler import BaseBackend, GPUTarget
 from triton.compiler import ASTSource, make_backend
 
 from liftcore.raster.cpu.warm_up import warm_up
-from liftcore.raster.gpu import launching, raster, rays, tiles, weights
+from liftcore.raster.gpu import launching, raster, tiles, weights
 from liftcore.raster.gpu.tiles import _cut as cut
 from liftcore.runtime.device import Device
 from liftcore.scene.compositing import CompositingParams, Weighting
@@ -37,7 +37,6 @@ OLDEST = 75  # what a lift of 3DGS launches most is compiled for it too
 _compile: Any = triton.compile
 _specialised: Any = libtriton.native_specialize_impl
 _CARD = Device("cuda", torch.device("cpu"))
-TOP = Weighting(2, top_k=40)
 
 
 @dataclass(frozen=True)
@@ -106,7 +105,7 @@ def launches_of(work: Callable[[], None]) -> dict[Launch, None]:
             for name, value in (("rows", 0), ("firsts", 0), ("counts", 1)):
                 by_name[name].fill_(value)
 
-    modules: list[Any] = [rays, tiles, weights]
+    modules: list[Any] = [tiles, weights]
     for module in modules:
         module.launch = note
     work()
@@ -138,7 +137,7 @@ def main() -> None:
     launches: dict[Launch, None] = {}
     for kernel in Kernel:
         case = (
-            (CompositingParams(opacity_logit_scale=1.2), TOP)
+            (CompositingParams(opacity_logit_scale=1.2), Weighting(2))
             if kernel is Kernel.GAUSSIAN_3D
             else (CompositingParams(), Weighting())
         )
@@ -148,7 +147,7 @@ def main() -> None:
         print(json.dumps({"kernel": str(kernel), "launches": len(lift), "compiled_in_the_lift": later}), flush=True)
         launches |= lift
     launches |= launches_of(_every_product)
-    names = ("_weigh", "_add_runs", "_trace", "_cut")
+    names = ("_weigh", "_add_runs", "_cut")
     everywhere = [next(launch for launch in launches if launch.name == name) for name in names]
     for launch in launches:
         for card in (H100, OLDEST) if launch in everywhere else (H100,):

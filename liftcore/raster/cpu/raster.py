@@ -26,7 +26,6 @@ from liftcore.raster.base import (
     ViewRequest,
     ViewWeights,
     check_params,
-    strided_places,
 )
 from liftcore.raster.cpu.composite import (
     Frame,
@@ -159,11 +158,12 @@ class CpuRaster:
 
     def ray_rows(self, camera: Camera, pixels: Tensor, params: CompositingParams) -> RayRows:
         """Return rows of A for single pixels [n, 2] (x, y). See the protocol."""
-        places = strided_places(params, pixels)
-        if places is None:  # some are no rays of the strided view
-            places, params = pixels, every_pixel(params)
-        rays = np.ascontiguousarray(places.to(torch.int32).numpy())
-        return RayRows(*map(torch.from_numpy, trace_rays(self._frame(camera, params), rays)))
+        if not len(pixels):
+            return RayRows(
+                torch.zeros(1, dtype=torch.int64), pixels.new_empty(0), torch.empty(0, dtype=torch.float32)
+            )
+        rays = (pixels.to(torch.int32).numpy() - np.array(params.offset, np.int32)) // params.stride
+        return RayRows(*map(torch.from_numpy, trace_rays(self._frame(camera, params), np.ascontiguousarray(rays))))
 
     def footprints(self, camera: Camera, params: CompositingParams) -> Tensor:
         """Return the areas [P] f32 of the splats' outlines. See the protocol."""
@@ -300,11 +300,4 @@ def _weights_of(raster: Raster, request: ViewRequest) -> ViewWeights:
     """Return the region weights of one view, and the rows of A of its requested rays."""
     camera, params = request.camera, request.params
     weights = raster.region_weights(camera, request.observation, params, request.weighting)
-    if len(request.pixels):
-        return ViewWeights(weights, raster.ray_rows(camera, request.pixels, params))
-    return ViewWeights(
-        weights,
-        RayRows(
-            torch.zeros(1, dtype=torch.int64), torch.empty(0, dtype=torch.int32), torch.empty(0, dtype=torch.float32)
-        ),
-    )
+    return ViewWeights(weights, raster.ray_rows(camera, request.pixels, params))

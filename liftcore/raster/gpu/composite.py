@@ -17,7 +17,7 @@ few float64 units.
 import triton.language as tl
 
 from liftcore.raster.gpu import project as scene
-from liftcore.raster.gpu.launching import jit, lang
+from liftcore.raster.gpu.launching import jit
 from liftcore.scene.compositing import ALPHA_FLOOR, LARGEST_EXPONENT, TILE
 from liftcore.scene.splats import Kernel
 
@@ -30,9 +30,7 @@ PARTS = 2  # of scratch; twice as many with those of the total weight
 
 # The same as constants of kernels.
 _CHUNK, _TILE, _PIXELS = tl.constexpr(CHUNK), tl.constexpr(TILE), tl.constexpr(TILE * TILE)
-_SCRATCH, _TOTALS = tl.constexpr(PARTS * PART), tl.constexpr(PARTS * PART)
 _WEIGHTS, _UNSCALED_ALPHAS = tl.constexpr(PART), tl.constexpr(2 * PART)
-_LATER = tl.constexpr(1 << 30)  # above every item number: an empty slot
 _BETAS = tl.constexpr(BETAS)
 _DISCS = tl.constexpr(DISCS)
 _LARGEST_EXPONENT = tl.constexpr(LARGEST_EXPONENT)
@@ -166,63 +164,3 @@ def weights_of(scratch, count, pixel):
     number = tl.arange(0, _CHUNK)[:, None]
     pointer = scratch + _WEIGHTS + number * _PIXELS + pixel[None, :]
     return tl.load(pointer, mask=number < count, other=0.0)
-
-
-@jit
-def blend_largest(scratch, transmittance, stop, count, least, ties, WITH_ALL: tl.constexpr):
-    """Blend as ``blend_chunk``, storing the k largest weights of a ray only.
-
-    Args:
-        least: [256] f32, the k-th largest weight of a ray. ties: [256] i32, how many equal to it count.
-        WITH_ALL: store all weights too, as those of the total weight.
-
-    Returns:
-        The transmittance behind the chunk, and the remaining ties.
-    """
-    pixel = tl.arange(0, _PIXELS)
-    for number in range(tl.minimum(count, _CHUNK)):
-        pointer = scratch + number * _PIXELS + pixel
-        weight, transmittance = blend(tl.load(pointer), transmittance, stop)
-        if WITH_ALL:
-            tl.store(pointer + _TOTALS + _WEIGHTS, weight)
-        equal = (weight == least) & (weight > 0.0) & (ties > 0)  # near to far, until k are full
-        ties -= equal.to(tl.int32)
-        tl.store(pointer + _WEIGHTS, tl.where(equal | (weight > least), weight, 0.0))
-    tl.debug_barrier()
-    return transmittance, ties
-
-
-@jit
-def rank_tile(
-    places, inks, starts, items, scratch, largest, band_tile, own_tile, columns, width, height, count,
-    cap, stop, floor, KIND: tl.constexpr, COUNT: tl.constexpr,
-):  # fmt: skip
-    list_tile = own_tile + tl.program_id(0)
-    tile = band_tile + list_tile
-    own_scratch = scratch + tl.program_id(0) * _SCRATCH
-    pixel = tl.arange(0, _PIXELS)
-    rank = tl.arange(0, COUNT)
-    first = tl.load(starts + list_tile)
-    at = first
-    last = tl.load(starts + list_tile + 1)
-    transmittance = start_rays(tile, columns, width, height)
-    # COUNT is a power of two; the excess columns hold infinity, which no weight displaces.
-    top_weights = tl.where((rank < count)[None, :] & (pixel >= 0)[:, None], 0.0, float("inf"))
-    order = _LATER + rank[None, :] + tl.zeros([_PIXELS, COUNT], tl.int32)
-    brightest = lang.max(transmittance, 0)
-    while (at < last) & (brightest > 0.0):
-        remaining = (last - at).to(tl.int32)
-        fill_alphas(places, inks, items, at, last, tile, columns, own_scratch, cap, floor, KIND, False)
-        transmittance = blend_chunk(own_scratch, transmittance, stop, remaining)
-        for number in range(tl.minimum(remaining, _CHUNK)):
-            weight = tl.load(own_scratch + _WEIGHTS + number * _PIXELS + pixel)
-            least = lang.min(top_weights, 1)
-            # Of equal ones the latest is displaced.
-            latest = lang.max(tl.where(top_weights == least[:, None], order, -1), 1)
-            displaced = (order == latest[:, None]) & (weight > least)[:, None]
-            top_weights = tl.where(displaced, weight[:, None], top_weights)
-            order = tl.where(displaced, (at - first).to(tl.int32) + number, order)
-        brightest = lang.max(transmittance, 0)
-        at += _CHUNK
-    to = (tl.program_id(0) * _PIXELS + pixel)[:, None] * count + rank[None, :]
-    tl.store(largest + to, top_weights, mask=(rank < count)[None, :] & (pixel >= 0)[:, None])

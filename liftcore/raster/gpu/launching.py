@@ -28,9 +28,7 @@ WARPS = 4  # per program, of 32 threads: two pixels of a tile per thread
 
 # Arguments that change from view to view. Triton would specialise a kernel on 1 and on multiples of 16, and compile
 # it in the middle of a lift.
-COUNTS = frozenset(
-    {"band_tile", "own_tile", "slots_tile", "columns", "width", "height", "count", "runs"}
-)  # fmt: skip
+COUNTS = frozenset({"columns", "width", "height", "count", "runs"})
 
 
 def jit(function: Callable) -> Any:

@@ -1,8 +1,7 @@
-"""Tile lists on the device, for all projected splats at once; and the division of a view into blocks.
+"""Tile lists on the device, for all projected splats at once.
 
 Every projected splat is split into spans, one per tile row, by the same bounds as on the CPU. Counts and prefix sums
-give the offset of each span's tiles, in depth order; a stable sort by tile keeps that order inside a tile. A view
-whose lists exceed a block is processed in bands of tile rows, with the lists of one band at a time.
+give the offset of each span's tiles, in depth order; a stable sort by tile keeps that order inside a tile.
 """
 
 from typing import NamedTuple
@@ -11,107 +10,70 @@ import torch
 import triton.language as tl
 from torch import Tensor
 
+from liftcore.raster.cpu import project as projected
 from liftcore.raster.cpu.project import View
-from liftcore.raster.gpu.composite import FLOORS, KINDS, PART, PARTS
+from liftcore.raster.gpu.composite import FLOORS, KINDS
 from liftcore.raster.gpu.launching import jit, lang, launch
-from liftcore.raster.gpu.project import DeviceScene, Outlines, ProjectedSplats, project
+from liftcore.raster.gpu.project import kernel_inputs
 from liftcore.scene.compositing import TILE, CompositingParams
 from liftcore.scene.splats import Kernel
 
 SPANS = 256  # per program
 _TILE = tl.constexpr(TILE)
+_OUTLINE = (
+    projected.MX, projected.MY, projected.SLOPE, projected.SQRT_A, projected.C, projected.CUTOFF,
+    projected.EXTENT_X, projected.EXTENT_Y, projected.RIGHTMOST_DY,
+)  # fmt: skip
+_CIRCLE = projected.CENTRE_X, projected.CENTRE_Y, projected.NEARBY  # covered beside the outline, of 2DGS
 
 
-class TileSpans(NamedTuple):
-    """Runs of tiles in a tile row that a projected splat touches: ordered by splat, near to far, then by row."""
+class Frame(NamedTuple):
+    """One view on the device: its projected splats, near to far, and the lists of its tiles."""
 
-    places: Tensor  # [s] i32, rows of projected splats
-    rows: Tensor  # [s] i32, the tile row
-    firsts: Tensor  # [s] i32, the first tile column
-    counts: Tensor  # [s] i32, at least one
-
-
-class TileLists(NamedTuple):
-    """The lists of the tiles of a band of tile rows, and the projected splats to which they refer."""
-
-    first_row: int  # of the band, in the view
-    columns: int  # tiles per row
+    ids: Tensor  # [n] i32, the splat of a projected splat
+    splats: tuple[Tensor, Tensor]  # places [n, PLACE] f64 and inks [n, INK] f32
     starts: Tensor  # [tiles + 1] i64, each tile's list in items
-    items: Tensor  # [n] i32, rows of projected splats, near to far in each tile
-    ids: Tensor  # [f] i32, the splat of a projected splat
-    splats: tuple[Tensor, Tensor]  # places [f, PLACE] f64 and inks [f, INK] f32
-
-    @property
-    def tiles(self) -> int:
-        """The number of tiles of the band."""
-        return self.starts.shape[0] - 1
-
-    @property
-    def first_tile(self) -> int:
-        """The first tile of the band, in the view."""
-        return self.first_row * self.columns
+    items: Tensor  # [m] i32, rows of projected splats, near to far in each tile
+    size: tuple[int, int, int]  # tiles a row, width and height in pixels
+    cuts: tuple[float, float, float]  # alpha cap, transmittance stop, alpha floor
+    kind: int  # of splats, as kernels number them
 
 
-def spans_of(outlines: Outlines, rows: tuple[int, int], columns: int, at_once: int) -> TileSpans:
-    """Return the spans of all projected splats in the tile rows ``rows[0]..rows[1]`` of ``columns`` tiles.
+def frame_of(ids: Tensor, splats: Tensor, view: View, kernel: Kernel, params: CompositingParams) -> Frame:
+    """Return a view of projected splats.
 
     Args:
-        at_once: projected splats per block, whose intermediate tensors are float64.
+        ids: [n] i32, the splats, near to far. splats: [n, COLUMNS] f64, their projections.
     """
-    parts = []
-    for first in range(0, outlines.mx.shape[0], at_once):
-        block = outlines.at(slice(first, first + at_once))
-        parts.append(_spans(block, rows, columns, first))
-    if not parts:
-        none = torch.empty(0, dtype=torch.int32, device=outlines.mx.device)
-        return TileSpans(none, none, none, none)
-    return TileSpans(*(torch.cat(columns_) for columns_ in zip(*parts, strict=True)))
+    columns, rows = -(-view.width // TILE), -(-view.height // TILE)
+    cuts = params.alpha_cap, params.transmittance_stop, FLOORS[kernel]
+    inputs, lists = kernel_inputs(splats, kernel, view), _tile_lists(splats, kernel, rows, columns)
+    return Frame(ids, inputs, *lists, (columns, view.width, view.height), cuts, KINDS[kernel])
 
 
-def items_by_row(spans: TileSpans, rows: int) -> Tensor:
-    """Return the number of list items of every tile row, [rows] i64. Integer sums do not depend on their order."""
-    totals = torch.zeros(rows, dtype=torch.int64, device=spans.rows.device)
-    return totals.index_add_(0, spans.rows, spans.counts.long())
-
-
-def bands_of(items: list[int], limit: int) -> list[tuple[int, int]]:
-    """Return first and last + 1 tile row of every band: rows of at most ``limit`` items together, at least one row.
-
-    Args:
-        items: of each tile row.
-    """
-    bands, first, band_items = [], 0, 0
-    for row, total in enumerate(items):
-        if row > first and band_items + total > limit:
-            bands.append((first, row))
-            first, band_items = row, 0
-        band_items += total
-    return [*bands, (first, len(items))]
-
-
-def lists_of(projected: ProjectedSplats, spans: TileSpans, band: tuple[int, int], columns: int) -> TileLists:
-    """Return the lists of the tiles of the rows ``band[0]..band[1]``."""
-    tiles = (band[1] - band[0]) * columns
-    in_band = ((spans.rows >= band[0]) & (spans.rows < band[1])).nonzero()[:, 0]
-    counts = spans.counts[in_band].long()
-    span, step = expand_counts(counts)
-    first = (spans.rows[in_band] - band[0]) * columns + spans.firsts[in_band]
-    by_tile = torch.sort((first[span] + step).to(torch.int32), stable=True)
-    items = spans.places[in_band][span[by_tile.indices]]
-    edges = torch.arange(tiles + 1, dtype=torch.int32, device=items.device)
-    starts = torch.searchsorted(by_tile.values, edges)
-    return TileLists(band[0], columns, starts, items, projected.ids, (projected.places, projected.inks))
-
-
-def tile_rows_of(outlines: Outlines, rows: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Return first and last of the rows ``rows[0]..rows[1]`` that splats can touch, [n] f64; first > last if none."""
-    top, bottom = _tiles_between(outlines.my - outlines.extent_y, outlines.my + outlines.extent_y)
-    if outlines.circle.numel():
-        near_top, near_bottom = _tiles_between(
-            outlines.circle_y - outlines.circle, outlines.circle_y + outlines.circle
-        )
+def _tile_lists(splats: Tensor, kernel: Kernel, rows: int, columns: int) -> tuple[Tensor, Tensor]:
+    """Return starts [tiles + 1] i64 and items [m] i32 of the lists of all tiles."""
+    # Copies, of any number of splats: kernels are compiled for aligned tensors.
+    outline = [splats[:, column].clone() for column in _OUTLINE]
+    has_circles = kernel is Kernel.GAUSSIAN_2D
+    circle = [splats[:, column].clone() if has_circles else splats.new_empty(0) for column in _CIRCLE]
+    middle, reach = splats[:, projected.MY], splats[:, projected.EXTENT_Y]
+    top, bottom = _tiles_between(middle - reach, middle + reach)
+    if has_circles:
+        near_top, near_bottom = _tiles_between(circle[1] - circle[2], circle[1] + circle[2])
         top, bottom = torch.minimum(top, near_top), torch.maximum(bottom, near_bottom)
-    return top.clamp(min=rows[0]), bottom.clamp(max=rows[1] - 1.0)
+    top = top.clamp(min=0.0)
+    splat, step = expand_counts((bottom.clamp(max=rows - 1.0) - top + 1.0).clamp(min=0.0).long())
+    count = splat.shape[0]
+    span_rows, firsts, counts = (torch.empty(count, dtype=torch.int32, device=splat.device) for _ in range(3))
+    launch(
+        _cut, -(-count // SPANS), *outline, *circle, top, splat, step, span_rows, firsts, counts, columns, count,
+        CIRCLES=has_circles, SPANS=SPANS,
+    )  # fmt: skip
+    span, step = expand_counts(counts.long())
+    by_tile = torch.sort(((span_rows * columns + firsts)[span] + step).to(torch.int32), stable=True)
+    edges = torch.arange(rows * columns + 1, dtype=torch.int32, device=splat.device)
+    return torch.searchsorted(by_tile.values, edges), splat[span[by_tile.indices]].to(torch.int32)
 
 
 def expand_counts(counts: Tensor) -> tuple[Tensor, Tensor]:
@@ -120,19 +82,6 @@ def expand_counts(counts: Tensor) -> tuple[Tensor, Tensor]:
     total = int(ends[-1]) if ends.numel() else 0
     rows = torch.repeat_interleave(counts, output_size=total)
     return rows, torch.arange(total, device=counts.device) - (ends - counts)[rows]
-
-
-def _spans(outlines: Outlines, rows: tuple[int, int], columns: int, base: int) -> TileSpans:
-    top, bottom = tile_rows_of(outlines, rows)
-    splat, step = expand_counts((bottom - top + 1.0).clamp(min=0.0).long())
-    count = splat.shape[0]
-    outputs = [torch.empty(count, dtype=torch.int32, device=splat.device) for _ in range(3)]
-    launch(
-        _cut, -(-count // SPANS), *outlines, top, splat, step, *outputs, columns, count,
-        CIRCLES=outlines.circle.numel() > 0, SPANS=SPANS,
-    )  # fmt: skip
-    nonempty = outputs[2].nonzero()[:, 0]
-    return TileSpans((splat[nonempty] + base).to(torch.int32), *(column[nonempty] for column in outputs))
 
 
 def _tiles_between(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
@@ -200,90 +149,3 @@ def _last_tile(high):
 def _edge(dy, side, slope, sqrt_a, c, cutoff):
     """Return x of the outline's left (-1) or right (+1) edge at dy, relative to its centre."""
     return slope * dy + side * tl.sqrt(tl.maximum(cutoff - c * dy * dy, 0.0)) / sqrt_a
-
-
-BLOCK = 1 << 24  # items of tile lists at a time: some 1.5 GB while they are built
-UNIT = 16  # adjacent tiles of a row that are summed together; launches begin and end at units
-
-
-class Frame:
-    """One view on the device: its projected splats, its tiles, and their division into blocks.
-
-    Results are bitwise identical for any division.
-
-    Args:
-        block: items of tile lists in memory at a time; the other sizes follow from it. A tile row or a unit of tiles
-            may need more.
-    """
-
-    def __init__(
-        self, scene: DeviceScene, view: View, kernel: Kernel, params: CompositingParams, block: int = BLOCK
-    ) -> None:
-        self.device = scene.means.device
-        self.width, self.height = view.width, view.height
-        self.columns, self.rows = -(-view.width // TILE), -(-view.height // TILE)
-        self.size = self.columns, self.width, self.height
-        self.cuts = params.alpha_cap, params.transmittance_stop, FLOORS[kernel]
-        self.kind = KINDS[kernel]
-        self.tiles_at_once = max(UNIT, block >> 12)  # programs per launch, each with its own scratch
-        self.floats_at_once = 4 * block  # of a launch's table of sums
-        self.sums_at_once = max(1, block >> 2)  # nonzero sums of a table that are expanded to rows of splats
-        self._lists: TileLists | None = None
-        self._projected = project(scene, view, kernel, params.antialiased, max(1, block >> 4))
-        self._spans = spans_of(self._projected.outlines, (0, self.rows), self.columns, max(1, block >> 5))
-        self.bands = bands_of(items_by_row(self._spans, self.rows).tolist(), block)
-
-    def lists_of(self, band: tuple[int, int]) -> TileLists:
-        """Return the tile lists of a band; those of a view with a single band are cached.
-
-        Callers hold them in a function that returns before the next band, so that one band's lists are in memory.
-        """
-        if len(self.bands) > 1:
-            return lists_of(self._projected, self._spans, band, self.columns)
-        if self._lists is None:
-            self._lists = lists_of(self._projected, self._spans, band, self.columns)
-        return self._lists
-
-    def scratch(self, tiles: int, parts: int = PARTS) -> Tensor:
-        """Allocate the scratch of ``tiles`` programs."""
-        return torch.empty(tiles * parts * PART, dtype=torch.float32, device=self.device)
-
-    def tile_runs(self, lists: TileLists) -> list[tuple[int, int]]:
-        """Return runs ``(first, last + 1)`` of a band's tiles, whole units, for one launch each."""
-        runs, first = [], 0
-        ends = self.unit_ends(0, lists.tiles)
-        for unit, end in zip([0, *ends], ends, strict=False):
-            if unit > first and end - first > self.tiles_at_once:
-                runs.append((first, unit))
-                first = unit
-        return [*runs, (first, lists.tiles)]
-
-    def table_runs(self, tiles: tuple[int, int], sizes: Tensor) -> list[tuple[int, int, int]]:
-        """Return runs ``(first, last + 1, floats)`` of whole units whose tables fit together in a block.
-
-        Args:
-            tiles: first and last + 1, whole units. sizes: [tiles] i64, floats of a tile's table.
-        """
-        ends = self.unit_ends(*tiles)
-        firsts = [tiles[0], *ends[:-1]]
-        totals = torch.cumsum(sizes, 0)[torch.tensor(ends, device=sizes.device) - tiles[0] - 1].tolist()
-        runs, run_start, before, last = [], tiles[0], 0, 0
-        for unit, total in zip(firsts, totals, strict=True):
-            if unit > run_start and total - before > self.floats_at_once:
-                runs.append((run_start, unit, last - before))
-                run_start, before = unit, last
-            last = total
-        return [*runs, (run_start, tiles[1], last - before)]
-
-    def unit_of(self, tiles: Tensor) -> Tensor:
-        """Return the unit [n] i32 of each tile [n] of the view, ascending if the tiles are."""
-        return (tiles // self.columns * -(-self.columns // UNIT) + tiles % self.columns // UNIT).to(torch.int32)
-
-    def unit_ends(self, first: int, last: int) -> list[int]:
-        """Return the ends of the units of the tiles ``first..last`` of a band."""
-        begins = [
-            row + column
-            for row in range(first // self.columns * self.columns, last, self.columns)
-            for column in range(0, self.columns, UNIT)
-        ]
-        return [begin for begin in begins if first < begin < last] + [last]
