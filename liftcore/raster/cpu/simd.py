@@ -418,8 +418,6 @@ class DiscSegment(NamedTuple):
     d_step_rest: np.float32
 
 
-_EXP2_DEGREE = 6  # 2^-f on [0, 1) as a polynomial with p(0) = 1, relative error below 6e-9 (Chebyshev nodes)
-_LOG2_DEGREE = 9  # log2(1 + f) / f on [sqrt(1/2) - 1, sqrt(2) - 1], relative error below 5e-9
 _LOG2_E = 1.0 / math.log(2.0)
 _ROOT_HALF_BITS = int(np.float32(math.sqrt(0.5)).view(np.int32))
 _MANTISSA_BITS = 23
@@ -427,41 +425,25 @@ _LANE_NUMBERS = ir.Constant(FLOATS, [float(lane) for lane in range(LANES)])
 _LARGEST_ALPHA_EXPONENT = LARGEST_EXPONENT + 6.0  # without an alpha floor: float32 has 2^-126
 _SMALLEST_REST = 2.0**-100  # lower bound of 1 - sigma before its logarithm
 
-
-def _nodes(low: float, high: float) -> np.ndarray:
-    """Return 64 Chebyshev nodes of an interval."""
-    return low + (high - low) * (0.5 - 0.5 * np.cos(np.pi * (np.arange(64) + 0.5) / 64))
-
-
-def _fit_polynomial(nodes: np.ndarray, target: np.ndarray, degree: int, scale: np.ndarray) -> list[float]:
-    """Return coefficients of ``sum_k c_k f^k ~ target``, errors weighted by ``scale``."""
-    powers = nodes[:, None] ** np.arange(degree + 1)
-    return np.linalg.lstsq(powers * scale[:, None], target * scale, rcond=None)[0].tolist()
-
-
-def _exp2_coefficients() -> list[float]:
-    nodes = _nodes(0.0, 1.0)
-    return [1.0, *_fit_polynomial(nodes, (np.exp2(-nodes) - 1.0) / nodes, _EXP2_DEGREE - 1, nodes * np.exp2(nodes))]
-
-
-def _log2_coefficients() -> list[float]:
-    nodes = _nodes(math.sqrt(0.5) - 1.0, math.sqrt(2.0) - 1.0)
-    target = np.log2(1.0 + nodes) / nodes
-    return _fit_polynomial(nodes, target, _LOG2_DEGREE, 1.0 / target)
-
-
-_POLYNOMIALS = np.array([*_exp2_coefficients(), *_log2_coefficients()], np.float32)
+# Least squares over 64 Chebyshev nodes, errors relative, rounded to float32.
+_EXP2 = (  # 2^-f on [0, 1), with p(0) = 1; the error is below 6e-9
+    1.0, -0.69314706, 0.2402243, -0.05549051, 0.0095787225, -0.0012743612, 0.000108899236,
+)  # fmt: skip
+_LOG2 = (  # log2(1 + f) / f on [sqrt(1/2) - 1, sqrt(2) - 1]; the error is below 5e-9
+    1.442695, -0.72134733, 0.48089856, -0.36069652, 0.28855106, -0.23960708, 0.20488332, -0.19142178, 0.1846195,
+    -0.10725165,
+)  # fmt: skip
 # Then a row a coefficient.
 _CUT_ROW, _LARGEST_ROW, _ALPHA_EXPONENT_ROW, _FLOOR_ROW, _CAP_ROW, _STOP_ROW, _EXP2_ROW = range(7)
-_LOG2_ROW = _EXP2_ROW + _EXP2_DEGREE + 1
-STATE = TABLE + (_LOG2_ROW + _LOG2_DEGREE + 1) * LANES  # length of a tile's array
+_LOG2_ROW = _EXP2_ROW + len(_EXP2)
+STATE = TABLE + (_LOG2_ROW + len(_LOG2)) * LANES  # length of a tile's array
 
 
 def new_state(floor: float, alpha_cap: float, transmittance_stop: float) -> np.ndarray:
     """Return a tile's state [STATE] f32: all rays terminated, the constants of compositing set."""
     state = np.zeros(STATE, np.float32)
     cut = -math.log2(floor) if floor > 0 else _LARGEST_ALPHA_EXPONENT
-    rows = [cut, LARGEST_EXPONENT, _LARGEST_ALPHA_EXPONENT, floor, alpha_cap, transmittance_stop, *_POLYNOMIALS]
+    rows = [cut, LARGEST_EXPONENT, _LARGEST_ALPHA_EXPONENT, floor, alpha_cap, transmittance_stop, *_EXP2, *_LOG2]
     state[TABLE:] = np.repeat(np.array(rows, np.float32), LANES)
     return state
 
@@ -504,8 +486,8 @@ def _log2(builder: Builder, state: ir.Value, value: ir.Value) -> ir.Value:
     integer = builder.ashr(builder.sub(bits, _integers(_ROOT_HALF_BITS)), _integers(_MANTISSA_BITS))
     mantissa = builder.sub(bits, builder.shl(integer, _integers(_MANTISSA_BITS)))
     f = builder.fsub(builder.bitcast(mantissa, FLOATS), _row(builder, state, _EXP2_ROW))  # its first coefficient is 1
-    total = _row(builder, state, _LOG2_ROW + _LOG2_DEGREE)
-    for k in reversed(range(_LOG2_DEGREE)):
+    total = _row(builder, state, _LOG2_ROW + len(_LOG2) - 1)
+    for k in reversed(range(len(_LOG2) - 1)):
         total = _fused(builder, total, f, _row(builder, state, _LOG2_ROW + k))
     return _fused(builder, total, f, builder.sitofp(integer, FLOATS))
 
