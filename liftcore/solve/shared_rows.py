@@ -26,7 +26,7 @@ from liftcore.raster.cpu.simd import (
     sum_of_lanes,
     zeros_of,
 )
-from liftcore.runtime.jit import kernel
+from liftcore.runtime.jit import inlined, kernel
 
 GROUP = 4  # rows; the code below is unrolled over them
 LONG = 256  # terms of a sum that float32 adds one by one
@@ -111,6 +111,70 @@ def unite_rows(rows, first, last, piece, length, indptr, region, weight, scales,
         count += 1
 
 
+# The same channels of the rows of a group are a tuple of vectors of lanes, each row ``stride`` after the one before.
+
+
+@inlined
+def rows_at(values, at, stride):
+    """Load the lanes from ``values[at]`` on of each row."""
+    return (
+        lanes_at(values, at),
+        lanes_at(values, at + stride),
+        lanes_at(values, at + 2 * stride),
+        lanes_at(values, at + 3 * stride),
+    )
+
+
+@inlined
+def store_rows(values, at, stride, rows):
+    """Store the lanes of each row from ``values[at]`` on."""
+    store_lanes(values, at, rows[0])
+    store_lanes(values, at + stride, rows[1])
+    store_lanes(values, at + 2 * stride, rows[2])
+    store_lanes(values, at + 3 * stride, rows[3])
+
+
+@inlined
+def plus_rows(a, b):
+    """Add the lanes of each row."""
+    return plus(a[0], b[0]), plus(a[1], b[1]), plus(a[2], b[2]), plus(a[3], b[3])
+
+
+@inlined
+def plus_products(a, vector, b):
+    """Return ``a + vector b`` of each row."""
+    return (
+        plus_product(a[0], vector, b[0]),
+        plus_product(a[1], vector, b[1]),
+        plus_product(a[2], vector, b[2]),
+        plus_product(a[3], vector, b[3]),
+    )
+
+
+@inlined
+def first_lanes_of(rows, count):
+    """Return the first lanes of each row, zero beyond."""
+    return (
+        first_lanes(rows[0], count),
+        first_lanes(rows[1], count),
+        first_lanes(rows[2], count),
+        first_lanes(rows[3], count),
+    )
+
+
+@inlined
+def sum_vectors(first, last, regions, shares, table, width, c):
+    """Sum the lanes from channel c on of some regions of a group, each times the share of a row."""
+    p = q = s = t = no_lanes()
+    for n in range(first, last):
+        vector = lanes_at(table, np.int64(regions[n]) * width + c)
+        p = plus_times(p, shares[GROUP * n], vector)
+        q = plus_times(q, shares[GROUP * n + 1], vector)
+        s = plus_times(s, shares[GROUP * n + 2], vector)
+        t = plus_times(t, shares[GROUP * n + 3], vector)
+    return p, q, s, t
+
+
 @kernel
 def sum_rows(rows, indptr, region, weight, inverse, table, width, sums):
     """Compute ``sum_k W_jk inverse_j table[region_k]`` of some rows.
@@ -134,17 +198,7 @@ def sum_rows(rows, indptr, region, weight, inverse, table, width, sums):
             arrays = indptr, region, weight, scales
             count = unite_rows(rows, first, last, piece, LONG, *arrays, regions, shares, entries)
             for c in range(0, width, LANES):
-                a = b = d = e = no_lanes()
-                for n in range(count):
-                    vector = lanes_at(table, np.int64(regions[n]) * width + c)
-                    a = plus_times(a, shares[GROUP * n], vector)
-                    b = plus_times(b, shares[GROUP * n + 1], vector)
-                    d = plus_times(d, shares[GROUP * n + 2], vector)
-                    e = plus_times(e, shares[GROUP * n + 3], vector)
-                store_lanes(group_sums, c, a)
-                store_lanes(group_sums, stride + c, b)
-                store_lanes(group_sums, 2 * stride + c, d)
-                store_lanes(group_sums, 3 * stride + c, e)
+                store_rows(group_sums, c, stride, sum_vectors(0, count, regions, shares, table, width, c))
             if pieces > 1:
                 for j in range(last - first):
                     for c in range(width):
@@ -177,9 +231,8 @@ def compare_rows(rows, indptr, region, weight, view, table, width, products, squ
     # Sums of each view, of all views, of all but a heavy one, and zeros, each of the rows of a group.
     sums, other_views = np.zeros((view_limit + 3) * size, np.float32), np.empty(size, np.float32)
     total_at, others_at, zeros_at = view_limit * size, (view_limit + 1) * size, (view_limit + 2) * size
-    minuends, subtrahends = np.empty(GROUP, np.int64), np.empty(GROUP, np.int64)
     view_shares, scales = np.empty(view_limit * GROUP), np.zeros(GROUP)
-    heavy, square = np.empty(GROUP, np.int64), np.empty(GROUP, np.float32)
+    heavy, square, product = np.empty(GROUP, np.int64), np.empty(GROUP, np.float32), np.empty(GROUP, np.float32)
     first = 0
     while first < rows.size:
         last = group_end(rows, first, indptr)
@@ -207,32 +260,16 @@ def compare_rows(rows, indptr, region, weight, view, table, width, products, squ
                         view_shares[GROUP * number + j] += shares[GROUP * end + j]
                     end += 1
                 for c in range(0, width, LANES):
-                    p = q = s = t = no_lanes()
-                    for n in range(begin, end):
-                        vector = lanes_at(table, np.int64(regions[n]) * width + c)
-                        p = plus_times(p, shares[GROUP * n], vector)
-                        q = plus_times(q, shares[GROUP * n + 1], vector)
-                        s = plus_times(s, shares[GROUP * n + 2], vector)
-                        t = plus_times(t, shares[GROUP * n + 3], vector)
+                    view_sums = sum_vectors(begin, end, regions, shares, table, width, c)
                     if c + LANES > width:  # the next row of the table
-                        p, q = first_lanes(p, width - c), first_lanes(q, width - c)
-                        s, t = first_lanes(s, width - c), first_lanes(t, width - c)
+                        view_sums = first_lanes_of(view_sums, width - c)
                     at = number * size + c
                     if not new:
-                        p, q = plus(p, lanes_at(sums, at)), plus(q, lanes_at(sums, at + stride))
-                        s, t = plus(s, lanes_at(sums, at + 2 * stride)), plus(t, lanes_at(sums, at + 3 * stride))
-                    store_lanes(sums, at, p)
-                    store_lanes(sums, at + stride, q)
-                    store_lanes(sums, at + 2 * stride, s)
-                    store_lanes(sums, at + 3 * stride, t)
+                        view_sums = plus_rows(view_sums, rows_at(sums, at, stride))
+                    store_rows(sums, at, stride, view_sums)
                     if pieces == 1:  # the sums are complete, and in registers
-                        store_lanes(sums, total_at + c, plus(lanes_at(sums, total_at + c), p))
-                        at = total_at + stride + c
-                        store_lanes(sums, at, plus(lanes_at(sums, at), q))
-                        at += stride
-                        store_lanes(sums, at, plus(lanes_at(sums, at), s))
-                        at += stride
-                        store_lanes(sums, at, plus(lanes_at(sums, at), t))
+                        at = total_at + c
+                        store_rows(sums, at, stride, plus_rows(rows_at(sums, at, stride), view_sums))
                 begin = end
         for c in range(0, size if pieces > 1 else 0, LANES):
             p = no_lanes()
@@ -256,48 +293,27 @@ def compare_rows(rows, indptr, region, weight, view, table, width, products, squ
             if pieces > 1:
                 count = unite_rows(rows, first, last, piece, MOST_COMPARED, *arrays)
             for n in range(count):
-                p = q = s = t = no_lanes()
                 if view[regions[n]] != v:
                     v, number = view[regions[n]], number + 1
                     for j in range(GROUP):
                         is_heavy = heavy[j] == number
-                        minuends[j] = (others_at if is_heavy else total_at) + j * stride
-                        subtrahends[j] = (zeros_at if is_heavy else number * size) + j * stride
-                    b = d = e = f = no_lanes()
-                    for c in range(0, width, LANES):
-                        vector = lanes_at(table, np.int64(regions[n]) * width + c)
-                        others = minus(lanes_at(sums, minuends[0] + c), lanes_at(sums, subtrahends[0] + c))
-                        p, b = plus_product(p, vector, others), plus_product(b, others, others)
-                        store_lanes(other_views, c, others)
-                        others = minus(lanes_at(sums, minuends[1] + c), lanes_at(sums, subtrahends[1] + c))
-                        q, d = plus_product(q, vector, others), plus_product(d, others, others)
-                        store_lanes(other_views, stride + c, others)
-                        others = minus(lanes_at(sums, minuends[2] + c), lanes_at(sums, subtrahends[2] + c))
-                        s, e = plus_product(s, vector, others), plus_product(e, others, others)
-                        store_lanes(other_views, 2 * stride + c, others)
-                        others = minus(lanes_at(sums, minuends[3] + c), lanes_at(sums, subtrahends[3] + c))
-                        t, f = plus_product(t, vector, others), plus_product(f, others, others)
-                        store_lanes(other_views, 3 * stride + c, others)
-                    square[0], square[1] = sum_of_lanes(b), sum_of_lanes(d)
-                    square[2], square[3] = sum_of_lanes(e), sum_of_lanes(f)
-                else:
-                    for c in range(0, width, LANES):
-                        vector = lanes_at(table, np.int64(regions[n]) * width + c)
-                        p = plus_product(p, vector, lanes_at(other_views, c))
-                        q = plus_product(q, vector, lanes_at(other_views, stride + c))
-                        s = plus_product(s, vector, lanes_at(other_views, 2 * stride + c))
-                        t = plus_product(t, vector, lanes_at(other_views, 3 * stride + c))
-                at = GROUP * n
-                if entries[at] >= 0:
-                    products[entries[at]] += sum_of_lanes(p)
-                    squares[entries[at]] += square[0]
-                if entries[at + 1] >= 0:
-                    products[entries[at + 1]] += sum_of_lanes(q)
-                    squares[entries[at + 1]] += square[1]
-                if entries[at + 2] >= 0:
-                    products[entries[at + 2]] += sum_of_lanes(s)
-                    squares[entries[at + 2]] += square[2]
-                if entries[at + 3] >= 0:
-                    products[entries[at + 3]] += sum_of_lanes(t)
-                    squares[entries[at + 3]] += square[3]
+                        minuend = (others_at if is_heavy else total_at) + j * stride
+                        subtrahend = (zeros_at if is_heavy else number * size) + j * stride
+                        p = no_lanes()
+                        for c in range(0, width, LANES):
+                            others = minus(lanes_at(sums, minuend + c), lanes_at(sums, subtrahend + c))
+                            p = plus_product(p, others, others)
+                            store_lanes(other_views, j * stride + c, others)
+                        square[j] = sum_of_lanes(p)
+                dots = no_lanes(), no_lanes(), no_lanes(), no_lanes()
+                for c in range(0, width, LANES):
+                    vector = lanes_at(table, np.int64(regions[n]) * width + c)
+                    dots = plus_products(dots, vector, rows_at(other_views, c, stride))
+                product[0], product[1] = sum_of_lanes(dots[0]), sum_of_lanes(dots[1])
+                product[2], product[3] = sum_of_lanes(dots[2]), sum_of_lanes(dots[3])
+                for j in range(GROUP):
+                    entry = entries[GROUP * n + j]
+                    if entry >= 0:
+                        products[entry] += product[j]
+                        squares[entry] += square[j]
         first = last
