@@ -36,7 +36,6 @@ from liftcore.scene.splats import Splats
 from liftcore.solve.codebook import LEAST_CHANNELS, TABLE_BYTES
 from liftcore.solve.diagnostics import shape_warnings
 from liftcore.solve.objects import MOST_REGIONS
-from liftcore.solve.rays import sample_pixels
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.pack import Views
 from liftcore.values.region_weights import MEMORY_LIMIT
@@ -45,7 +44,7 @@ from liftcore.values.views import DENSE_ROWS
 
 FEW_VIEWS = 32  # and fewer are all lifted, whatever view_cosine: estimating the noise would cost what it saves
 TIMED_VIEWS = 32  # and more have one of them timed, which costs little of the lift then
-TRACED_RAYS = 1_000  # of a view of a dense map, to count the splats on a ray
+RAY_SPLATS = 40  # on a ray
 MIB, GIB = 2**20, 2**30
 LIBRARIES = 450_000_000  # of torch, numba, numpy and the compiled kernels, before anything is read
 SCENE_BYTES = 230  # of a splat: in the raster, its order and counts in a view, sums of the solution
@@ -172,7 +171,7 @@ def plan_lift(
     features = views.features
     names = views.names
     cameras = [views.cameras[name] for name in names]
-    visible = visibility(splats, cameras, settings.compositing, device, threads)
+    visible = visibility(splats, cameras, settings.compositing, threads)
     short = [] if in_workers else check_device_memory(device, splats.count, settings.device)
     device = CPU if short else device
     raster, seconds, contradicting = None, None, list[str]()
@@ -184,11 +183,7 @@ def plan_lift(
         contradicting = contradictions(raster, views.only(names), settings, visible.seen_share)
     if probe and raster is not None and device.kind == "cpu":
         seconds = _seconds(raster, views, names, settings)
-    dense = [name for name in names if _is_dense(features, name)]
-    if dense and raster is None:
-        raster = open_raster(splats, device, threads)
-    hit_share = _hit_share(raster, views.only(dense), settings, visible) if dense and raster is not None else 1.0
-    entries = _entries(visible, cameras, features, names, settings, hit_share)
+    entries = _entries(visible, cameras, features, names, settings)
     weights = weight_bytes(visible, entries, settings)
     phases = memory_phases(splats, visible, cameras, features, names, settings, entries)
     free = None if in_workers else free_memory()
@@ -271,67 +266,21 @@ def _splat_counts(visible: Visibility) -> np.ndarray:
 
 
 def _entries(
-    visible: Visibility,
-    cameras: Sequence[Camera],
-    features: Views,
-    names: Sequence[str],
-    settings: LiftSettings,
-    hit_share: float,
+    visible: Visibility, cameras: Sequence[Camera], features: Views, names: Sequence[str], settings: LiftSettings
 ) -> np.ndarray:
-    """Estimate the entries of W of each view, [V] f64: the cells under the outline of each splat.
+    """Estimate the entries of W of each view, [V] f64.
 
-    Regions count as square cells of the same number; long thin ones have more entries. Of cells that are smaller than
-    a tile, rays reach few: one region or four cells a splat, tile and level are counted. In a dense map, the share of
-    pixels where rays reach the splat counts.
-
-    Args:
-        hit_share: of `_hit_share`.
+    A splat has one region or four cells a tile and level; a ray of a dense map has RAY_SPLATS splats.
     """
-    parts = max(_parts_a_tile(features, name, settings) for name in names)
-    limits = _splat_counts(visible) * parts * _tiles(visible)
-    entries = np.zeros(len(cameras))
+    counts = _splat_counts(visible) * _tiles(visible)
     for number, (name, camera) in enumerate(zip(names, cameras, strict=True)):
-        sides = np.sqrt(visible.areas[number][visible.in_view[number]], dtype=np.float64)
-        across, down = (
-            sides * min(cells, reads * -(-pixels // settings.stride)) / pixels + reads
-            for cells, pixels in zip(_cells(features, name, camera), (camera.width, camera.height), strict=True)
-            for reads in (1 if cells == pixels or features.is_regions(name) else 2,)  # of a pixel, in a line
-        )
-        levels = 1 if isinstance(settings.levels, int) else _levels(features, name)
-        cells_under = levels * float(across @ down) / visible.areas.shape[1] * visible.splats
-        is_dense = _is_dense(features, name)
-        entries[number] = hit_share * cells_under if is_dense else min(cells_under, limits[number])
-    return entries
+        if _is_dense(features, name):
+            counts[number] = RAY_SPLATS * camera.width * camera.height / settings.stride**2
+    return counts * [_parts_a_tile(features, name, settings) for name in names]
 
 
 def _is_dense(features: Views, view: str) -> bool:
     return math.prod(_codebook(features, view)[:-1]) > DENSE_ROWS
-
-
-def _cells(features: Views, view: str, camera: Camera) -> tuple[float, float]:
-    """Return columns and rows of a grid; for regions, those of as many square cells a level."""
-    if not features.is_regions(view):
-        rows, columns, _ = _codebook(features, view)
-        return columns, rows
-    side = math.sqrt(_codebook(features, view)[0] / _levels(features, view))
-    return side * math.sqrt(camera.width / camera.height), side * math.sqrt(camera.height / camera.width)
-
-
-def _hit_share(raster: Raster, views: LiftViews, settings: LiftSettings, visible: Visibility) -> float:
-    """Estimate the share of the outlines' area that rays reach before they are absorbed, by some rays of a few views.
-
-    Args:
-        views: of dense maps. visible: of all views that are lifted; their mean area stands for that of each.
-    """
-    counts = list[float]()
-    for number in sorted({0, len(views) // 2, len(views) - 1}):
-        camera = views.cameras[views.names[number]]
-        places = sample_pixels(camera, TRACED_RAYS, (settings.seed, number), settings.compositing)
-        lengths = raster.ray_rows(camera, places, settings.compositing).indptr.diff().numpy()
-        limit = settings.top_k or lengths.max(initial=0)
-        counts.append(float(lengths.clip(max=limit).mean()) * camera.width * camera.height)
-    area = float(visible.areas.sum(dtype=np.float64)) / len(visible.areas) / visible.areas.shape[1] * visible.splats
-    return min(1.0, float(np.mean(counts)) / max(area, 1.0))
 
 
 def memory_phases(

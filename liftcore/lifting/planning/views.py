@@ -46,7 +46,7 @@ from torch import Tensor
 from liftcore.lifting.geometry import weigh_views
 from liftcore.raster import open_raster
 from liftcore.raster.base import Raster
-from liftcore.runtime.device import CPU, Device
+from liftcore.runtime.device import CPU
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import silent
 from liftcore.scene.cameras import Camera
@@ -99,12 +99,11 @@ def visibility(
     splats: Splats,
     cameras: Sequence[Camera],
     params: CompositingParams,
-    device: Device = CPU,
     threads: int | None = None,
 ) -> Visibility:
     """Project evenly spaced splats, SAMPLE at most, into every camera."""
     sample = spaced_splats(splats, min(SAMPLE, splats.count))
-    raster = open_raster(sample, device, threads)
+    raster = open_raster(sample, CPU, threads)
     areas = np.zeros((len(cameras), sample.count), np.float32)
     for row, camera in zip(areas, cameras, strict=True):
         row[:] = raster.footprints(camera, params).numpy()
