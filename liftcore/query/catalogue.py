@@ -14,7 +14,6 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable, Sequence
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,6 @@ from liftcore.query.objects import object_box, size_of
 from liftcore.query.question import SceneNode, SceneTree
 from liftcore.query.scene import Scene, as_numpy
 from liftcore.query.scores import cosines, norms_of
-from liftcore.scene.origin import MAP_REACH
 from liftcore.text import check_texts
 
 MOST_WORDS = 65_536  # of a vocabulary: their vectors take 130 MB at 512 channels
@@ -50,18 +48,13 @@ def tree(scene: Scene, words: Sequence[str] = (), vectors: Any = None) -> SceneT
     assert scene.node_views is not None and scene.node_confidence is not None and scene.node_features is not None
     of_parts = scene.node_features[len(scene.object_views) :].astype(np.float32)
     naming = _names(np.concatenate([scene.object_means, of_parts]), words, vectors)
-    order = np.argsort(scene.node, kind="stable")
-    ends = np.searchsorted(scene.node[order], np.arange(len(parents) + 1))
-    rows_of = [order[first:last] for first, last in pairwise(ends.tolist())]
-    for node in sorted(range(len(parents)), key=lambda node: -len(scene.node_path(node))):  # parts before wholes
-        if parents[node] >= 0:
-            rows_of[parents[node]] = np.concatenate([rows_of[parents[node]], rows_of[node]])
+    rows_of = [np.flatnonzero(scene.members(node)) for node in range(len(parents))]
     total_weight, view_names = scene.total_weight.astype(np.float64), scene.metadata.views
     total, nodes = total_weight.sum() or 1.0, list[SceneNode]()
-    for node, ((name, score), unsorted_rows) in enumerate(zip(naming, rows_of, strict=True)):
-        if not unsorted_rows.size:
+    for node, ((name, score), rows) in enumerate(zip(naming, rows_of, strict=True)):
+        if not rows.size:
             continue
-        rows, key = np.sort(unsorted_rows), (node, unsorted_rows.size)
+        key = node, rows.size
         if key not in scene.node_boxes:
             scene.node_boxes[key] = object_box(scene.splats, rows, scene.weights_of(rows))
         box = scene.node_boxes[key]
@@ -126,8 +119,7 @@ def table_csv(source: SceneTree) -> bytes:
     for obj in source.objects:
         low, high = obj.box
         label = "" if obj.name is None else obj.name, "" if obj.score is None else f"{obj.score:.6g}"
-        digits = 9 if max(map(abs, (*low, *high))) < MAP_REACH else 15  # as many as the boxes' numbers have
-        numbers = (f"{value:.{digits}g}" for value in (obj.share, *obj.centre, *low, *high))
+        numbers = (f"{value:.12g}" for value in (obj.share, *obj.centre, *low, *high))
         size = (f"{side:.6g}" for side in obj.size)
         writer.writerow([obj.id, *label, obj.splats, *numbers, " ".join(obj.views), *size, source.world.unit])
     return content.getvalue().encode()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
@@ -40,27 +41,21 @@ def masks_json(scene: Scene, labels: Labels, views: Sequence[str] | None = None)
         | {name: labels.document[name] for name in ("world", "unit")},
         "categories": [{"id": number, "name": name} for number, name in sorted(kinds.items())],
     }
-    return _blocks(scene, labels, instances, head, scene.metadata.views if views is None else views)
+    view_names = scene.metadata.views if views is None else views
 
+    def blocks() -> Iterator[bytes]:
+        images, numbers = [], itertools.count(1)
+        yield json.dumps(head, ensure_ascii=False)[:-1].encode() + b', "annotations": ['
+        for place, view in enumerate(view_names, 1):
+            number_map = value_map(scene, labels.columns["instance_id"], view)
+            height, width = number_map.shape
+            images.append({"id": place, "file_name": view, "width": width, "height": height})
+            for annotation in _annotations(number_map, instances):
+                entry = {"id": next(numbers), "image_id": place} | annotation
+                yield (", " if entry["id"] > 1 else "").encode() + json.dumps(entry).encode()
+        yield b'], "images": ' + json.dumps(images, ensure_ascii=False).encode() + b"}\n"
 
-def _blocks(
-    scene: Scene,
-    labels: Labels,
-    instances: dict[int, dict[str, Any]],
-    head: dict[str, Any],
-    views: Sequence[str],
-) -> Iterator[bytes]:
-    images, count = [], 0
-    yield json.dumps(head, ensure_ascii=False)[:-1].encode() + b', "annotations": ['
-    for place, view in enumerate(views, 1):
-        number_map = value_map(scene, labels.columns["instance_id"], view)
-        height, width = number_map.shape
-        images.append({"id": place, "file_name": view, "width": width, "height": height})
-        for annotation in _annotations(number_map, instances):
-            count += 1
-            entry = {"id": count, "image_id": place} | annotation
-            yield (", " if count > 1 else "").encode() + json.dumps(entry).encode()
-    yield b'], "images": ' + json.dumps(images, ensure_ascii=False).encode() + b"}\n"
+    return blocks()
 
 
 def _annotations(number_map: np.ndarray, rows: dict[int, dict[str, Any]]) -> Iterator[dict[str, Any]]:

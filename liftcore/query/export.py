@@ -122,12 +122,6 @@ def _recoloured(scene: Scene, colours: np.ndarray) -> Iterable[bytes]:
     return recoloured(scene.splat_file, colours)
 
 
-def _mask_of_array(export: Export) -> Iterable[bytes]:
-    from liftcore.query.render import mask_png
-
-    return [mask_png(export.source)]
-
-
 def object_splats(scene: Scene, answer: Answer, suffix: str = ".ply") -> Iterable[bytes]:
     """Write the splats of an answer's objects as a file, in blocks; a PLY has all their properties unchanged.
 
@@ -246,7 +240,7 @@ FILES: dict[str, Files] = {  # kind of a source -> the files that are made of it
         **dict.fromkeys(("rgb", "depth", "pca", "cluster", "confidence"), _of_scene),
         "splats": lambda export: splats_as(export.scene, export.suffix or ".splat"),
     },
-    "array": {"npy": lambda export: [npy(export.source)], "mask": _mask_of_array},
+    "array": {"npy": lambda export: [npy(export.source)]},
 }
 BY_SUFFIX = {  # suffix of a name -> file of sources with several classes
     **dict.fromkeys((".glb", ".spz", ".usdc", ".usdz"), "labelled"), ".json": "masks",

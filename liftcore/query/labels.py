@@ -64,61 +64,56 @@ def _name(answer: Answer) -> str:
 
 
 def _of_words(scene: Scene, segmentation: Segmentation) -> Labels:
-    values, colours = segmentation.values, segmentation.colours.tolist()
-    instances, entries = np.zeros(len(values), np.int32), list[dict[str, Any]]()
-    for value, label in enumerate(segmentation.named_words, 1):
+    names, values = [label.word for label in segmentation.named_words], segmentation.values
+    groups = list[tuple[int, np.ndarray]]()
+    for value in range(1, len(names) + 1):
         rows = np.flatnonzero(values == value)
-        weights = scene.weights_of(rows)
-        groups = touching(scene.splats, rows)
-        sums = np.bincount(groups, weights)
-        for group in np.argsort(-sums, kind="stable")[
-            : int((sums >= LEAST_OBJECT_WEIGHT * sums.max()).sum())
-        ].tolist():
-            members = rows[groups == group]
-            instances[members] = len(entries) + 1
-            entry = {"instance_id": len(entries) + 1, "class_id": value, "name": label.word, "question": label.word}
-            entries.append(entry | {"colour": colours[value]} | _facts(scene, members, segmentation.score))
-    classes = [
-        {
-            "class_id": value,
-            "name": label.word,
-            "colour": colours[value],
-            "splats": label.splats,
-            "score": label.score,
-            "margin": label.margin,
-            "box": {"low": label.box[0], "high": label.box[1]},
-        }
-        for value, label in enumerate(segmentation.named_words, 1)
-    ]
-    return _labels(scene, values, instances, segmentation.score, classes, entries)
+        numbers = touching(scene.splats, rows)
+        sums = np.bincount(numbers, scene.weights_of(rows))
+        large = np.argsort(-sums, kind="stable")[: int((sums >= LEAST_OBJECT_WEIGHT * sums.max()).sum())]
+        groups += [(value, rows[numbers == number]) for number in large.tolist()]
+    colours = segmentation.colours[[value for value, _ in groups]]
+    return _of_groups(scene, names, values, segmentation.score, groups, colours)
 
 
 def _of_answers(scene: Scene, answers: Mapping[str, Answer]) -> Labels:
-    selections = {name: (a, objects(scene, a)) for name, a in answers.items() if a.count and not a.is_dropped}
+    selections = {name: a for name, a in answers.items() if a.count and not a.is_dropped}
     if not selections:
         first = next(iter(answers.values()))
         got = first.reason.rstrip(".") if first.is_dropped else "none above the threshold"
         raise InvalidQuery("source", expected="an answer with selected splats", got=got, hint="ask in other words")
     count = len(scene.features)
-    class_ids, best = np.zeros(count, np.int32), np.full(count, -np.inf)
-    scores, instances = np.zeros(count, np.float32), np.zeros(count, np.int32)
-    for value, (answer, _) in enumerate(selections.values(), 1):
+    class_ids, scores, best = np.zeros(count, np.int32), np.zeros(count, np.float32), np.full(count, -np.inf)
+    for value, answer in enumerate(selections.values(), 1):
         cut = answer.threshold.value
         over = (answer.scores - cut) / max(float(answer.scores.max()) - cut, 1e-9)  # as the page colours them
         better = answer.selected & ((over > best) | (class_ids == 0))
         class_ids[better], best[better], scores[better] = value, over[better], answer.scores[better]
-    colours = cluster_colours(sum(len(groups.objects) for _, groups in selections.values())).tolist()
-    entries, classes = list[dict[str, Any]](), list[dict[str, Any]]()
-    for value, (name, (answer, groups)) in enumerate(selections.items(), 1):
-        classes.append({"class_id": value, "name": name, "splats": int((class_ids == value).sum()), "question": name})
-        for number in range(len(groups.objects)):
-            rows = np.flatnonzero((groups.numbers == number) & (class_ids == value))
-            if not rows.size:
-                continue
-            instances[rows] = len(entries) + 1
-            entry = {"instance_id": len(entries) + 1, "class_id": value, "name": name, "question": name}
-            entries.append(entry | {"colour": colours[len(entries)]} | _facts(scene, rows, answer.scores))
-    return _labels(scene, class_ids, instances, scores, classes, entries)
+    numbers = [objects(scene, answer).numbers for answer in selections.values()]
+    groups = [
+        (value, rows)
+        for value, of_answer in enumerate(numbers, 1)
+        for number in range(of_answer.max() + 1)
+        if (rows := np.flatnonzero((of_answer == number) & (class_ids == value))).size
+    ]
+    return _of_groups(scene, list(selections), class_ids, scores, groups, cluster_colours(len(groups))[:-1])
+
+
+def _of_groups(
+    scene: Scene,
+    names: Sequence[str],
+    classes: np.ndarray,
+    scores: np.ndarray,
+    groups: Sequence[tuple[int, np.ndarray]],
+    colours: np.ndarray,
+) -> Labels:
+    """Return labels with an instance for each group of splats of a class, in its colour."""
+    instances, rows_of = np.zeros(len(classes), np.int32), list[dict[str, Any]]()
+    for number, ((value, rows), colour) in enumerate(zip(groups, colours.tolist(), strict=True), 1):
+        instances[rows] = number
+        entry = {"instance_id": number, "class_id": value, "name": names[value - 1], "colour": colour}
+        rows_of.append(entry | _facts(scene, rows, scores))
+    return _labels(scene, names, classes, instances, scores, rows_of)
 
 
 def _of_tree(scene: Scene, tree: SceneTree) -> Labels:
@@ -135,15 +130,12 @@ def _of_tree(scene: Scene, tree: SceneTree) -> Labels:
         entry |= {"views": list(node.views)} | _facts(scene, np.flatnonzero(scene.members(node.id)), None)
         nodes.append(_path(node) | entry | {"box": {"low": node.box[0], "high": node.box[1]}})
     values = numbers[scene.object]  # the last entry is of splats without an object
-    classes = [
-        {"class_id": value, "name": name, "splats": int((values == value).sum())} for name, value in class_of.items()
-    ]
     instances = [
         {"instance_id": node.id + 1, "class_id": int(numbers[node.id])} | entry
         for node, entry in zip(tree.nodes, nodes, strict=True)
         if node.kind == "object"
     ]
-    result = _labels(scene, values, scene.object + 1, scores[scene.object] if names else None, classes, instances)
+    result = _labels(scene, names, values, scene.object + 1, scores[scene.object] if names else None, instances)
     columns = result.columns | {"node_id": scene.node + 1}
     return Labels(columns, result.document | {"columns": list(columns), "nodes": nodes})
 
@@ -157,35 +149,37 @@ def _path(node: SceneNode) -> dict[str, Any]:
 
 def _labels(
     scene: Scene,
+    names: Sequence[str],
     classes: np.ndarray,
     instances: np.ndarray,
     scores: np.ndarray | None,
-    class_rows: Sequence[dict[str, Any]],
-    instance_rows: Sequence[dict[str, Any]],
+    instance_rows: list[dict[str, Any]],
 ) -> Labels:
-    columns: dict[str, np.ndarray] = {"class_id": classes.astype(np.int32)} if class_rows else {}
+    columns: dict[str, np.ndarray] = {"class_id": classes.astype(np.int32)} if names else {}
     columns["instance_id"] = instances.astype(np.int32)
     if scores is not None:
         columns["score"] = scores.astype(np.float32)
     if scene.confidence is not None:
         confidence = np.where((classes > 0) | (instances > 0), scene.confidence, 0)
         columns["confidence"] = confidence.astype(np.float32)
-    metadata, source = scene.metadata, f"splatlift {__version__}"
-    provenance = ", ".join(
-        filter(None, (source, metadata.encoder, metadata.text_space, f"{len(metadata.views)} views"))
-    )
-    members: dict[int, list[int]] = {}
-    for row in instance_rows:
-        members.setdefault(row["class_id"], []).append(row["instance_id"])
+    class_rows = [
+        {
+            "class_id": value,
+            "name": name,
+            "splats": int((classes == value).sum()),
+            "instances": [row["instance_id"] for row in instance_rows if row["class_id"] == value],
+        }
+        for value, name in enumerate(names, 1)
+    ]
     document = {
         "format": FORMAT,
-        "made_by": source,
+        "made_by": f"splatlift {__version__}",
         "splats": len(classes),
         "columns": list(columns),
         "world": scene.world.model_dump(mode="json"),
         "unit": scene.world.unit,
-        "classes": [row | {"instances": members.get(row["class_id"], [])} for row in class_rows],
-        "instances": [row | {"provenance": provenance} for row in instance_rows],
+        "classes": class_rows,
+        "instances": instance_rows,
     }
     return Labels(columns, document)
 

@@ -115,11 +115,9 @@ def estimate_presence(
     if presence >= 0.5:
         facts = f"at {presence:.0%} of its best splats at most {limit} of {count} other words are nearer"
         return Presence(present=True, presence=presence, reason=f"{name} is there: {facts}.")
-    order = np.argsort(nearer, kind="stable")
-    middle = int(nearer[order[np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2)]])
     near = weights @ products(rows, norms, direction[None], references.vectors[reference_rows])[1]
     nearest = references.words[reference_rows[int(near.argmax())]].replace("_", " ")
-    facts = f"its best splats are nearer to {middle} of {count} other words, first of all to {nearest!r}"
+    facts = f"its best splats are nearer to others of {count} words, first of all to {nearest!r}"
     first = float(weights[contrast == 0].sum() / weights.sum())
     if shares[0] < 0.5 and first < 0.5:
         reason = f"{name} is not there: {facts}."

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
 from PIL.PngImagePlugin import PngInfo
+from scipy.ndimage import binary_dilation
 
 from liftcore.errors import InvalidQuery
 from liftcore.query.areas import MINIMUM_ROW_SUM
@@ -237,11 +238,7 @@ def overlay(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """
     tinted = (1 - _TINT) * image + _TINT * _OUTLINE
     picture = np.where(mask[..., None], tinted, _DIM * image).astype(np.uint8)
-    padded, (height, width) = np.pad(mask, 1), mask.shape
-    near = np.zeros_like(mask)  # pixels that touch the mask, sideways or diagonally
-    for dy in range(3):
-        for dx in range(3):
-            near |= padded[dy : dy + height, dx : dx + width]
+    near = binary_dilation(mask, np.ones((3, 3)))  # pixels that touch the mask, sideways or diagonally
     picture[near & ~mask] = _OUTLINE
     return picture
 

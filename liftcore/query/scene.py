@@ -304,16 +304,12 @@ class Scene:
             example: or its notation, as in `Query.like`, or a vector [F].
             words: None: all words of the encoder, which is a table.
         """
+        from liftcore.query.question import Query
         from liftcore.query.segment import best_words
-        from liftcore.query.terms import Vector, parse_example
 
         reader = self.encoder(encoder)
         words = self.words(reader) if words is None else words
-        if isinstance(example, str):
-            example = parse_example(example, "example")
-        elif isinstance(example, Sequence):
-            example = Vector(tuple(example))
-        return best_words(self, example, words, reader.encode(words), top)
+        return best_words(self, Query(like=[example]), words, reader.encode(words), top)
 
     def words(self, encoder: AnyEncoder = None) -> list[str]:
         """Return all words of an encoder that is a table, each once; another encoder is an InvalidQuery."""
@@ -390,7 +386,7 @@ class Scene:
             what: of an answer object, coloured, scores, selection, mask, attention or overlay; of a segmentation
                 coloured, labels, picture or splat_labels; of a tree csv, of its objects; of all these labelled
                 (splats with labels), names (of the labels) or masks (COCO's JSON, in the views); of the scene a
-                channel of `render`, or splats; of an array npy, or mask of booleans [H, W]. Empty: the first of
+                channel of `render`, or splats; of an array npy. Empty: the first of
                 these; of a segmentation or a tree as a .glb or .usdz labelled (a tree as a .ply, too), .json masks.
             view: of pictures, as in `view_mask`; of masks the name of the only one.
             suffix: of its name, where there are several formats.
@@ -618,11 +614,8 @@ class Scene:
             raise NotFound("object", expected=expected, got=str(number), hint=hint)
         if self.node is None or self.node_parents is None:
             return self.object == number
-        below, above = np.zeros(nodes + 1, np.bool_), np.arange(nodes)
-        while (above >= 0).any():
-            below[:-1] |= above == number
-            above = np.where(above >= 0, self.node_parents[above], -1)
-        return below[self.node]  # the last entry is of splats without a node
+        below = [number in self.node_path(node) for node in range(nodes)]
+        return np.array([*below, False])[self.node]  # the last entry is of splats without a node
 
     def set_members(self, splat_set: SplatSet) -> np.ndarray:
         """Return the splats of an object or of a selection, [P] bool; NotFound if there is none of that name."""

@@ -30,7 +30,6 @@ from liftcore.query.question import BestWord, LabelSummary, NamedSplats, Query
 from liftcore.query.scene import Scene, as_numpy
 from liftcore.query.scores import cosines, norms_of
 from liftcore.query.selection import CompetingWords, levels_disagree, part_nodes
-from liftcore.query.terms import Example
 from liftcore.query.threshold import find_threshold
 from liftcore.runtime.one_line import one_line
 from liftcore.runtime.one_thread import one_thread
@@ -259,18 +258,18 @@ def _scores(scene: Scene, vectors: np.ndarray, rows: Sequence[int]) -> Iterator[
 
 
 def best_words(
-    scene: Scene, example: Example, words: Sequence[str], vectors: Any, count: int = 5
+    scene: Scene, example: Query, words: Sequence[str], vectors: Any, count: int = 5
 ) -> tuple[BestWord, ...]:
     """Return the words most similar to an example, the nearest first.
 
     Args:
-        scene: an opened lift. example: as in a query. words: n. vectors: [n, F], their text vectors.
+        scene: an opened lift. example: a query of one example. words: n. vectors: [n, F], their text vectors.
 
     Raises:
         InvalidQuery, NotFound, InvalidLift: as `liftcore.query.directions.directions`.
     """
     rows = np.atleast_2d(np.asarray(as_numpy(vectors), np.float32))
-    feature = directions(scene, Query.of([example]), None)
+    feature = directions(scene, example, None)
     scores = cosines(rows, norms_of(rows), feature)[:, 0]
     nearest = map(int, np.argsort(-scores, kind="stable")[:count])
     return tuple(BestWord(word=words[row], score=float(scores[row])) for row in nearest)
