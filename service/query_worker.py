@@ -39,7 +39,7 @@ from liftcore import (
 from liftcore.errors import InvalidQuery
 from liftcore.files import cameras_of_views, finite
 from liftcore.models import Edit, OwnCamera, SceneTree, SelectionSummary, Viewpoint
-from liftcore.text import OWN_WORDS
+from liftcore.text import OWN_WORDS, CachingEncoder
 from service.errors import FULL, NoSpace, fault_of
 from service.process import end_with_parent, own_stdout
 from service.settings import encoder_version
@@ -153,7 +153,7 @@ class Answers:
         with self._opening:
             entry = self._encoders.get(spec)
             if entry is None or entry[0] != version:  # the operator may have replaced the file of a table
-                entry = self._encoders[spec] = (version, open_encoder(spec, remembers=True))
+                entry = self._encoders[spec] = (version, CachingEncoder(open_encoder(spec)))
             return entry[1]
 
     def _text_encoder(self, request: Request) -> TextEncoder:

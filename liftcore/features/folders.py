@@ -129,26 +129,22 @@ def whole_numbers(stored: np.ndarray) -> np.ndarray:
 
 def files_below(folder: Path) -> list[Path]:
     """List the files of a folder and its sub-folders, sorted, without those of `is_system_file`."""
+    if not folder.is_dir():
+        raise InvalidFeatures(str(folder), expected="a folder of features or masks", got="no such folder")
     return visible_files(folder, "**/*")
 
 
 def npy_files(folder: Path, *suffixes: str) -> list[Path]:
     """List the files in a folder and its sub-folders with one of these suffixes, sorted."""
-    suffix = suffixes[0]
-    if not folder.is_dir():
-        raise InvalidFeatures(str(folder), expected=f"a folder of *{suffix} files", got="no such folder")
     files = files_below(folder)
     matches = [path for path in files if path.name.endswith(suffixes)]
     pickles = [path.name for path in files if path.suffix.lower() in PICKLED]
-    if not matches and pickles:
-        raise InvalidFeatures(
-            str(folder),
-            expected=f"*{suffix} files",
-            got=f"{len(pickles)} pickles ({pickles[0]}), which can run code when they are opened",
-            hint="save them as .npy with the program that wrote them: numpy.save(name, tensor.cpu().numpy())",
-        )
     if not matches:
-        raise InvalidFeatures(str(folder), expected=f"*{suffix} files", got=f"{len(files)} other files")
+        got, hint = f"{len(files)} other files", ""
+        if pickles:
+            got = f"{len(pickles)} pickles ({pickles[0]}), which can run code when they are opened"
+            hint = "save them as .npy with the program that wrote them: numpy.save(name, tensor.cpu().numpy())"
+        raise InvalidFeatures(str(folder), expected=f"*{suffixes[0]} files", got=got, hint=hint)
     return matches
 
 

@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
@@ -115,12 +115,8 @@ class StoredMasks(Sequence[np.ndarray]):
 
     stored: tuple[StoredMask, ...]
 
-    @overload
-    def __getitem__(self, index: int) -> np.ndarray: ...
-    @overload
-    def __getitem__(self, index: slice) -> "StoredMasks": ...
-    def __getitem__(self, index: int | slice) -> "np.ndarray | StoredMasks":
-        return StoredMasks(self.stored[index]) if isinstance(index, slice) else self.stored[index].pixels()
+    def __getitem__(self, index: Any) -> Any:
+        return self.stored[index].pixels()
 
     def __len__(self) -> int:
         return len(self.stored)

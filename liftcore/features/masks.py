@@ -38,8 +38,6 @@ OVERLAP = "move photos to another folder than their masks"
 
 def mask_files(folder: Path) -> dict[str, Path]:
     """Return view -> its file of masks, of a folder without vectors and its sub-folders."""
-    if not folder.is_dir():
-        raise InvalidFeatures(str(folder), expected="a folder of masks", got="no such folder")
     arrays = [path for path in files_below(folder) if path.name.endswith((VECTORS, ZIPPED_ARRAY))]
     vectors = [path.name for path in arrays if not path.name.endswith((ARRAY, ZIPPED_ARRAY))]
     if vectors:
@@ -83,17 +81,14 @@ def mask_views(
     masks = files_by_view(files, folder, ARRAY, ZIPPED_ARRAY, noun="file of masks", hint=OVERLAP)
     files = [path for path in arrays if not path.name.endswith((ARRAY, ZIPPED_ARRAY))]
     vectors = files_by_view(files, folder, noun="file of vectors")
-    for view, path in vectors.items():
-        if view not in masks:
-            expected = f"masks in {view}{RUNS}, {view}{ARRAY} or {view}{PICTURE}"
-            langsplat = path.name.endswith(("_s.npy", "_f.npy"))
-            hint = "pack folders of LangSplat with 'splatlift pack langsplat'" if langsplat else ""
-            raise InvalidFeatures(str(folder), expected=expected, got=f"{path.name} alone", hint=hint)
-    for view, path in masks.items():
-        if view not in vectors:
-            hint = "move photos and other files to another folder"
+    for view in sorted(vectors.keys() ^ masks.keys()):
+        path, hint = vectors.get(view) or masks[view], "move photos and other files to another folder"
+        expected = f"masks in {view}{RUNS}, {view}{ARRAY} or {view}{PICTURE}"
+        if path.name.endswith(("_s.npy", "_f.npy")):
+            hint = "pack folders of LangSplat with 'splatlift pack langsplat'"
+        if view in masks:
             expected = f"vectors in {view}{VECTORS}"
-            raise InvalidFeatures(str(folder), expected=expected, got=f"{path.name} alone", hint=hint)
+        raise InvalidFeatures(str(folder), expected=expected, got=f"{path.name} alone", hint=hint)
 
     def read(view: str) -> Regions:
         codebook = read_floats(vectors[view], "M, F")

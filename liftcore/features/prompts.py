@@ -140,8 +140,6 @@ def prompt_views(
         unlabelled: value of unlabelled pixels in pictures (255).
         unannotated: images of a data set without an annotation: ``skip`` them, or ``negative``, they show no phrase.
     """
-    if not folder.is_dir():
-        raise InvalidFeatures(str(folder), expected="a folder of masks", got="no such folder")
     files = [path for path in files_below(folder) if names is None or not path.samefile(names)]
     documents = [path for path in files if path.suffix.lower() == ".json"]
     pictures = [path for path in files if path.suffix.lower() == PICTURE]

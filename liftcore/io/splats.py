@@ -20,8 +20,7 @@ from liftcore.io import ply
 from liftcore.io.checkpoint import read_checkpoint
 from liftcore.io.compressed_ply import read_compressed_ply
 from liftcore.io.files import CONVERT_PLY, whole_file
-from liftcore.io.gltf import read_gltf
-from liftcore.io.gltf_writer import gltf_blocks
+from liftcore.io.gltf import gltf_blocks, read_gltf
 from liftcore.io.kinds import CONVERT, SplatFormat, identify, wrong_kind
 from liftcore.io.labels import COLUMN, Labels
 from liftcore.io.quantised import Fields
@@ -85,8 +84,8 @@ def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool
     with _naming(path):
         if splat_format is SplatFormat.PLY:
             return ply.read_ply(path, kernel, colour=colour)
-        if kernel != "auto":
-            require_kernel(path, kernel_named(kernel), str(path))
+        if kernel != "auto" and kernel_named(kernel) is Kernel.BETA:
+            raise ValueError(f"the property 'beta' of a dbs splat, got {splat_format}, which has none")
         from liftcore.scene.splats import Splats
 
         fields = _READERS[splat_format](path, colour=colour)
@@ -213,34 +212,20 @@ def format_of(path: Path) -> SplatFormat:
 def quick_count(path: Path) -> int | None:
     """P of a file by its header or size alone; None where it must be read to be counted, or does not open."""
     with suppress(InvalidSplats, OSError, ValueError):
-        match format_of(path):
-            case SplatFormat.PLY:
-                return ply.read_header(path).count
-            case SplatFormat.SPLAT:
-                return path.stat().st_size // ROW.itemsize
-            case SplatFormat.COMPRESSED_PLY:
-                elements = ply.parse_elements(ply.read_head(path)[0])[1]
-                return next((element.count for element in elements if element.name == "vertex"), None)
-            case _:
-                pass
+        splat_format = format_of(path)
+        if splat_format is SplatFormat.PLY:
+            return ply.read_header(path).count
+        if splat_format is SplatFormat.SPLAT:
+            return path.stat().st_size // ROW.itemsize
+        if splat_format is SplatFormat.COMPRESSED_PLY:
+            elements = ply.parse_elements(ply.read_head(path)[0])[1]
+            return next((element.count for element in elements if element.name == "vertex"), None)
     return None
 
 
 def splat_files(path: Path) -> list[Path]:
     """Return the files that splats are read from: one, or the several of a SOG that is not bundled."""
     return sog_files(path) if format_of(path) is SplatFormat.SOG and not is_bundled(path) else [path]
-
-
-def require_kernel(path: Path, kernel: Kernel, source: str) -> None:
-    """Refuse a kernel that a file lacks a property of, by its header alone."""
-    splat_format = format_of(path)
-    if splat_format is SplatFormat.PLY:
-        with reading(source, InvalidSplats, EXPECTED):
-            ply.model_slots(ply.read_header(path).names, kernel)
-    elif kernel is Kernel.BETA:
-        raise InvalidSplats(
-            source, expected="the property 'beta' of a dbs splat", got=f"{splat_format}, which has none"
-        )
 
 
 def some_rows(path: Path, mask: np.ndarray, suffix: str = ".ply", world: WorldFrame | None = None) -> Iterator[bytes]:

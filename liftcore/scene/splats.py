@@ -464,38 +464,38 @@ def _column(name: str, values: Array, shape: tuple[Any, ...], device: torch.devi
 
 def _repair_columns(columns: dict[str, Tensor]) -> tuple[dict[str, Tensor], list[str]]:
     """Replace NaN and infinity in columns (`Splats`), and return a warning of each kind."""
-    bad = {name: ~_meaningful(name, values) for name, values in columns.items() if not _all_meaningful(name, values)}
-    if not bad:
-        return columns, []
-    columns, warnings, count = dict(columns), [], len(columns["means"])
-    rows = {name: mask.reshape(count, -1).any(dim=1) for name, mask in bad.items()}
-    unseen = [rows[name] for name in _GEOMETRY if name in rows]
-    if unseen:
-        broken = torch.stack(unseen).any(dim=0)
-        if bool(broken.all()):
-            got = f"{count} whose {' and '.join(name for name in _GEOMETRY if name in rows)} are NaN or infinite"
+    count, warnings = len(columns["means"]), list[str]()
+    bad_rows = {
+        name: ~_meaningful(name, values).reshape(count, -1).all(dim=1)
+        for name, values in columns.items()
+        if not _all_meaningful(name, values)
+    }
+    geometry = [name for name in _GEOMETRY if name in bad_rows]
+    columns = dict(columns)
+    if geometry:
+        unseen = torch.stack([bad_rows[name] for name in geometry]).any(dim=0)
+        if bool(unseen.all()):
+            got = f"{count} whose {' and '.join(geometry)} are NaN or infinite"
             raise InvalidSplats("splats", expected="at least one splat of finite numbers", got=got)
-        for name in set(bad).intersection(_GEOMETRY):
-            values, row = columns[name], rows[name].reshape(-1, *[1] * (columns[name].ndim - 1))
-            columns[name] = torch.where(row, values[(~rows[name]).nonzero()[0, 0]], values)
-        columns["opacity_logits"] = columns["opacity_logits"].masked_fill(broken, -torch.inf)
-        first = int(broken.nonzero()[0, 0])
+        for name in geometry:
+            values, rows = columns[name], bad_rows[name].reshape(-1, *[1] * (columns[name].ndim - 1))
+            columns[name] = torch.where(rows, values[int(bad_rows[name].int().argmin())], values)
+        columns["opacity_logits"] = columns["opacity_logits"].masked_fill(unseen, -torch.inf)
         effect = "have a place, size, turn or opacity that is no number (NaN or infinite), and are invisible"
-        warnings.append(f"{int(broken.sum())} of {count} splats {effect}; the first is splat {first}")
-    grey = [rows[name] for name in rows if name not in _GEOMETRY]
-    if grey:
-        grey = torch.stack(grey).any(dim=0)
-        if "sh" in columns:
-            columns["sh"] = columns["sh"].masked_fill(grey[:, None, None], 0.0)
+        warnings.append(_count_text(unseen, effect))
+    if colours := [rows for name, rows in bad_rows.items() if name not in _GEOMETRY]:
+        grey = torch.stack(colours).any(dim=0)
+        for name in {"sh", "sb_params"} & columns.keys():
+            columns[name] = columns[name].masked_fill(grey[:, None, None], 0.0)
         if "sb_params" in columns:
-            lobes = columns["sb_params"].masked_fill(grey[:, None, None], 0.0)
-            lobes[..., :LOBE_COLOURS].masked_fill_(grey[:, None, None], DARK_LOBE)
-            columns["sb_params"] = lobes
-        effect = "have a colour that is no number (NaN or infinite), and are grey"
-        warnings.append(
-            f"{int(grey.sum())} of {count} splats {effect}; the first is splat {int(grey.nonzero()[0, 0])}"
-        )
+            columns["sb_params"][grey, :, :LOBE_COLOURS] = DARK_LOBE
+        warnings.append(_count_text(grey, "have a colour that is no number (NaN or infinite), and are grey"))
     return columns, warnings
+
+
+def _count_text(rows: Tensor, effect: str) -> str:
+    """Return the sentence of a warning of some rows of a mask [P]."""
+    return f"{int(rows.sum())} of {len(rows)} splats {effect}; the first is splat {int(rows.int().argmax())}"
 
 
 def _all_meaningful(name: str, values: Tensor) -> bool:

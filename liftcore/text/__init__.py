@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from liftcore.errors import InvalidInput, InvalidQuery, InvalidTable, Unavailable
+from liftcore.errors import InvalidInput, InvalidQuery, Unavailable, reading
 
 __all__ = ["BUILT_IN", "NO_WORDS", "OWN_WORDS", "TextEncoder", "check_encoder", "encoder_file", "open_encoder"]
 ENCODER_SPECS = (
@@ -74,22 +74,13 @@ def check_encoder(spec: str) -> None:
         if spec not in BUILT_IN and not spec.startswith("open_clip:"):
             raise InvalidInput("encoder", expected=f"one of {', '.join(ENCODER_SPECS)}", got=repr(spec))
         return
-    try:
+    with reading(f"encoder {file}", InvalidInput, "a readable file", "check the path and its permissions"):
         file.open("rb").close()
-    except OSError as error:
-        got, hint = f"{file} ({error.strerror})", "check the path and its permissions"
-        raise InvalidInput("encoder", expected="a readable file", got=got, hint=hint) from None
     if not spec.startswith("open_clip:"):
-        from liftcore.text.table import TableEncoder
-
-        try:
-            TableEncoder.open(file)
-        except InvalidTable as error:
-            got = f"{error.got} at {file}"
-            raise InvalidInput("encoder", expected=error.expected, got=got, hint=error.hint) from None
+        open_encoder(spec)
 
 
-def open_encoder(spec: str | Path, *, remembers: bool = False) -> TextEncoder:
+def open_encoder(spec: str | Path) -> TextEncoder:
     """Open a text encoder by its specification, such as ``open_encoder("lvis").encode(["mug"])``.
 
     Args:
@@ -97,14 +88,11 @@ def open_encoder(spec: str | Path, *, remembers: bool = False) -> TextEncoder:
             1,203 words of LVIS by CLIP ViT-B/32, shipped); ``open_clip:MODEL/TAG`` or ``open_clip:MODEL@FILE``, with
             the suffix ``#7`` or ``#80`` for the mean over that many of CLIP's sentences for ImageNet ("a photo of
             the small mug.").
-        remembers: cache the vectors of the last texts.
 
     Raises:
         InvalidQuery: the specification is not one of these, or a table is malformed.
         Unavailable: the encoder's weights are not on this machine.
     """
-    if remembers:
-        return CachingEncoder(open_encoder(spec))
     spec, templates = without_templates(str(spec))
     kind, _, rest = spec.partition(":")
     # A path may contain a colon, so the suffix is compared first.

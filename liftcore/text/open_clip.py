@@ -54,16 +54,11 @@ def open_model(kind: str, spec: str) -> OpenedModel:
     return OpenedModel(f"open_clip:{model_name}/{tag}", model_name, _from_tag(kind, model_name, tag))
 
 
-def create_model(model_name: str, pretrained: str | None) -> Any:
-    """Create a model with the weights of a tag or a file; None = random weights, for tests only."""
+def create_model(model_name: str, pretrained: str) -> Any:
+    """Create a model with the weights of a tag or a file."""
+    options = {"require_pretrained": True, "pretrained_text": False, "weights_only": True}
     with _quiet():
-        return library().create_model(
-            model_name,
-            pretrained=pretrained,
-            require_pretrained=pretrained is not None,
-            pretrained_text=False,
-            weights_only=True,
-        )
+        return library().create_model(model_name, pretrained=pretrained, **options)
 
 
 def tokenizer_of(model_name: str) -> Callable[[list[str]], Any]:
@@ -153,7 +148,7 @@ def _quiet() -> Iterator[None]:
 class OpenClipEncoder:
     """Encoder of texts into the space that a CLIP model shares with its images.
 
-    Create it with `open`. Random weights are used in tests only.
+    Create it with `open`.
     """
 
     def __init__(self, name: str, model: Any, tokenizer: Callable[[list[str]], Any], templates: int = 1) -> None:
@@ -171,12 +166,6 @@ class OpenClipEncoder:
         """
         model = open_model("open_clip", spec)
         return cls(model.name, _without_images(model.model), tokenizer_of(model.model_name), templates)
-
-    @classmethod
-    def _with_random_weights(cls, model_name: str, templates: int = 1) -> Self:
-        """Create an encoder with random weights of the right shapes, for tests only."""
-        model = _without_images(create_model(model_name, None))
-        return cls(f"open_clip:{model_name} (random)", model, tokenizer_of(model_name), templates)
 
     def encode(self, texts: Sequence[str]) -> np.ndarray:
         """Encode n texts as [n, F] f32 unit rows."""

@@ -6,7 +6,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from math import ceil
-from numbers import Integral
 from pathlib import Path
 from typing import Any, Self
 
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from liftcore.errors import InvalidInput, Unavailable, reading
 from liftcore.io.safetensors_file import map_tensors, write_tensors
+from liftcore.runtime.arguments import check_count
 from liftcore.runtime.cores import cores
 from liftcore.runtime.device import out_of_memory
 from liftcore.runtime.memory import zeros
@@ -155,9 +155,7 @@ class RegionWeights:
         Raises:
             InvalidInput: a splat of W is beyond them.
         """
-        if isinstance(splats, bool) or not isinstance(splats, Integral) or splats < 0:
-            hint = "P of the scene is splats.count"
-            raise InvalidInput("splats", expected="a number of splats", got=repr(splats)[:80], hint=hint)
+        check_count("splats", splats)
         if self.splats.numel() and int(self.splats[-1]) >= splats:
             raise InvalidInput("splats", expected=f"{int(self.splats[-1]) + 1} or more", got=str(splats))
         host, lengths = self.cpu(), np.zeros(splats, np.int64)

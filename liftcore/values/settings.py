@@ -350,11 +350,6 @@ class LiftSettings(PlainModel):
         return cls.of(**base | overrides | {**changes})
 
     @classmethod
-    def hint_of_name(cls, name: str) -> str:
-        """Return a hint that names the settings most like one that is not there."""
-        return nearest(name.replace("-", "_"), cls.model_fields, 3)
-
-    @classmethod
     def of_json(cls, values: Mapping[str, Any]) -> Self:
         """Return settings from JSON, where a boolean is no number.
 

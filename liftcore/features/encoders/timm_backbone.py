@@ -41,11 +41,6 @@ class TimmEncoder:
         model = _from_file(label, name, Path(file)) if at else _by_name(label, name)
         return cls(name, model, device)
 
-    @classmethod
-    def _with_random_weights(cls, name: str) -> Self:
-        """Create an encoder with random weights of the right shapes, for tests only."""
-        return cls(f"{name} (random)", _create(name, pretrained=False), torch.device("cpu"))
-
     def encode(self, images: Tensor) -> Tensor:
         """Encode images [n, 3, h p, w p] f32 as grids [n, h, w, F] f32 on the CPU."""
         with torch.inference_mode():

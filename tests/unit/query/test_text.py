@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 
 from liftcore.errors import InvalidQuery, Unavailable
 from liftcore.text import CachingEncoder, open_encoder, without_templates
-from liftcore.text.open_clip import OpenClipEncoder, tokenizer_of
+from liftcore.text.open_clip import OpenClipEncoder, library, tokenizer_of
 
 pytestmark = pytest.mark.slow
 
@@ -39,7 +39,7 @@ def test_spelling_variants_find_the_same_word_and_others_name_the_nearest(table:
 
 @pytest.fixture(scope="module")
 def clip() -> OpenClipEncoder:
-    return OpenClipEncoder._with_random_weights("ViT-S-32-alt")
+    return OpenClipEncoder("small", library().create_model("ViT-S-32-alt"), tokenizer_of("ViT-S-32-alt"))
 
 
 def test_open_clip_gives_unit_rows_of_its_width_and_none_for_no_text(clip: OpenClipEncoder) -> None:

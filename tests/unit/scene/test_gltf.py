@@ -16,8 +16,7 @@ import pytest
 import torch
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.gltf import TO_FILE
-from liftcore.io.gltf_writer import gltf_blocks
+from liftcore.io.gltf import TO_FILE, gltf_blocks
 from liftcore.io.labels import Labels
 from liftcore.io.quantised import gaussian_rows
 from liftcore.io.splats import labelled, read_splats, write_splats

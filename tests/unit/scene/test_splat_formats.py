@@ -20,7 +20,6 @@ from liftcore.io.kinds import SplatFormat
 from liftcore.io.splats import (
     read_splats,
     recoloured,
-    require_kernel,
     some_rows,
 )
 from liftcore.io.spz import FRAME_EXTENSION, FRAMES
@@ -137,8 +136,6 @@ def test_kernels_of_formats_without_columns_are_3dgs_or_2dgs() -> None:
     assert flat.log_scales.shape == (40, 2)
     with pytest.raises(InvalidSplats, match=r"the property 'beta' of a dbs splat, got \.splat, which has none"):
         read_splats(path, "dbs")
-    with pytest.raises(InvalidSplats, match=r"asset: expected the property 'beta'"):
-        require_kernel(path, Kernel.BETA, "asset")
 
 
 @pytest.mark.parametrize("name", FORMATS)
