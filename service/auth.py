@@ -17,7 +17,7 @@ import anyio
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from service.errors import Forbidden, Misdirected, TooLarge, Unauthorized, UnclearEnd
+from service.errors import Forbidden, Misdirected, TooLarge, TooManyParameters, Unauthorized, UnclearEnd
 from service.models import BITS_BYTES, BODY_BYTES, Key
 from service.settings import ServiceSettings
 from service.store import SERVICE, Owner, Store, admit
@@ -31,6 +31,7 @@ OPEN = re.compile(r"GET /(web/.+|healthz|readyz|openapi\.json|docs(/[^/]+)?)?")
 READS = re.compile(r"(GET|HEAD) .*|POST /(query(/.*)?|render)")  # a question may have a body
 SHARED = re.compile(r"/key|/lifts(/[^/]+(/(?!shares(/|$)).*)?)?|/query(/.*)?|/render")  # for keys with shared lifts
 UPLOAD = re.compile(r"PUT /assets/.*|POST /lifts")  # whose limit is a setting
+PARAMETERS = 1100  # of a query string: a picture may hide a thousand sets; each costs the event loop 5 us
 SCHEME = {"type": "http", "scheme": "bearer", "description": f"A key with one or more of {', '.join(SCOPES)}."}
 
 
@@ -51,6 +52,9 @@ class Auth:
             headers, line = Headers(scope=scope), f"{scope['method']} {scope['path']}"
             require_clear_end(headers, line)
             self._require_host(scope["method"], headers)
+            if (count := scope["query_string"].count(b"&") + 1) > PARAMETERS:
+                expected, hint = f"at most {PARAMETERS} parameters", "POST them as a body"
+                raise TooManyParameters("query", expected=expected, got=str(count), hint=hint)
             owner, key = await self._caller(headers, line)
             limit = BITS_BYTES if "/selections" in line else BODY_BYTES
             require_length(headers, self._upload_bytes if UPLOAD.fullmatch(line) else limit)

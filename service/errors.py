@@ -98,6 +98,12 @@ class TooLarge(ServiceError):
     headers: ClassVar = {"Connection": "close"}
 
 
+class TooManyParameters(ServiceError):
+    """More parameters of a query than any use has: parsing them would delay other requests."""
+
+    kind, status, title = "too-many-parameters", 414, "The address is too long"
+
+
 class UnsupportedMedia(ServiceError):
     """A body in an encoding or of a media type that the route does not accept."""
 

@@ -22,7 +22,7 @@ CHECKS = (
 )  # fmt: skip
 # What breaks the schema by its length may break the limit of a body first.
 REFUSALS = """[checks.negative_data_rejection]
-expected-statuses = [400, 401, 403, 404, 405, 406, 409, 412, 413, 415, 422, 428, 429]
+expected-statuses = [400, 401, 403, 404, 405, 406, 409, 412, 413, 414, 415, 422, 428, 429]
 """
 # A longer head is answered by uvicorn (docs/service.md).
 HOOKS = """import schemathesis

@@ -37,6 +37,8 @@ def gate(_: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
         verdicts.check("a foreign Origin is refused before the body", not wrong, wrong[:3] or f"{len(origins)} heads")
         sizes = {head: status_of(service, head, TOO_LARGE) for head in heads}
         verdicts.check("too large a body is 413 before it comes", set(sizes.values()) == {413}, sizes)
+        crowded = status_of(service, f"GET /query?{'&'.join(['text=a'] * 6000)}", 0)
+        verdicts.check("6,000 parameters are 414", crowded == 414, crowded)
         before = service.get("/assets").json()
 
         reader = service.run(

@@ -100,6 +100,14 @@ def test_request_to_another_host_is_misdirected(client: httpx.Client, host: str)
         assert_problem(client.get(path, headers={"Host": host}), 421)
 
 
+def test_only_more_parameters_than_a_picture_has_are_too_many(client: httpx.Client, lift: dict[str, Any]) -> None:
+    for count, status in ((1000, 200), (2000, 414)):
+        parameters = {"lift": lift["id"], "view": lift["views"][0], "hide": ["object:0"] * count}
+        reply = client.get("/render", params=parameters)
+        assert reply.status_code == status, reply.text[:200]
+    assert_problem(reply, 414)
+
+
 def test_hosts_of_the_machine_are_taken(client: httpx.Client) -> None:
     for host in ("localhost", "LOCALHOST:80", "127.0.0.1:9", "[::1]"):
         assert client.get("/lifts", headers={"Host": host}).status_code == 200, host
