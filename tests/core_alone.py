@@ -40,6 +40,7 @@ def main() -> None:
         lift_in_blocks(lc, folder)
         hold_in_files()
         check_hints(lc, folder)
+        assert "triton" not in sys.modules, "only a lift on a GPU needs it"
         gc.collect()  # Windows removes no file that a lift still maps
     print("read, planned, lifted, saved, asked, rendered and exported on", cores(), "cores")
 

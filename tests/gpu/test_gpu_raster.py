@@ -104,10 +104,3 @@ def test_without_a_card_or_the_interpreter_the_backend_says_so():
     )  # fmt: skip
     lines = process.stdout.splitlines()
     assert lines and all(line.startswith("Unavailable device: expected a CUDA device") for line in lines)
-
-
-def test_nothing_else_loads_triton():
-    modules = "liftcore.lifting.pipeline, liftcore.raster.cpu.raster, liftcore.cli"
-    code = f"import sys, {modules}; print('triton' in sys.modules)"
-    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True)
-    assert process.stdout.strip() == "False"

@@ -76,7 +76,10 @@ def dense_lift(scene: RandomScene, name_of_settings: str) -> tuple[np.ndarray, n
     [(name, kernel) for name in SETTINGS for kernel in KERNELS[: 1 if name == "antialiased" else 3]],
 )
 def test_lift_equals_its_dense_definition(name: str, kernel: str, grids: bool) -> None:
-    scene = random_scene(11, count=60, grids=grids, kernel=kernel, wrong=0.3)
+    scene = random_scene(11, count=60, grids=grids, kernel=kernel, wrong=0.3 if kernel == "3dgs" else 0.0)
+    for view in scene.views.values():  # the few tuples of labels of clean masks are lifted in place of rows
+        if isinstance(view, lc.Regions):
+            view.labels[1, : HEIGHT // 3] = -1
     X, D = dense_lift(scene, name)
     result = lc.lift(*scene.arguments(), **SETTINGS[name], progress=False)
     clear = D > 1e-4

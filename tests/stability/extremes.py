@@ -2,8 +2,7 @@
 
 The error of weights is the largest difference from the float64 reference over all weights, their squares, the row
 sums and the total weight, on all rays of the view; rays that float32 decided otherwise at a cut-off are left out. The
-error of a distorted photo is how far from a pixel, in pixels, its ray meets the photo again. The error of features is
-the largest difference from the dense closed form in float64, over the largest value of the codebook.
+error of features is the largest difference from the dense closed form in float64, over the codebook's largest value.
 """
 
 import math
@@ -14,8 +13,7 @@ import numpy as np
 import torch
 
 import liftcore as lc
-from liftcore.scene.cameras import MAX_FOCAL, MAX_SIDE, MIN_FOCAL, behind_lens, distortion_warning, drawn_by
-from liftcore.scene.distortion import Brown, Distortion, Fisheye, photo_places
+from liftcore.scene.cameras import MAX_FOCAL, MAX_SIDE, MIN_FOCAL
 from liftcore.scene.splats import Kernel
 from tests.scenes import ROTATION, ROW, camera_at_origin, splats_at
 from tests.stability.extreme_measures import (
@@ -32,7 +30,6 @@ from tests.stability.extreme_measures import (
     Outcome,
     Scene,
     View,
-    always,
     at,
     lift_of,
     messages_of,
@@ -186,42 +183,9 @@ VIEWS: tuple[Extreme, ...] = (
 # fmt: on
 
 
-PHOTO_WIDTH, PHOTO_HEIGHT, FOCAL = 64, 48, 50.0  # of the photo
-CORNER = math.hypot(PHOTO_WIDTH, PHOTO_HEIGHT) / 2 / FOCAL  # on the plane one unit before the camera
-PIXELS = 1e-4  # of a place that float32 keeps
 TURN = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # a third of a turn about (1, 1, 1)
 THIRD_OF_A_TURN = (0.5, 0.5, 0.5, 0.5)  # the same as a quaternion
-LENS_SCALES = (-1.0, -1.5, -2.0)
-
-
-def _behind(distortion: Distortion, focal: float = FOCAL) -> lc.Camera:
-    centre = PHOTO_WIDTH / 2, PHOTO_HEIGHT / 2
-    return behind_lens(_pinhole(PHOTO_WIDTH, PHOTO_HEIGHT, focal, centre, np.eye(4)), distortion)
-
-
-def photographed(
-    name: str, distortion: Distortion, claim: Callable[[lc.Camera], bool] = always, focal: float = FOCAL
-) -> Extreme:
-    """An extreme whose error is how far, in pixels, a pixel lies from where its ray meets the photo again.
-
-    Pixels go to the pinhole that draws, in float32 as pictures do, and back; only those that it sees count.
-
-    Args:
-        name: of the row. distortion: of the photo. claim: what exact arithmetic says of the camera.
-    """
-
-    def measure(_: Kernel) -> Outcome:
-        camera = _behind(distortion, focal)
-        lens, pinhole = camera.lens, drawn_by(camera)
-        assert lens is not None
-        x, y = (axis.astype(np.float64) for axis in photo_places(lens))
-        visible = (x >= 0) & (x <= pinhole.width) & (y >= 0) & (y <= pinhole.height)
-        v, u = np.meshgrid(np.arange(lens.height) + 0.5, np.arange(lens.width) + 0.5, indexing="ij")
-        back = lens.on_photo((x - pinhole.cx) / pinhole.fx, (y - pinhole.cy) / pinhole.fy)
-        error = float(np.hypot(back[0] - u, back[1] - v)[visible].max())
-        return Outcome(error, tuple(distortion_warning([camera])), claim(camera))
-
-    return Extreme(name, measure, GAUSSIAN, PIXELS, "features must be of the photos as they were taken")
+FRAME_SCALES = (-1.0, -1.5, -2.0)
 
 
 def _transformed(scale: float, digits: type = np.float64) -> Scene:
@@ -232,31 +196,17 @@ def _transformed(scale: float, digits: type = np.float64) -> Scene:
         matrix[:3, :3], matrix[:3, 3] = scale * TURN, scale * np.array([3.0, -2.0, 1.0])
         camera = camera_at_origin().transformed(matrix.astype(digits).astype(np.float64))
         means = np.asarray(ROW, np.float32).astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-        splats = splats_at(means, LENS_SCALES, quats=THIRD_OF_A_TURN, kernel=kernel)
+        splats = splats_at(means, FRAME_SCALES, quats=THIRD_OF_A_TURN, kernel=kernel)
         return View(replace(splats, log_scales=splats.log_scales + math.log(scale)), camera, DEFAULTS)
 
     return scene
 
 
-def _as_taken(camera: lc.Camera) -> bool:
-    return (camera.width, camera.height) == (PHOTO_WIDTH, PHOTO_HEIGHT)
-
-
 # fmt: off
-LENSES: tuple[Extreme, ...] = (
-
-    photographed("a barrel lens that turns back a millionth beyond the photo's corner",
-        Brown(k1=-4 / 27 / (CORNER * (1 + 1e-6)) ** 2)),
-    photographed("a barrel lens that turns back before the photo's corners", Brown(k1=-4 / 27 / (CORNER * 0.9) ** 2),
-        lambda camera: camera.lens is not None and 0.8 < camera.lens.share < 1),
-
-    photographed("a lens of 1e9 px", Brown(k1=-0.3), _as_taken, focal=1e9),
-    photographed("a fisheye whose corners lie 110 degrees off its axis", Fisheye(),
-        lambda camera: camera.width / 2 / camera.fx <= math.tan(math.radians(60)) + 1 / camera.fx,
-        focal=CORNER * FOCAL / math.radians(110)),
-    view_of("a frame 0.01 times as large", _transformed(0.01), like=at(ROW, LENS_SCALES)),
-    view_of("a frame 1e+06 times as large", _transformed(1e6), like=at(ROW, LENS_SCALES), text="further than"),
-    view_of("a frame given in float32", _transformed(0.37, digits=np.float32), like=at(ROW, LENS_SCALES)),
+FRAMES: tuple[Extreme, ...] = (
+    view_of("a frame 0.01 times as large", _transformed(0.01), like=at(ROW, FRAME_SCALES)),
+    view_of("a frame 1e+06 times as large", _transformed(1e6), like=at(ROW, FRAME_SCALES), text="further than"),
+    view_of("a frame given in float32", _transformed(0.37, digits=np.float32), like=at(ROW, FRAME_SCALES)),
 )
 # fmt: on
 
@@ -356,4 +306,4 @@ MAPS: tuple[Extreme, ...] = (
 )
 # fmt: on
 
-EXTREMES = (*OPACITIES, *SHAPES, *PLACES, *VIEWS, *LENSES, *LENGTHS, *MAPS)
+EXTREMES = (*OPACITIES, *SHAPES, *PLACES, *VIEWS, *FRAMES, *LENGTHS, *MAPS)

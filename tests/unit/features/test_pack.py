@@ -137,9 +137,3 @@ def test_a_name_of_a_mac_is_the_name_of_other_systems(stored: str, photographed:
         assert torch.equal(paired[photographed].codebook, torch.ones(4, 3))
         assert torch.equal(views[DECOMPOSED].codebook, views[COMPOSED].codebook)
     assert cameras[DECOMPOSED] is cameras[COMPOSED] and DECOMPOSED in cameras and COMPOSED in cameras
-
-
-def test_a_pack_with_both_forms_of_a_name_is_refused(tmp_path: Path) -> None:
-    save_file({f"{name}/grid": torch.ones(2, 2, 3) for name in (DECOMPOSED, COMPOSED)}, tmp_path / "a.pack")
-    with pytest.raises(InvalidFeatures, match=r"each view once.*forms of Unicode"):
-        read_features(tmp_path / "a.pack")

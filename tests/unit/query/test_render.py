@@ -29,7 +29,7 @@ from liftcore.query.terms import Vector
 from liftcore.raster.reference import ReferenceRaster
 from liftcore.scene.cameras import Camera, Cameras, behind_lens, drawn_by
 from liftcore.scene.compositing import CompositingParams
-from liftcore.scene.distortion import Brown, Distortion, Fisheye, photo_places
+from liftcore.scene.distortion import Fisheye
 from liftcore.scene.drawing import in_photo
 from liftcore.scene.harmonics import SH_C0
 from liftcore.scene.splats import Kernel, Splats
@@ -37,8 +37,6 @@ from tests.scenes import look_at, random_camera, random_splats
 from tests.tiny_scene import AXES, HEIGHT, SPLATS_A_CLUSTER, WIDTH
 
 from .made_up import answer_with
-
-OUTLIER = 2 * SPLATS_A_CLUSTER + 5  # a splat of the third cluster
 
 
 @pytest.fixture(scope="module")
@@ -82,20 +80,6 @@ def test_a_mask_is_where_objects_have_most_of_a_ray(scene: Scene) -> None:
     assert 0 < int(largest.mask.sum()) < int(in_view.mask.sum())
     empty = view_mask(scene, of(scene), "middle")
     assert not empty.mask.any() and "the 0 objects that were found" in empty.explanation
-
-
-def test_unassigned_splats_are_not_in_a_mask(scene: Scene) -> None:
-    large = scene.splats.log_scales.clone()
-    large[OUTLIER] = np.log(0.2)
-    opaque = scene.splats.opacity_logits.clone()
-    opaque[OUTLIER] = 9.0
-    scene.__dict__["splats"] = replace(scene.splats, log_scales=large, opacity_logits=opaque)
-    answer = of(scene, 0, rows=(OUTLIER,))
-    assert objects(scene, answer).unassigned_splats == 1
-    assert (mostly(scene, answer.selected) & ~mostly(scene, of(scene, 0).selected)).any()  # it could be seen
-    in_view = view_mask(scene, answer, "middle")
-    assert np.array_equal(in_view.mask, mostly(scene, of(scene, 0).selected))
-    assert "1 object that was found" in in_view.explanation
 
 
 def test_clusters_have_their_colours_and_the_rest_is_grey(scene: Scene) -> None:
@@ -247,29 +231,6 @@ def test_a_depth_picture_has_its_range_and_can_be_decoded(two: Scene) -> None:
     assert (near, far) == shown_depth(two, "front")[1]
     decoded = far + (levels[hit] - 1.0) / 254 * (near - far)
     np.testing.assert_allclose(decoded, depths[hit].clip(near, far), atol=0.51 * (far - near) / 254)
-
-
-BARREL = Brown(k1=-0.25, k2=0.04, p1=0.002, p2=-0.001)
-PINCUSHION = Brown(k1=0.2)
-PINHOLE = Camera.pinhole("v", 60, 44, 48.0, 47.0, 29.0, 23.0, np.eye(4))
-
-
-def places(of: Camera) -> torch.Tensor:
-    """Return [H, W, 2], the centres of a pinhole's pixels."""
-    y, x = torch.meshgrid(torch.arange(of.height) + 0.5, torch.arange(of.width) + 0.5, indexing="ij")
-    return torch.stack([x, y], dim=2)
-
-
-@pytest.mark.parametrize("distortion", [BARREL, PINCUSHION])
-def test_numbers_are_interpolated_and_labels_read_where_the_photo_shows_them(distortion: Distortion) -> None:
-    camera = behind_lens(PINHOLE, distortion)
-    assert camera.lens is not None
-    picture = in_photo(camera, places)  # linear, so interpolation is exact off the very border
-    expected = torch.stack([torch.from_numpy(axis) for axis in photo_places(camera.lens)], dim=2)
-    assert picture.shape == (44, 60, 2) and float((picture - expected)[2:-2, 2:-2].abs().max()) < 1e-4
-    assert float((picture - expected).abs().max()) <= 0.5
-    labels = in_photo(camera, lambda of: torch.arange(of.width, dtype=torch.int32).expand(of.height, -1))
-    assert labels.dtype == torch.int32 and torch.equal(labels, expected[..., 0].floor().to(torch.int32))
 
 
 def test_the_rim_that_no_pinhole_sees_is_empty() -> None:

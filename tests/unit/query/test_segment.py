@@ -10,7 +10,6 @@ import pytest
 import torch
 from PIL import Image
 
-from liftcore.errors import InvalidQuery
 from liftcore.io.splats import read_splats
 from liftcore.query.colours import NO_CLUSTER_COLOUR
 from liftcore.query.render import render
@@ -75,15 +74,6 @@ def test_splat_of_no_word_gets_the_one_of_most_of_its_node(clear: Scene) -> None
     assert segmentation.labels[odd].tolist() == [0, -1, -1]
     assert segmentation.score[0] < 0.2 and segmentation.margin[0] <= 0
     assert np.array_equal(segmentation.labels[3:], CLUSTER[3:])
-
-
-@pytest.mark.parametrize(
-    ("words", "vectors"),
-    [([], EYE[:0]), (["a", "a"], EYE[:2]), (["a"], EYE[:2]), (["a"], EYE[:1, :5]), (["a"], 0 * EYE[:1])],
-)
-def test_words_without_directions_of_their_own_are_refused(clear: Scene, words: list, vectors) -> None:
-    with pytest.raises(InvalidQuery):
-        segment(clear, words, vectors)
 
 
 def test_pictures_show_the_words_of_the_pixels(clear: Scene) -> None:

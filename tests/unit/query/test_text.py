@@ -1,7 +1,6 @@
 """Text encoders: look-ups, meanings, shapes, and errors of missing words and weights."""
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +9,8 @@ import torch
 from safetensors.torch import save_file
 
 from liftcore.errors import InvalidQuery, Unavailable
-from liftcore.text import CachingEncoder, open_encoder, without_templates
-from liftcore.text.open_clip import OpenClipEncoder, library, tokenizer_of
+from liftcore.text import open_encoder, without_templates
+from liftcore.text.open_clip import OpenClipEncoder, tokenizer_of
 
 pytestmark = pytest.mark.slow
 
@@ -77,23 +76,3 @@ def test_unknown_model_of_open_clip_is_an_error(
     torch.save({"state_dict": Path("code")}, tmp_path / "code.pt")
     with pytest.raises(error, match=message):
         open_encoder(f"open_clip:{model.format(code=tmp_path / 'code.pt')}")
-
-
-def test_a_remembered_text_is_read_once_until_too_many_are_remembered() -> None:
-    encoded: list[str] = []
-
-    class Counting:
-        name, channels = "counting", 2
-
-        def encode(self, texts: Sequence[str]) -> np.ndarray:
-            encoded.extend(texts)
-            return np.array([[float(len(text)), 1.0] for text in texts])
-
-    encoder = CachingEncoder(Counting(), size=2)
-    first = encoder.encode(["a", "bb", "a"])
-    assert first[:, 0].tolist() == [1.0, 2.0, 1.0] and encoded == ["a", "bb"]
-    encoder.encode(["a", "ccc"])
-    assert encoded == ["a", "bb", "a", "ccc"]
-    encoder.encode(["ccc"])
-    assert encoded == ["a", "bb", "a", "ccc"]
-    assert encoder.encode([]).shape == (0, 2) and (encoder.name, encoder.channels) == ("counting", 2)

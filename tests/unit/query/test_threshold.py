@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from liftcore.errors import InvalidQuery
 from liftcore.query.question import METHODS
 from liftcore.query.threshold import find_threshold
 
@@ -55,18 +54,6 @@ def test_auto_takes_no_score_below_least() -> None:
 def test_auto_says_when_nothing_stands_apart() -> None:
     assert "with care" in find_threshold(hills((0.2, 0.05, 50_000)), "auto").explanation
     assert "with care" not in find_threshold(hills((0.2, 0.02, 50_000), (0.4, 0.01, 500)), "auto").explanation
-
-
-def test_a_given_threshold_is_kept_where_a_score_can_be_it() -> None:
-    threshold = find_threshold(torch.rand(10), 0.3)
-    assert (threshold.value, threshold.method) == (0.3, "fixed")
-    for number in (1.001, math.nan):
-        with pytest.raises(InvalidQuery, match="threshold: expected a number from -1 to 1"):
-            find_threshold(torch.rand(10), number)
-    with pytest.raises(InvalidQuery):
-        find_threshold(torch.rand(10), "best")
-    with pytest.raises(InvalidQuery, match="finite"):
-        find_threshold(torch.tensor([0.1, math.nan]), "auto")
 
 
 @pytest.mark.parametrize("method", METHODS)
