@@ -16,6 +16,7 @@ from liftcore.scene.splats import Kernel, Splats
 from liftcore.values.pack import write_pack
 from liftcore.values.views import FeatureGrid, Regions, ViewFeatures
 from tests.inria_file import write_inria_cameras
+from tests.promises import scenes as random_scenes
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 ROTATION = (0.9, 0.1, 0.3, 0.2)
@@ -45,15 +46,7 @@ def random_splats(seed: int, count: int = 40, spread: float = 1.0, kernel: Kerne
 
 def look_at(name: str, centre: np.ndarray, width: int, height: int, focal: float) -> Camera:
     """Return a camera at ``centre`` that looks at the origin."""
-    forward = -centre / np.linalg.norm(centre)
-    helper = np.array([0.0, 1.0, 0.0]) if abs(forward[1]) < 0.9 else np.array([1.0, 0.0, 0.0])
-    right = np.cross(helper, forward)
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    pose = np.eye(4)
-    pose[:3, :3] = rotation
-    pose[:3, 3] = -rotation @ centre
-    return Camera.pinhole(name, width, height, focal, focal * 1.1, width / 2 + 0.7, height / 2 - 0.4, pose)
+    return random_scenes.look_at(centre, name, width, height).replace(fx=focal, fy=1.1 * focal)
 
 
 def random_camera(seed: int, width: int = 37, height: int = 29, name: str = "v0") -> Camera:

@@ -6,11 +6,10 @@ import threading
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
-import pytest
 import torch
 
 from liftcore.raster.base import ViewRequest
-from liftcore.raster.cpu.raster import side_by_side, views_at_a_time
+from liftcore.raster.cpu.raster import side_by_side
 from liftcore.scene.compositing import CompositingParams, Weighting
 from liftcore.values.views import DENSE_ROWS, FeatureGrid
 from tests.scenes import random_camera, random_regions
@@ -64,14 +63,6 @@ def copies_of(raster: Staged, count: int) -> list[Raster]:
     return [cast("Raster", raster)] * count
 
 
-def test_views_come_in_their_order_whichever_ends_first() -> None:
-    names = [f"v{k}" for k in range(9)]
-    raster = Staged({"v0": "v2 ended", "v1": "v2 ended"})  # none ends unless all three run concurrently
-    assert [answer.weights for answer in side_by_side(copies_of(raster, 3), requests_of(*names))] == names
-    assert raster.is_forgotten  # no view stays cached
-    assert [views_at_a_time(threads) for threads in (1, 2, 64)] == [1, 2, 4]
-
-
 def test_of_dense_maps_one_is_in_work_wherever_they_come_among_the_views() -> None:
     raster = Staged({"d0": "v1 begun", "d1": "v1 begun"})  # which waits for neither
     dense = FeatureGrid(torch.zeros(1, DENSE_ROWS + 1, 1))
@@ -80,13 +71,6 @@ def test_of_dense_maps_one_is_in_work_wherever_they_come_among_the_views() -> No
     assert [answer.weights for answer in answers] == ["d0", "d1", "v1"]
     begins, ends = ([raster.events.index(f"d{k} {event}") for k in range(2)] for event in ("begun", "ended"))
     assert min(ends) < max(begins)
-
-
-def test_an_error_comes_in_the_place_of_its_view() -> None:
-    answers = side_by_side(copies_of(Staged(), 2), requests_of("v0", "v1", "broken", "v3"))
-    assert [next(answers).weights, next(answers).weights] == ["v0", "v1"]
-    with pytest.raises(ValueError, match="broken"):
-        next(answers)
 
 
 def test_closing_awaits_the_views_in_work_and_begins_no_other() -> None:

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from safetensors.numpy import save_file
 
 from liftcore.errors import InvalidFeatures
-from liftcore.features.folders import Layout, array_views, files_below, langsplat_views
+from liftcore.features.folders import Layout, array_views, langsplat_views
 from liftcore.io.photo_zip import describe_photos
 from liftcore.values.pack import read_features, write_pack
-from liftcore.values.views import FeatureGrid, Regions
+from liftcore.values.views import Regions
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -60,24 +59,7 @@ def test_wrong_ids_are_refused(ids: np.ndarray, message: str, tmp_path: Path) ->
         langsplat_views(langsplat(tmp_path, ids))["frame_1"]
 
 
-UNRELATED_FILES = (
-    "._frame_1_s.npy",
-    ".DS_Store",
-    "Thumbs.db",
-    "desktop.ini",
-    "__MACOSX/frame_2_s.npy",
-    ".cache/frame_2_s.npy",
-)
-
-
-def test_what_systems_put_beside_files_is_left_out(tmp_path: Path) -> None:
-    langsplat(tmp_path)
-    for name in UNRELATED_FILES:
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_bytes(b"\x00\x05\x16\x07\x00\x02\x00\x00Mac OS X")
-    assert [*langsplat_views(tmp_path)] == ["frame_1"]
-    assert [path.name for path in files_below(tmp_path)] == ["frame_1_f.npy", "frame_1_s.npy"]
-    assert [path.name for path in files_below(tmp_path / ".cache")] == ["frame_2_s.npy"]  # what is named is read
+def test_what_systems_put_beside_photos_in_zips_is_left_out(tmp_path: Path) -> None:
     photo = io.BytesIO()
     Image.new("RGB", (4, 3)).save(photo, format="PNG")
     with zipfile.ZipFile(tmp_path / "photos.zip", "w") as archive:
@@ -114,22 +96,6 @@ def test_maps_may_have_unit_axes_and_any_floats(
 def test_maps_of_feature_3dgs_are_of_their_images_and_channels_first(tmp_path: Path) -> None:
     torch.save(torch.from_numpy(GRID.transpose(2, 0, 1).copy()), tmp_path / "IMG_0_fmap_CxHxW.pt")
     assert array_views(tmp_path)["IMG_0"].grid.tolist() == GRID.tolist()
-
-
-def test_values_in_memory_and_in_packs_may_have_unit_axes(tmp_path: Path) -> None:
-    assert FeatureGrid(GRID[None, None]).grid.tolist() == GRID.tolist()
-    regions = Regions(IDS[None], CODEBOOK[None])
-    assert regions.labels.tolist() == IDS.tolist() and regions.codebook.tolist() == CODEBOOK.tolist()
-    tensors = {
-        "a/grid": GRID[None],
-        "b/labels": IDS[None].astype(np.int32),
-        "b/codebook": np.ones((1, 4, 4), np.float32),
-    }
-    save_file(tensors, tmp_path / "a.pack")
-    packs = read_features(tmp_path / "a.pack")
-    assert packs["a"].codebook.tolist() == GRID.reshape(6, 4).tolist()
-    assert packs.map_size("a") == (3, 2) and packs.map_size("b") == (2, 2)
-    assert packs["b"].cpu().codebook.tolist() == np.ones((4, 4)).tolist()
 
 
 @pytest.mark.parametrize(

@@ -215,20 +215,6 @@ def test_photos_beside_documents_that_name_them_are_no_masks(tmp_path: Path) -> 
         prompt_views(write(tmp_path / "twice", a=twice))
 
 
-def test_counts_in_pythons_text_of_bytes_are_counts(tmp_path: Path) -> None:
-    """``str`` of pycocotools' bytes; where counts have a backslash, that of the text is doubled."""
-    masks = [np.zeros((94, 60), bool) for _ in range(2)]
-    masks[0][30:50, 20:30], masks[1][44:64, 0] = True, True
-    texts = [str(rle(mask)["counts"].encode()) for mask in masks]
-    texts.append(f'b"{texts[0][2:-1]}"')
-    assert texts[1].startswith("b'\\\\")
-    for text, mask in zip(texts, [*masks, masks[0]], strict=True):
-        assert np.array_equal(read_runs({"size": [94, 60], "counts": text}).pixels(), mask)
-    assert read_runs({"size": [1, 47], "counts": "b'_1'"}).lengths.tolist() == [47]
-    with pytest.raises(ValueError, match="in number 0"):
-        read_runs({"size": [94, 60], "counts": "'aP'"})
-
-
 def test_pixels_that_nobody_decided_have_no_label(tmp_path: Path) -> None:
     """The 255 of VOC and the like, in images of numbers, images with a palette and binary images."""
     void = np.zeros((HEIGHT, WIDTH), bool)

@@ -52,7 +52,6 @@ KINDS: dict[str, dict[str, Any]] = {
     "booleans": {"a_masks.npy": MASKS},
     "uncompressed_rle": {"a.json": sam_records(MASKS)},
     "coco_rle": {"a.json": sam_records(MASKS, as_string=True)},
-    "SA-1B": {"a.json": {"image": {"image_id": 1}, "annotations": sam_records(MASKS, as_string=True)}},
 }
 
 
@@ -83,10 +82,8 @@ def test_views_are_named_as_their_cameras_are_and_with_their_folders(tmp_path: P
     [
         ("a.npy", r"masks in a\.json, a_masks\.npy or a\.png, got a\.npy alone"),
         ("a_f.npy a_s.npy", r"a_f\.npy alone; .*'splatlift pack langsplat'"),
-        ("a.npy a.json b.json", r"vectors in b\.npy, got b\.json alone; move .* to another folder"),
         ("a_masks.npy", r"vectors in a\.npy, got a_masks\.npy alone"),
         ("a.npy a.json a.png", r"one file of masks a view, got a\.json and a\.png.*move photos to another folder"),
-        ("a.pt", "pickles"),
     ],
 )
 def test_files_without_their_partners_are_refused(files: str, message: str, tmp_path: Path) -> None:
@@ -140,14 +137,11 @@ def test_strings_that_coco_published_fill_the_boxes_that_it_published(
     ("segmentation", "message"),
     [
         ([[1.0, 2.0, 3.0, 4.0]], r"run lengths \{size, counts\}, got \[\[1\.0, 2\.0, 3\.0, 4\.0\]\]; .*output_mode"),
-        ({"size": [2, 3, 1], "counts": [6]}, r"size \[h, w\], got \[2, 3, 1\]"),
         ({"size": [32769, 1], "counts": [32769]}, r"sides in 1\.\.32768"),
         ({"size": [32768, 32768], "counts": [1 << 30]}, "at most 178956970 pixels"),
         ({"size": [2, 3], "counts": [1, 2]}, r"sum up to 2 x 3 = 6, got a sum of 3; the file is truncated"),
         ({"size": [2, 3], "counts": [8, -2]}, "counts from 0 on, got a run of -2"),
-        ({"size": [2, 3], "counts": [1.0, 5]}, "a list of whole numbers or a string"),
         ({"size": [2, 3], "counts": "6P"}, "ends within a number"),
-        ({"size": [2, 3], "counts": "6\u0660"}, "in number 1"),
         ({"size": [2, 3], "counts": "P" * 8 + "0"}, "7 at most for a number"),
     ],
 )

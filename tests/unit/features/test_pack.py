@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 
 from liftcore.errors import InvalidFeatures
-from liftcore.io.safetensors_file import write_tensors
 from liftcore.scene.cameras import Camera, Cameras
-from liftcore.values.pack import as_views, pair, read_features
+from liftcore.values.pack import read_features
 from liftcore.values.views import FeatureGrid, Regions, ViewFeatures
 
 MAP = np.arange(24, dtype=np.float32).reshape(3, 2, 4)  # [F, h, w]
@@ -41,15 +40,6 @@ def test_arrays_that_fit_are_not_copied() -> None:
     grid = np.ones((2, 3, 4), np.float16)
     grid.flags.writeable = False  # as mapped files are
     assert FeatureGrid(grid).grid.data_ptr() == grid.ctypes.data
-
-
-def test_tensors_of_any_order_are_stored_in_row_order(tmp_path) -> None:
-    transposed = torch.from_numpy(MAP).permute(1, 2, 0)
-    single = torch.arange(6).as_strided((1,), (2,))  # as a slice of one number may be
-    write_tensors(tmp_path / "t", {"turned": transposed, "every other": transposed[:, ::2], "single": single}, {})
-    tensors = load_file(tmp_path / "t")
-    assert torch.equal(tensors["turned"], transposed) and torch.equal(tensors["every other"], transposed[:, ::2])
-    assert torch.equal(tensors["single"], single)
 
 
 CODEBOOK = torch.arange(12.0).reshape(4, 3)
@@ -97,17 +87,6 @@ def test_names_of_levels_are_texts_that_print_or_none(text: str, names: tuple[st
     assert read_features(saved(tmp_path / "p", regions(0), levels=text)).level_names == names
 
 
-def test_several_packs_make_one_set_of_views(tmp_path: Path) -> None:
-    clip = saved(tmp_path / "one", regions(0), encoder="clip")
-    other = saved(tmp_path / "other", {"B/grid": torch.ones(1, 1, 3)})
-    packs = read_features(clip, other)
-    assert packs.views == ("B", "a")
-    with pytest.raises(InvalidFeatures, match="'ghost'"):
-        packs["ghost"]
-    assert packs.encoder == "clip"
-    assert packs.normalised is None
-
-
 def test_packs_that_do_not_fit_together_are_refused(tmp_path: Path) -> None:
     clip = saved(tmp_path / "one", regions(0), encoder="clip")
     wide = saved(tmp_path / "wide", {"b/grid": torch.ones(1, 1, 4)})
@@ -122,18 +101,3 @@ def test_packs_that_do_not_fit_together_are_refused(tmp_path: Path) -> None:
         read_features()
     with pytest.raises(InvalidFeatures, match="No such file"):
         read_features(tmp_path / "nowhere")
-
-
-DECOMPOSED, COMPOSED = "Ku\u0308che_0", "K\u00fcche_0"  # one name, decomposed and composed
-
-
-@pytest.mark.parametrize(("stored", "photographed"), [(DECOMPOSED, COMPOSED), (DECOMPOSED, DECOMPOSED)])
-def test_a_name_of_a_mac_is_the_name_of_other_systems(stored: str, photographed: str, tmp_path: Path) -> None:
-    save_file({f"{stored}/grid": torch.ones(2, 2, 3)}, tmp_path / "a.pack")
-    cameras = Cameras([Camera.pinhole(photographed, 4, 3, 4.0, 4.0, 2.0, 1.5, np.eye(4))])
-    for views in (read_features(tmp_path / "a.pack"), as_views({stored: FeatureGrid(np.ones((2, 2, 3)))})):
-        paired, left_over = pair(views, cameras)
-        assert (paired.views, left_over) == ((COMPOSED,), [])
-        assert torch.equal(paired[photographed].codebook, torch.ones(4, 3))
-        assert torch.equal(views[DECOMPOSED].codebook, views[COMPOSED].codebook)
-    assert cameras[DECOMPOSED] is cameras[COMPOSED] and DECOMPOSED in cameras and COMPOSED in cameras

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import torch
-
-import liftcore as lc
 from liftcore.lifting.planning.plan import check_memory, features_room
-from tests.benchmarks.room import room_cameras, room_splats
 
 WIDTH, HEIGHT, CHANNELS = 416, 320, 2  # 133,120 pixels
 
@@ -20,13 +16,3 @@ def test_what_one_phase_frees_is_free_for_the_features_of_another() -> None:
     assert features.startswith("the features, 5.6 GiB, do not fit")
     (rest,) = check_memory(phases | {"solve": phases["solve"] | {"features": 1}}, 77 * GB // 10)
     assert rest.startswith("the rest of the lift may take 6.5 GiB")
-
-
-def test_the_peak_of_a_plan_is_that_of_one_phase() -> None:
-    (camera,) = room_cameras(1, WIDTH, HEIGHT)
-    labels = torch.arange(WIDTH * HEIGHT, dtype=torch.int32).reshape(HEIGHT, WIDTH)
-    views = {camera.name: lc.Regions(labels, torch.rand(WIDTH * HEIGHT, CHANNELS))}
-    plan = lc.plan(room_splats(300), {camera.name: camera}, views, aggregation=True)
-    totals = {phase: sum(parts.values()) for phase, parts in plan.memory_phases.items()}
-    assert plan.memory_bytes == max(totals.values()) == sum(plan.memory.values())
-    assert "view" not in plan.memory_phases["solve"] and "features" not in plan.memory_phases["geometry"]

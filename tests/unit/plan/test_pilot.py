@@ -69,16 +69,6 @@ def test_cosines_are_those_of_the_variance_and_of_the_splats_that_views_show():
     assert pilot_of([[1.0]] * 100, [1.0], [1.0]).views_for(0.9, range(100)) == (81, pytest.approx(0.9))  # all error
 
 
-def test_the_fewest_views_that_reach_the_cosine_are_chosen_but_never_fewer_than_least():
-    estimate = pilot_of([[1.0]] * 40, [0.05], [1.0])
-    cosines = list(estimate.cosines(range(40)))
-    count, expected = estimate.views_for(0.99, range(40))
-    assert cosines[count - 2] < 0.99 <= cosines[count - 1] == expected
-    assert estimate.views_for(0.99, range(40), least=count + 7) == (count + 7, cosines[count + 6])
-    assert estimate.views_for(1e-200, range(40)) == (1, cosines[0])
-    assert estimate.views_for(0.999_999_999_999, range(40))[0] == 40
-
-
 def test_with_coverage_beside_it_a_cosine_takes_no_fewer_views_and_no_pilot_flies_for_few(tmp_path):
     paths = disagreeing(tmp_path / "scene", 0.3)
     counts, expected = [], []

@@ -163,8 +163,6 @@ def test_threshold_of_examples_is_above_a_least_likeness(scene: Scene) -> None:
         (Pixel("middle", WIDTH, 0), InvalidQuery, rf"0\.\.{WIDTH - 1}"),
         (Pixel("middle", 0, 0), InvalidQuery, r"got a ray with an opacity of [\d.]+%"),
         (PixelBox("middle", 0, 0, WIDTH + 1, 2), InvalidQuery, f"x1 <= {WIDTH}"),
-        (PixelBox("middle", 9, 3, 9, 9), InvalidQuery, "x0 < x1"),
-        (PixelBox("middle", 0, 0, 2, 2), InvalidQuery, r"got rays with an opacity of [\d.]+%"),
         (Stroke("middle", ((0, 0), (1, 1))), InvalidQuery, "an area that shows the scene"),
         (Vector((1.0,) * 7), InvalidQuery, "8 channels"),
         ("apple", InvalidQuery, "ask by example"),

@@ -6,11 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from liftcore.errors import InvalidLift
 from liftcore.io.splats import read_splats
 from liftcore.query.ask import ask
 from liftcore.query.colours import NOT_SEEN_COLOUR, colour_map
-from liftcore.query.export import object_splats
 from liftcore.query.question import Answer, Query
 from liftcore.query.scene import Scene
 from liftcore.query.terms import Vector
@@ -42,14 +40,3 @@ def test_scores_have_the_colours_of_the_map_and_what_was_not_seen_is_grey(scene:
     assert np.array_equal(colours[best], colour_map()[-1]) and np.array_equal(colours[worst], colour_map()[0])
     map_colours = {tuple(colour) for colour in colour_map().tolist()}
     assert {tuple(colour) for colour in colours[:-1].tolist()} <= map_colours
-
-
-def test_exports_load_no_splats_and_know_when_their_file_changed(scene: Scene, tmp_path: Path) -> None:
-    answer = of_lamp(scene)
-    assert list(scene.blocks_of(answer, "coloured")) and "splats" not in scene.__dict__
-    assert list(object_splats(scene, answer)) and "raster" not in scene.__dict__
-    (tmp_path / "s.ply").write_bytes(ply(splat_rows()))
-    other = Scene(scene.path)
-    for content in ("object", "coloured"):
-        with pytest.raises(InvalidLift, match="splats changed since the lift"):
-            other.blocks_of(answer, content)

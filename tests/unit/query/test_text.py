@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 
 from liftcore.errors import InvalidQuery, Unavailable
 from liftcore.text import open_encoder, without_templates
-from liftcore.text.open_clip import OpenClipEncoder, tokenizer_of
+from liftcore.text.open_clip import OpenClipEncoder, library, tokenizer_of
 
 pytestmark = pytest.mark.slow
 

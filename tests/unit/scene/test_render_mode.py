@@ -92,7 +92,6 @@ SAYING: dict[str, tuple[Callable[[Path], Path], tuple[Kernel, bool], str | None]
     **{f"SPZ {v}": (lambda f, v=v: spz_saying(f, v, 1), MIP, "flag") for v in (1, 2, 3, 4)},
 
     "SOG": (lambda f: sog_saying(f, "antialiased"), MIP, "model"),
-    "SOG of discs": (lambda f: sog_saying(f, "2dgs"), DISCS, "model"),
 
     "gsplat's configuration": (lambda f: checkpoint_beside(f, "cfg.yml", GSPLAT.format("true")), MIP, "cfg.yml"),
 
@@ -182,9 +181,7 @@ def test_splats_in_memory_are_drawn_and_lifted_in_their_mode() -> None:
     ("names", "words"),
     [
         (["motion_0", "trbf_center", "omega_3"], "motion_0, trbf_center, omega_3 are not read: these splats move"),
-        (["t", "scale_t", "rot_r_0"], "t, scale_t, rot_r_0 are not read: these splats move"),
         (["shape"], "shape are not read: these splats have a footprint"),
-        (["gamma_0"], "footprint"),
         (["f_asg_0", "roughness"], "f_asg_0, roughness are not read: these splats have colours"),
         (["opacity_compensation"], "have opacities"),
         (["mask", "class_id", "instance_id", "confidence", "nx"], ""),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -98,11 +97,6 @@ def test_cameras_are_a_mapping_whose_names_win() -> None:
         Cameras({})
 
 
-@pytest.fixture
-def model(tmp_path: Path) -> Path:
-    return write_files(tmp_path / "model", binary_files())
-
-
 def test_views_are_named_by_stem_and_all_by_path_where_any_stems_collide() -> None:
     images = ["a/001.jpg", "b\\002.png", "003.JPG", "./train/r_0", "frame.0001"]
     assert view_names(images) == ["001", "002", "003", "r_0", "frame.0001"]
@@ -142,20 +136,3 @@ def test_a_view_is_found_by_its_last_part_and_else_its_neighbours_are_named() ->
     with pytest.raises(NotFound, match="nearest:") as error:
         cameras_of(*(f"{k:06}" + "x" * 300 for k in range(20)))["000001" + "y" * 494]
     assert len(str(error.value)) < 500
-
-
-@pytest.mark.parametrize("kind", ["binary", "text", "transforms", "inria"])
-def test_more_views_than_a_scene_may_have_are_refused_before_they_are_read(
-    kind: str, tmp_path: Path, model: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("liftcore.scene.cameras.MAX_VIEWS", 2)
-    path = write_files(tmp_path / "many", (text_files if kind == "text" else binary_files)())
-    if kind == "binary":
-        content = struct.pack("<Q", 3) + b"\0" * 3 * 73  # nothing that could be read
-        path = write_files(tmp_path / "many", {"images.bin": content})
-    elif kind == "transforms":
-        path = with_json(tmp_path, {"frames": [{}] * 3})
-    elif kind == "inria":
-        path = with_json(tmp_path, [{"img_name": "a"}] * 3)
-    with pytest.raises(InvalidCameras, match=r"at most 2 views, got 3 or more; lift fewer photos"):
-        read_cameras(path)

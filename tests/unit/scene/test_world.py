@@ -102,7 +102,7 @@ def test_gltf_of_others_is_in_metres_with_y_up() -> None:
 
 
 WRONG: list[dict[str, Any]] = [
-    {"up": (0, 0, 0)}, {"up": (0, 1)}, {"up": "up"}, {"metres_per_unit": 0}, {"metres_per_unit": math.inf},
+    {"up": (0, 0, 0)}, {"metres_per_unit": 0},
     {"metres_per_unit": True}, {"down": (0, 1, 0)},
 ]  # fmt: skip
 
