@@ -73,7 +73,9 @@ def test_codes_are_labelled_clicked_and_named_as_their_rows_are(coded: lc.LiftRe
     vectors = lc.open_encoder("lvis").encode(list(WORDS))
     listing, expected = (scene.tree(WORDS, vectors) for scene in (of_codes, of_rows))
     assert [item.name for item in listing.objects] == [item.name for item in expected.objects]
-    np.testing.assert_allclose(*([item.score for item in tree.objects] for tree in (listing, expected)), atol=1e-5)
+    assert [item.score for item in listing.objects] == pytest.approx(
+        [item.score for item in expected.objects], abs=1e-5
+    )
 
 
 def test_codes_have_the_same_bits_for_any_threads(exact: lc.LiftResult, coded: lc.LiftResult) -> None:

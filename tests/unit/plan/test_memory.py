@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from liftcore.lifting.planning.plan import check_memory, features_room
 
-WIDTH, HEIGHT, CHANNELS = 416, 320, 2  # 133,120 pixels
-
 
 def test_what_one_phase_frees_is_free_for_the_features_of_another() -> None:
     GB = 10**9
