@@ -196,17 +196,10 @@ def layer_colours(scene: Scene, layer: str) -> np.ndarray:
     if layer == "pca":
         colours = np.round(255 * scene.principal.numpy()).astype(np.uint8)
     elif layer == "cluster":
-        if scene.cluster is None or scene.cluster_features is None:
-            hint = "lift again with the setting aggregation=true"
-            raise InvalidQuery("what", expected="a lift with clusters", got="a lift without aggregation", hint=hint)
-        colours = cluster_colours(len(scene.cluster_features))[scene.cluster]
+        clusters = scene.layer("cluster")
+        colours = cluster_colours(int(clusters.max()) + 1)[clusters]
     else:
-        tensor = getattr(scene, layer)
-        if tensor is None:
-            hint = "lift again with the setting robust=true"
-            got = "a lift without reweighting"
-            raise InvalidQuery("what", expected=f"a lift with {layer}", got=got, hint=hint)
-        values = tensor.astype(np.float32)
+        values = scene.layer("confidence" if layer == "confidence" else "total_weight").astype(np.float32)
         valid = scene.has_feature & np.isfinite(values)
         if layer == "total_weight":
             valid &= values > 0

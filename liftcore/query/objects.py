@@ -62,8 +62,7 @@ def objects(scene: Scene, answer: Answer) -> Objects:
     summaries = []
     for number in range(len(object_groups)):
         inside = numbers[rows] == number
-        members, member_weights = rows[inside], weights[inside]
-        member_weights = member_weights if member_weights.any() else np.ones(len(members))
+        members, member_weights = rows[inside], scene.weights_of(rows[inside])
         box = (
             object_box(scene.splats, members, member_weights)
             if sets

@@ -10,7 +10,6 @@ from PIL import Image, ImageDraw, ImageFont
 from PIL.PngImagePlugin import PngInfo
 from scipy.ndimage import binary_dilation
 
-from liftcore.errors import InvalidQuery
 from liftcore.query.areas import MINIMUM_ROW_SUM
 from liftcore.query.colours import cluster_colours, heat_colours, map_colours
 from liftcore.query.objects import objects
@@ -136,24 +135,17 @@ def render(scene: Scene, view: str | Camera, channel: str = "rgb") -> np.ndarray
 
 
 def _render_clusters(scene: Scene, view: str | Camera) -> np.ndarray:
-    if scene.cluster is None or scene.cluster_features is None:
-        hint = "lift again with the setting aggregation=true"
-        raise InvalidQuery("channel", expected="a lift with clusters", got="a lift without aggregation", hint=hint)
-    clusters = torch.from_numpy(scene.cluster)
+    clusters = torch.from_numpy(scene.layer("cluster"))
     labels = scene.image(view, lambda camera: scene.raster.strongest_labels(camera, clusters, scene.compositing))
-    picture = cluster_colours(len(scene.cluster_features))[labels.numpy()]  # the last colour is that of label -1
+    picture = cluster_colours(int(clusters.max()) + 1)[labels.numpy()]  # the last colour is that of label -1
     sums = scene.image(view, lambda camera: scene.raster.row_sums(camera, scene.compositing))
     picture[sums.numpy() <= 0] = 0
     return picture
 
 
 def _render_confidence(scene: Scene, view: str | Camera) -> np.ndarray:
-    if scene.confidence is None:
-        hint = "lift again with the preset default, or with robust=true"
-        raise InvalidQuery(
-            "channel", expected="a lift with confidence", got="a lift that was not reweighted", hint=hint
-        )
-    values = torch.from_numpy(np.stack([scene.confidence, np.ones_like(scene.confidence)], axis=1))
+    confidence = scene.layer("confidence")
+    values = torch.from_numpy(np.stack([confidence, np.ones_like(confidence)], axis=1))
     image = scene.image(view, lambda camera: scene.raster.render(camera, values, scene.compositing)).numpy()
     sums = image[..., 1]
     means = image[..., 0] / np.where(sums > 0, sums, 1.0)

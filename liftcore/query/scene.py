@@ -521,6 +521,14 @@ class Scene:
         weights = self.total_weight[rows].astype(np.float64)
         return weights if weights.any() else np.ones(len(weights))
 
+    def layer(self, name: Literal["cluster", "total_weight", "confidence"]) -> np.ndarray:
+        """Return a column for pictures, [P]; InvalidQuery if the lift does not have it."""
+        column: np.ndarray | None = getattr(self, name)
+        if column is None:
+            hint = f"lift again with the setting {'aggregation' if name == 'cluster' else 'robust'}=true"
+            raise InvalidQuery("channel", expected=f"a lift with {name}", got="a lift without", hint=hint)
+        return column
+
     @cached_property
     def effective_count(self) -> float:
         """Number of splats with a feature whose scores have as much noise as those of these total weights."""
