@@ -129,7 +129,8 @@ class LiftResult(Lift):
         """Return the lift with at most 8,192 rows of features, and the number of its row for each splat.
 
         ``diagnostics["codes"]`` has the number of rows, and the loss: 1 - the mean cosine of splats about the scene's
-        mean, by total weight. Where it is too large, or nothing is saved, it has the reason, and features stay exact.
+        mean, by the root of total weight. Where it is too large, or nothing is saved, it has the reason, and features
+        stay exact.
         """
         import torch
 

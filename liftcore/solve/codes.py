@@ -4,6 +4,10 @@ Features of masks are mixtures of few region vectors, and most of what differs w
 like splats lose nothing that is asked for. Groups are cut in two, those that vary most first, in principal directions
 of a sample, and their number doubles until a held-out part of the sample loses little by it; the cuts then place all
 splats. Samples are evenly spaced rows and products have fixed shapes, so that codes depend on no number of threads.
+
+A splat counts by the root of its total weight. By the weight itself groups follow the few splats near to cameras
+(`tabletop`, grids: accuracy .919, by the root .922, exact .923); without it they follow the noise of splats that few
+rays meet.
 """
 
 from __future__ import annotations
@@ -25,7 +29,7 @@ SAMPLE = 1 << 17  # splats of which groups are made
 HELD_OUT = 8  # each eighth of them measures the loss, and makes no group
 CHANNELS = 64  # principal directions in which groups are cut
 ROUNDS = 3  # of 2-means that place a cut
-MOST_LOSS = 0.045  # 1 - cosine about the mean, of held-out splats by total weight
+MOST_LOSS = 0.045  # 1 - cosine about the mean, of held-out splats by weight
 LEAST_SAVED = 2  # times smaller that codes and codebook must be than features
 BLOCK = 8_192  # rows converted to float32 at once
 
@@ -57,14 +61,14 @@ def code_features(features: np.ndarray, has_feature: np.ndarray, total_weight: n
     """Code features, or explain in a sentence why they are to stay exact.
 
     Args:
-        features: [P, F] f16 or f32. has_feature: [P] bool. total_weight: [P] f32, weights of the loss and of means.
+        features: [P, F] f16 or f32. has_feature: [P] bool. total_weight: [P] f32.
     """
     rows = np.flatnonzero(has_feature)
     rows = rows[:: -(-len(rows) // SAMPLE) or 1]
     most_groups = min(MOST_CODES - 1, len(features) // LEAST_SAVED - 1)  # one is zero
     if len(rows) < LEAST_SAVED * (FIRST_CODES + 1):
         return f"Features are exact: {len(rows)} splats with a feature are too few to share codes."
-    unit, weights = _unit(features[rows]), np.maximum(total_weight[rows], 1e-6).astype(np.float64)
+    unit, weights = _unit(features[rows]), np.sqrt(np.maximum(total_weight[rows], 1e-6)).astype(np.float64)
     with one_thread():
         centre = (weights @ unit / weights.sum()).astype(np.float32)
         axes = principal_axes(unit[::HELD_OUT] - centre, CHANNELS)
