@@ -152,7 +152,9 @@ class Algebra:
         codebook, masks = scene.codebook, mask_regions(scene.load("regions")["levels"])
         entries = sum(scene.load("rows", number)["region"].size for number in range(scene.splat_pieces))
         totals = torch.from_numpy(self._region_totals())
-        scene.keep_directions(RegionDirections(codebook, totals, entries, scene.settings.robust_directions))
+        directions = RegionDirections.of(codebook, totals, entries, scene.settings.robust_directions)
+        axes = {} if directions.axes is None else {"axes": directions.axes}
+        scene.save("directions", None, {"mean": directions.mean, "distances": directions.distances, **axes})
         sums = np.zeros((2, codebook.regions))
         for turn, regions in enumerate(steps.compared_regions(scene)):
             self.scene = replace(scene, turn=turn)

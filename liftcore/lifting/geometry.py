@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from liftcore.lifting.checkpoint import Checkpoint
+from liftcore.lifting.pieces import stacked
 from liftcore.raster.base import Raster, ViewRequest, ViewWeights
 from liftcore.runtime.device import give_back_memory
 from liftcore.runtime.one_thread import one_thread
@@ -21,7 +22,7 @@ from liftcore.solve.codebook import Codebook, ViewCodebook, as_regions
 from liftcore.solve.rays import Readout, SampledRays, read_pixels, sample_pixels
 from liftcore.values.levels import at_levels, region_levels
 from liftcore.values.lift_views import LiftViews
-from liftcore.values.region_weights import MEMORY_LIMIT, RegionWeights, stacked
+from liftcore.values.region_weights import MEMORY_LIMIT, RegionWeights
 from liftcore.values.settings import LiftSettings
 from liftcore.values.views import Regions
 

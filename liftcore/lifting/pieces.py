@@ -12,7 +12,7 @@ its rows in all parts.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -20,14 +20,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from liftcore.errors import Unavailable
 from liftcore.runtime.jit import kernel
 from liftcore.runtime.memory import zeros
 from liftcore.solve.sums import PieceSums, sum_pieces
-from liftcore.values.region_weights import MEMORY_LIMIT
+from liftcore.values.region_weights import MEMORY_LIMIT, MOST_REGIONS, RegionWeights, row_blocks, run_each
 
 if TYPE_CHECKING:
     from liftcore.solve.codebook import Codebook
-    from liftcore.solve.directions import RegionDirections
     from liftcore.solve.rays import SampledRays
     from liftcore.values.settings import LiftSettings
 
@@ -113,14 +113,6 @@ class Pieces:
         """Return the values of a loaded array, to be overwritten."""
         return torch.from_numpy(array)
 
-    def keep_directions(self, directions: RegionDirections) -> None:
-        """Store the directions of all regions."""
-        self.arrays["directions", None] = {"all": directions}
-
-    def directions(self) -> RegionDirections:
-        """Return what `keep_directions` stored."""
-        return self.load("directions")["all"]
-
     def new_features(self, _piece: int) -> Tensor:
         """Return zeros for X of a block of splats."""
         size = self.splats * self.channels * self.dtype.itemsize
@@ -195,6 +187,60 @@ def gather_rows(
     targets = [values_of(int(starts[-1]), dtype) for dtype in dtypes]
     fill_rows(parts(), starts, [target.numpy() for target in targets])
     return starts, targets
+
+
+def part_of(splats: np.ndarray, starts: np.ndarray, values: Iterable[np.ndarray], ends: tuple[int, int]) -> SomeRows:
+    """Select the rows of a part that are in a block, and their values."""
+    first, last = np.searchsorted(splats, ends)
+    span = slice(int(starts[first]), int(starts[last]))
+    return SomeRows(
+        splats[first:last] - ends[0], starts[first : last + 1] - span.start, [part[span] for part in values]
+    )
+
+
+def region_offsets(counts: Iterable[int]) -> np.ndarray:
+    """Return the first region of each view among those of all, [V + 1] i64, from their numbers.
+
+    Raises:
+        Unavailable: an entry cannot name so many.
+    """
+    offsets = np.cumsum([0, *counts])
+    if offsets[-1] > MOST_REGIONS:
+        got, hint = f"{offsets[-1]} in {offsets.size - 1} views", "lift fewer views, or smaller maps"
+        raise Unavailable("features", expected=f"at most {MOST_REGIONS} regions", got=got, hint=hint)
+    return offsets
+
+
+def stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None = None) -> RegionWeights:
+    """W of all views, with a row for each of ``splats``, from the W of each; total weight is added up."""
+    offsets, total_weight = region_offsets(int(part.offsets[-1]) for part in parts), np.zeros(splats)
+    for part in parts:
+        total_weight[part.total_weight_splats.numpy()] += part.total_weight.numpy()
+    starts = row_starts((SomeRows(part.splats.numpy(), part.indptr.numpy(), ()) for part in parts), splats)
+    region, weight = (values_of(int(starts[-1]), dtype) for dtype in (torch.int32, torch.float32))
+
+    def fill(first: int, last: int) -> None:
+        def rows() -> Iterator[SomeRows]:
+            for part, base in zip(parts, offsets[:-1], strict=True):
+                values = part.region.numpy(), part.weight.numpy()
+                block = part_of(part.splats.numpy(), part.indptr.numpy(), values, (first, last))
+                yield SomeRows(block.rows, block.starts, (block.values[0] + np.int32(base), block.values[1]))
+
+        fill_rows(rows(), starts[first : last + 1], (region.numpy(), weight.numpy()))
+
+    # Each block reads all views.
+    run_each(fill, row_blocks(np.diff(starts), max(splats, 1), max(1 << 20, int(starts[-1]) >> 5)), threads)
+    hit_splats = np.flatnonzero(total_weight)
+    tensors = (
+        np.arange(splats, dtype=np.int32),
+        starts,
+        hit_splats.astype(np.int32),
+        total_weight[hit_splats],
+        offsets,
+    )
+    rows, begins, hits, sums, bases = map(torch.from_numpy, tensors)
+    names = tuple(name for part in parts for name in part.views)
+    return RegionWeights(rows, begins, region, weight, hits, sums.float(), bases, names)
 
 
 def take_rows(starts: np.ndarray, rows: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

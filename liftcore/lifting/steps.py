@@ -29,7 +29,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from liftcore.lifting.pieces import Pieces, Shape, SomeRows, fill_rows, gather_rows, take_rows, values_of
+from liftcore.lifting.pieces import Pieces, Shape, SomeRows, fill_rows, gather_rows, part_of, take_rows, values_of
 from liftcore.runtime.one_thread import one_thread
 from liftcore.solve.closed_form import solve_rows
 from liftcore.solve.consensus import (
@@ -41,7 +41,7 @@ from liftcore.solve.consensus import (
     splat_tuples,
     with_mean,
 )
-from liftcore.solve.directions import region_totals
+from liftcore.solve.directions import RegionDirections, region_totals
 from liftcore.solve.objects import (
     count_members,
     node_containers,
@@ -86,15 +86,6 @@ def weights_of(starts: np.ndarray, region: Tensor, weight: Tensor, offsets: np.n
     """Make W, a row for each of ``starts``, without total weight."""
     rows, begins = torch.arange(starts.size - 1, dtype=torch.int32), torch.from_numpy(starts)
     return RegionWeights(rows, begins, region, weight, rows[:0], weight[:0], torch.from_numpy(offsets))
-
-
-def part_of(splats: np.ndarray, starts: np.ndarray, values: Iterable[np.ndarray], ends: tuple[int, int]) -> SomeRows:
-    """Select the rows of a part that are in a block, and their values."""
-    first, last = np.searchsorted(splats, ends)
-    span = slice(int(starts[first]), int(starts[last]))
-    return SomeRows(
-        splats[first:last] - ends[0], starts[first : last + 1] - span.start, [part[span] for part in values]
-    )
 
 
 # ---- pieces of views
@@ -269,8 +260,14 @@ def compare(scene: Pieces, piece: int, threads: int | None) -> Saved:
     block, levels = splat_block(scene, piece), scene.load("regions")["levels"]
     [(W, _)] = by_level(scene, block.W, [scene.turn])
     reweighter = BlockReweighter(W, block.means, threads)
-    cosines, sums = reweighter.cosines(scene.directions(), by_region=bool((levels >= 0).any()))
+    cosines, sums = reweighter.cosines(_directions(scene), by_region=bool((levels >= 0).any()))
     return {"cosines": cosines}, sums, reweighter.shape
+
+
+def _directions(scene: Pieces) -> RegionDirections:
+    arrays = scene.load("directions")
+    parts = {name: torch.from_numpy(arrays[name]) for name in ("mean", "distances", "axes") if name in arrays}
+    return RegionDirections(scene.codebook, **parts)
 
 
 def reweighted(

@@ -14,14 +14,12 @@ import torch
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from liftcore.errors import InvalidInput, Unavailable, reading
+from liftcore.errors import InvalidInput, reading
 from liftcore.io.safetensors_file import map_tensors, write_tensors
 from liftcore.runtime.arguments import check_count
 from liftcore.runtime.cores import cores
-from liftcore.runtime.device import out_of_memory
 from liftcore.runtime.memory import zeros
 from liftcore.runtime.one_line import one_line
-from liftcore.runtime.one_thread import one_thread
 
 FORMAT = "splatlift-weights/2"
 MEMORY_LIMIT = 1 << 28  # bytes of W that stay in memory; what is beyond lies in mapped files
@@ -116,23 +114,6 @@ class RegionWeights:
         """Return the starts [B + 1] i64 of rows [B] i64 among their entries, and their indices in W [nnz'] i64."""
         return row_entries(self.indptr, rows)
 
-    def of_splats(self, first: int, last: int) -> Self:
-        """W and total weight of the splats ``first..last`` alone, counted from ``first`` on; a copy."""
-        bounds = torch.tensor([first, last], dtype=torch.int32, device=self.device)
-        begin, end = torch.searchsorted(self.splats, bounds).tolist()
-        met_begin, met_end = torch.searchsorted(self.total_weight_splats, bounds).tolist()
-        starts = self.indptr[begin : end + 1]
-        entries = slice(int(starts[0]), int(starts[-1]))
-        return replace(
-            self,
-            splats=self.splats[begin:end] - first,
-            indptr=starts - entries.start,
-            region=self.region[entries].clone(),
-            weight=self.weight[entries].clone(),
-            total_weight_splats=self.total_weight_splats[met_begin:met_end] - first,
-            total_weight=self.total_weight[met_begin:met_end].clone(),
-        )
-
     def runs(self, starts: Tensor, region: Tensor) -> tuple[Tensor, Tensor]:
         """Return the runs of some rows, a run being the entries of one view in a row.
 
@@ -202,78 +183,6 @@ def one_view(
     """W of a view of so many regions, as a raster finds it. See `RegionWeights`."""
     offsets = torch.tensor([0, regions])
     return RegionWeights(splats, indptr, region, weight, total_weight_splats, total_weight, offsets)
-
-
-@one_thread()
-def stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None = None) -> RegionWeights:
-    """W of all views of the parts, in their order, with a row for every splat; total weight is added up.
-
-    The result lies where all parts lie if there is room, else on the CPU: in memory, or in mapped files beyond
-    MEMORY_LIMIT.
-
-    Args:
-        splats: P. threads: None takes the cores that this process may use. The number changes no bit.
-    """
-    try:
-        return _stacked(parts, splats, threads)
-    except RuntimeError as error:
-        if not out_of_memory(error) or all(not part.region.is_cuda for part in parts):
-            raise
-    return _stacked([part.cpu() for part in parts], splats, threads)  # out here the error holds nothing any more
-
-
-def _stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None) -> RegionWeights:
-    counts = [int(part.offsets[-1]) for part in parts]
-    bases = np.concatenate([[0], np.cumsum(counts)]).tolist()
-    if bases[-1] > MOST_REGIONS:
-        got, hint = f"{bases[-1]} in {len(parts)} views", "lift fewer views, or smaller maps"
-        raise Unavailable("features", expected=f"at most {MOST_REGIONS} regions", got=got, hint=hint)
-    places = {part.device for part in parts}
-    place = places.pop() if len(places) == 1 else torch.device("cpu")
-    lengths = torch.zeros(splats, dtype=torch.int64, device=place)
-    total_weight = torch.zeros(splats, dtype=torch.float64, device=place)
-    for part in parts:  # of different splats, so that no two threads of a device add to the same
-        lengths.index_add_(0, part.splats.to(place), part.indptr.diff().to(place))
-        total_weight.index_add_(0, part.total_weight_splats.to(place), part.total_weight.to(place).double())
-    indptr = from_zero(lengths)
-    total = int(indptr[-1])
-    columns = []
-    for dtype in (torch.int32, torch.float32):
-        if place.type == "cpu":
-            columns.append(zeros((total,), dtype, name="weights", in_file=8 * total > MEMORY_LIMIT))
-        else:
-            columns.append(torch.empty(total, dtype=dtype, device=place))
-    region, weight = columns
-
-    def fill(first: int, last: int) -> None:
-        cursors = indptr[first:last].clone()
-        for part, base in zip(parts, bases[:-1], strict=True):
-            bounds = torch.tensor([first, last], dtype=torch.int32, device=part.device)
-            begin, end = torch.searchsorted(part.splats, bounds).tolist()
-            if begin == end:
-                continue
-            rows, starts = part.splats[begin:end].to(place) - first, part.indptr[begin : end + 1]
-            entries = slice(int(starts[0]), int(starts[-1]))
-            starts = starts.to(place) - entries.start
-            at, lengths = cursors.index_select(0, rows), starts.diff()
-            to = torch.repeat_interleave(at - starts[:-1], lengths, output_size=entries.stop - entries.start)
-            to += torch.arange(to.shape[0], device=place)
-            region.scatter_(0, to, part.region[entries].to(place) + base)
-            weight.scatter_(0, to, part.weight[entries].to(place))
-            cursors.index_add_(0, rows, lengths)
-
-    ranges = [(0, splats)]  # on a GPU, where a copy in pieces takes longer than one
-    if place.type == "cpu":
-        ranges = row_blocks(lengths.numpy(), max(splats, 1), max(1 << 20, total >> 5))  # each block reads all views
-    run_each(fill, ranges, threads)
-    hit_rows = torch.nonzero(total_weight)[:, 0]
-    ends = [part.offsets[1:] + base for part, base in zip(parts, bases, strict=False)]
-    offsets = torch.cat([torch.zeros(1, dtype=torch.int64), *ends])
-    names = tuple(name for part in parts for name in part.views)
-    splat_rows = torch.arange(splats, dtype=torch.int32, device=place)
-    return RegionWeights(
-        splat_rows, indptr, region, weight, hit_rows.int(), total_weight[hit_rows].float(), offsets, names
-    )
 
 
 def row_blocks(lengths: np.ndarray, rows: int, entries: int) -> list[tuple[int, int]]:

@@ -25,8 +25,8 @@ from torch import Tensor
 
 from liftcore.io.safetensors_file import map_tensors, tensor_bytes, write_tensors
 from liftcore.lifting.geometry import WeightRequest, weight_request
-from liftcore.lifting.pieces import Pieces, Shape, SomeRows, gather_rows, values_of
-from liftcore.lifting.steps import Saved, part_of, row_arrays, saved_as, weights_of
+from liftcore.lifting.pieces import Pieces, Shape, SomeRows, gather_rows, part_of, values_of
+from liftcore.lifting.steps import Saved, row_arrays, saved_as, weights_of
 from liftcore.lifting.warm_up import warm_up_lift
 from liftcore.raster import open_raster
 from liftcore.raster.base import RayRows, ViewWeights
@@ -36,7 +36,6 @@ from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
 from liftcore.solve.codebook import Codebook, ViewCodebook
-from liftcore.solve.directions import RegionDirections, StoredDirections
 from liftcore.solve.rays import Readout, SampledRays
 from liftcore.solve.sums import PieceSums, pack_sums, unpack_sums
 from liftcore.values.lift_views import LiftViews
@@ -114,12 +113,6 @@ class Job(Pieces):
     def writable(self, array: np.ndarray) -> Tensor:
         values = torch.from_numpy(array)
         return values_of(values.shape[0], values.dtype).copy_(values)
-
-    def keep_directions(self, directions: RegionDirections) -> None:
-        directions.save(self.folder)
-
-    def directions(self) -> RegionDirections:
-        return StoredDirections(self.folder)
 
     def new_features(self, piece: int) -> Tensor:
         first, last = self.bounds(piece)

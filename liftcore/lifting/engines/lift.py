@@ -35,6 +35,7 @@ from liftcore.lifting.engines.blocks import (
     write_scene,
 )
 from liftcore.lifting.inputs import LiftInputs
+from liftcore.lifting.pieces import region_offsets
 from liftcore.lifting.planning.plan import Plan, plan_lift
 from liftcore.runtime.device import CPU, Device, choose_device
 from liftcore.runtime.folders import scratch_folder
@@ -42,7 +43,7 @@ from liftcore.runtime.progress import Timings
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
 from liftcore.values.pack import NO_ROOM, Views, write_pack
-from liftcore.values.region_weights import MEMORY_LIMIT, MOST_REGIONS
+from liftcore.values.region_weights import MEMORY_LIMIT
 from liftcore.values.settings import LiftSettings
 
 PACKED = 64  # views of a pack
@@ -224,7 +225,7 @@ def block_folder(
 
 def _share_regions(job: Job, plan: Plan) -> WeightStatistics:
     """Write the numbers of the regions of all views."""
-    counts, levels, blind, entries = [0], list[np.ndarray](), list[str](), 0
+    counts, levels, blind, entries = list[int](), list[np.ndarray](), list[str](), 0
     for number, name in enumerate(job.names):
         view = read_view(job.view_file(number))
         counts.append(view.codebook.regions)
@@ -232,9 +233,6 @@ def _share_regions(job: Job, plan: Plan) -> WeightStatistics:
         entries += view.entries
         if view.blind:
             blind.append(name)
-    arrays = {"offsets": np.cumsum(counts), "levels": np.concatenate(levels)}
-    if arrays["offsets"][-1] > MOST_REGIONS:
-        got, hint = f"{arrays['offsets'][-1]} in {len(job.names)} views", "lift fewer views, or smaller maps"
-        raise Unavailable("features", expected=f"at most {MOST_REGIONS} regions", got=got, hint=hint)
+    arrays = {"offsets": region_offsets(counts), "levels": np.concatenate(levels)}
     job.save("regions", None, arrays)
     return WeightStatistics(plan, arrays["levels"], entries, tuple(blind))

@@ -83,7 +83,7 @@ def reweighting_of(
 ) -> Reweighting:
     """Return the factors of W; masks [M] bool are the regions with a reliability."""
     totals = np.bincount(W.region.numpy(), W.weight.numpy(), minlength=codebook.regions).astype(np.float64)
-    directions = RegionDirections(codebook, torch.from_numpy(totals), W.region.shape[0], principal)
+    directions = RegionDirections.of(codebook, torch.from_numpy(totals), W.region.shape[0], principal)
     level_of = np.zeros(codebook.regions) if levels is None else levels
     factors = torch.zeros(W.region.shape[0])
     scores, sums = (np.zeros((2, count)) for count in (W.splats.shape[0], codebook.regions))

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from liftcore.values.region_weights import RegionWeights, stacked
+from liftcore.lifting.pieces import stacked
+from liftcore.values.region_weights import RegionWeights
 from tests.unit.solve.one_piece import solve
 from tests.unit.solve.sparse_views import codebook_of, defined, of_dense, random_view
 

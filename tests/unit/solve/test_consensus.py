@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from liftcore.lifting.pieces import stacked
 from liftcore.solve.consensus import BELONGS, FAINT, OBSERVES, PRIOR
 from liftcore.solve.reweight import SHARPNESS
-from liftcore.values.region_weights import RegionWeights, stacked
+from liftcore.values.region_weights import RegionWeights
 from tests.unit.solve.one_piece import mask_consensus, reweighting_of
 from tests.unit.solve.sparse_views import codebook_of, dense, of_dense
 

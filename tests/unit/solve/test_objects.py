@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from liftcore.lifting.pieces import stacked
 from liftcore.solve import objects
 from liftcore.solve.objects import CONTAINS, OBSERVES, RegionObjects
 from liftcore.solve.region_tree import LEAST_VIEWS, MERGE_RATE
-from liftcore.values.region_weights import RegionWeights, stacked
+from liftcore.values.region_weights import RegionWeights
 from tests.unit.solve.one_piece import region_objects
 from tests.unit.solve.sparse_views import dense, of_dense
 from tests.unit.solve.test_consensus import SPLATS, belonging, of_things, random_scene

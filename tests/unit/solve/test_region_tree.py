@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from liftcore.lifting.pieces import stacked
 from liftcore.solve.codebook import Codebook, ViewCodebook
 from liftcore.solve.objects import NodeVectors, RegionObjects, object_facts
-from liftcore.values.region_weights import RegionWeights, stacked
+from liftcore.values.region_weights import RegionWeights
 from tests.unit.solve.one_piece import region_objects
 from tests.unit.solve.sparse_views import of_dense
 from tests.unit.solve.test_objects import objects_of

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from liftcore.lifting.pieces import stacked
 from liftcore.solve.directions import RegionDirections
 from liftcore.solve.reweight import NO_CONSENSUS, scale_weights
 from liftcore.solve.shared_rows import LONG, MOST_COMPARED
-from liftcore.values.region_weights import RegionWeights, stacked
+from liftcore.values.region_weights import RegionWeights
 from tests.unit.solve.one_piece import reweighting_of
 from tests.unit.solve.sparse_views import codebook_of, dense, of_dense
 
@@ -108,7 +109,7 @@ def test_principal_directions_have_the_cosines_of_all_channels(channels: int) ->
     rng = np.random.default_rng(1)
     vectors = rng.standard_normal((40, 6)) @ rng.standard_normal((6, channels))
     codebook, totals = codebook_of([torch.from_numpy(vectors).float()]), torch.from_numpy(rng.uniform(0.5, 2, 40))
-    principal = RegionDirections(codebook, totals, 10_000, 12).table(slice(0, 12))
+    principal = RegionDirections.of(codebook, totals, 10_000, 12).table(slice(0, 12))
     unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
     offsets = unit - totals.numpy() @ unit / totals.sum().item()
     e = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
