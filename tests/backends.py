@@ -54,7 +54,7 @@ class Backend:
         return run
 
 
-CPU = Backend("cpu", lambda splats: CpuRaster(splats, threads=2), examples=30, seeds=30)
+CPU = Backend("cpu", lambda splats: CpuRaster(splats, threads=2), examples=20, seeds=20)
 GPU = Backend("gpu", gpu_raster, 20, 30)
 if not torch.cuda.is_available():  # small scenes for the interpreter
     GPU = Backend("gpu", gpu_raster, examples=6, seeds=1, splats=24, size=(20, 18), rays=12)

@@ -1,10 +1,13 @@
-"""Masks as COCO writes them, the twin of what `liftcore.features.mask_files` reads."""
+"""Masks as COCO and others write them, the twin of what `liftcore.features.mask_files` reads."""
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 
 def sam_records(masks: np.ndarray, *, as_string: bool = False) -> list[dict[str, Any]]:
@@ -15,6 +18,22 @@ def sam_records(masks: np.ndarray, *, as_string: bool = False) -> list[dict[str,
         counts = compressed(lengths) if as_string else lengths
         records.append({"segmentation": {"size": [*mask.shape], "counts": counts}, "area": int(mask.sum())})
     return records
+
+
+def write_files(folder: Path, files: dict[str, Any]) -> Path:
+    """Write bytes and texts as they are, arrays and pictures by the suffix of their name, and the rest as JSON."""
+    for name, content in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if isinstance(content, bytes):
+            path.write_bytes(content)
+        elif path.suffix == ".npy":
+            np.save(path, content)
+        elif path.suffix.lower() == ".png":
+            (Image.fromarray(content) if isinstance(content, np.ndarray) else content).save(path)
+        else:
+            path.write_text(content if isinstance(content, str) else json.dumps(content), encoding="utf-8")
+    return folder
 
 
 def lengths_of(mask: np.ndarray) -> list[int]:

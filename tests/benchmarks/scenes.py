@@ -1,11 +1,10 @@
 """A scene to measure on: a synthetic room of many views, with known mistakes.
 
-    python -m tests.benchmarks.scenes room FOLDER --splats 500000 --views 160 [--alike C]
+    python -m tests.benchmarks.scenes room FOLDER --splats 500000 --views 160
 
 Every view of the room has regions on four levels, from walls and balls to their parts, seen with occlusion. A part
 has a random unit vector; what a view says of it has noise of norm NOISE. Of all regions a tenth say another part's
-vector, and of three tenths the vector is mixed with another's. With ``--alike C`` the vectors of parts have the
-cosine C to one another in the mean, as those of an encoder lie in a narrow cone.
+vector, and of three tenths the vector is mixed with another's.
 """
 
 import argparse
@@ -37,7 +36,6 @@ class RoomSpec:
     views: int
     size: tuple[int, int]  # width and height of the views, pixels
     channels: int
-    cosine: float = 0.0  # cosine of two parts' vectors, in the mean
     seed: int = 0
 
 
@@ -57,7 +55,8 @@ def observed_views(
     """Iterate over views by name, with their observed features."""
     parts = room_parts(spec.splats, spec.seed)  # [P, PART_LEVELS], numbers of parts on each level
     fine, counts = parts[:, -1], parts.max(axis=0) + 1
-    vectors = _vectors(int(counts.sum()), spec)  # level by level
+    shape = int(counts.sum()), spec.channels
+    vectors = _unit(np.random.default_rng((spec.seed, 1)).standard_normal(shape))  # level by level
     rows = np.full((PART_LEVELS, fine.max() + 2), NO_LABEL)  # of a finest part its vector on each level; none is last
     rows[:, fine] = (np.cumsum(counts) - counts + parts).T
     for number, camera in enumerate(cameras):
@@ -71,15 +70,6 @@ def observed_views(
             camera.name,
             lc.Regions(torch.from_numpy((labels - first).astype(np.int32)), torch.from_numpy(vectors_seen).half()),
         )
-
-
-def _vectors(count: int, spec: RoomSpec) -> np.ndarray:
-    rng = np.random.default_rng((spec.seed, 1))
-    unique, common = (
-        _unit(rng.standard_normal((count, spec.channels))),
-        _unit(rng.standard_normal((1, spec.channels))),
-    )
-    return _unit(np.sqrt(1.0 - spec.cosine) * unique + np.sqrt(spec.cosine) * common)
 
 
 def _mistaken(book: np.ndarray, vectors: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -109,10 +99,9 @@ def main() -> None:
     spec.add_argument("folder", type=Path)
     for name, default in (("splats", 500_000), ("views", 160), ("width", 986), ("height", 728), ("channels", 512)):
         spec.add_argument(f"--{name}", type=int, default=default)
-    spec.add_argument("--alike", dest="cosine", type=float, default=0.0, metavar="C")
     options = parser.parse_args()
     size = options.width, options.height
-    write_room(options.folder, RoomSpec(options.splats, options.views, size, options.channels, options.cosine))
+    write_room(options.folder, RoomSpec(options.splats, options.views, size, options.channels))
 
 
 if __name__ == "__main__":

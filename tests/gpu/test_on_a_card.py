@@ -106,7 +106,6 @@ def test_tensors_of_a_card_come_in(paths: list[Path]) -> None:
         result = lc.lift(splats, cameras, {"middle": regions}, device=device, **FEW)
         assert torch.equal(result.cpu().features, expected.features)
         assert lc.lift(splats, cameras, iter([("middle", grid)]), device=device, **FEW).has_feature.any()
-        assert lc.lift(splats, cameras, {"middle": grid}, "default", device=device, **FEW).has_feature.any()
         lc.region_weights(splats, cameras, {"middle": regions}, device=device)
         assert lc.plan(splats, {"middle": corner}, {"middle": few}, device=device).views == ("middle",)
     ones = lc.render(splats, cameras["middle"], torch.ones(60).to("cuda"))

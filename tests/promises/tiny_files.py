@@ -17,18 +17,18 @@ from tests.tiny_scene import make_scene
 FILES = {"splats": "s.ply", "cameras": "c.json", "features": "f.safetensors", "table": "words.safetensors"}
 
 
-def write_files(folder: Path) -> dict[str, Path]:
-    """Write the splats, cameras, features and text table of the tiny scene; return the paths by kind."""
-    tiny = make_scene()
+def write_files(folder: Path, **contents: bytes) -> dict[str, Path]:
+    """Write the splats, cameras, features and text table of the tiny scene, or others; return the paths by kind."""
+    contents = vars(make_scene()) | contents
     paths = {kind: folder / name for kind, name in FILES.items()}
     for kind, path in paths.items():
-        path.write_bytes(getattr(tiny, kind))
+        path.write_bytes(contents[kind])
     return paths
 
 
-def write_lift(folder: Path, **settings: object) -> Path:
-    """Lift the tiny scene in a folder; return the lift's file. The default preset is row-sum."""
-    paths = write_files(folder)
+def write_lift(folder: Path, splats: bytes = b"", **settings: object) -> Path:
+    """Lift the tiny scene, or other splats, in a folder; return the lift's file. The default preset is row-sum."""
+    paths = write_files(folder, **({"splats": splats} if splats else {}))
     options = lc.LiftSettings.of(**{"preset": "row-sum", **settings})
     result = lc.lift_files(paths["splats"], paths["cameras"], [paths["features"]], options)
     result.save(folder / "scene.lift.safetensors")

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,12 +12,11 @@ import torch
 
 from liftcore.evaluate.accuracy import centred_cosines, cosine_figures, shared_pixels
 from liftcore.evaluate.ranking import accuracy_of, choose
-from liftcore.evaluate.tradeoff import RunSpec, SceneFiles, measure_run
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import dense_view, reading_matrix
 from liftcore.scene.compositing import CompositingParams
 from liftcore.values.views import FeatureGrid
-from tests.scenes import centred, observed, random_camera, random_splats, write_scene
+from tests.scenes import centred, observed, random_camera, random_splats
 
 pytestmark = pytest.mark.slow
 
@@ -127,23 +124,3 @@ def test_cosines_count_splats_that_the_exact_run_saw():
     assert figures["cosine"] == pytest.approx(3 / 4)
     assert figures["cosine_plain"] == pytest.approx(1 / 3)
     assert (figures["cosine_q05"], figures["lost_share"]) == (0, pytest.approx(1 / 3))
-
-
-def order_of(folder: Path, **parts) -> RunSpec:
-    paths = write_scene(folder, 2)
-    scene = SceneFiles(paths[0], paths[1], (paths[2],), **parts)
-    return RunSpec(scene, {"diagnostic_rays": 0}, ("v0", "v1"), ("v2",), (), 1, folder, exact=True)
-
-
-def test_a_run_is_judged_by_views_that_it_did_not_lift(tmp_path):
-    order = order_of(tmp_path)
-    exact = measure_run(order)
-    assert (exact["views"], exact["accuracies"]["unions"], exact["lost_share"]) == (2, [], 0)
-    assert [exact["cosine"], exact["cosine_plain"]] == pytest.approx([1.0, 1.0])
-    assert -1 < exact["accuracies"]["centred_cosine"][0] < 1
-    assert exact["peak_memory_bytes"] > 1 << 26
-    assert exact["cpu_with_reading_s"] > exact["cpu_s"] > 0
-    draft_run = measure_run(replace(order, settings={"quality": "draft"}, exact=False))
-    assert draft_run["cosine"] < 1
-    full_run = measure_run(replace(order, lifted=("v0", "v1", "v2"), settings={}, exact=False))
-    assert full_run["accuracies"]["centred_cosine"] > exact["accuracies"]["centred_cosine"]  # the view was lifted

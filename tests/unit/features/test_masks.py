@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from liftcore.features.mask_files import read_runs
 from liftcore.features.masks import mask_views
 from liftcore.values.pack import read_features, write_pack
 from liftcore.values.views import MAX_LEVELS, Regions, label_levels
-from tests.run_lengths import compressed, lengths_of, sam_records
+from tests.run_lengths import compressed, lengths_of, sam_records, write_files
 
 LABELS = np.array([[-1, 0, 0, 2], [1, 1, -1, 2], [1, 1, -1, -1]])
 MASKS = np.stack([k == LABELS for k in range(3)])
@@ -27,21 +26,6 @@ VECTORS = np.arange(15, dtype=np.float32).reshape(3, 5)
 GREY, VALUES_255 = (LABELS + 1).astype(np.uint8), np.where(LABELS < 0, 255, LABELS).astype(np.uint8)
 PALETTE = Image.fromarray(GREY)
 PALETTE.putpalette([255, 0, 0, 0, 255, 0, 0, 0, 255])
-
-
-def save(folder: Path, files: dict[str, Any]) -> None:
-    """Write each file by its suffix and content; texts and bytes as they are."""
-    for name, content in files.items():
-        path = folder / name
-        path.parent.mkdir(exist_ok=True)
-        if isinstance(content, bytes):
-            path.write_bytes(content)
-        elif path.suffix == ".npy":
-            np.save(path, content)
-        elif path.suffix.lower() == ".png":
-            (content if isinstance(content, Image.Image) else Image.fromarray(content)).save(path)
-        else:
-            path.write_text(content if isinstance(content, str) else json.dumps(content), encoding="utf-8")
 
 
 KINDS: dict[str, dict[str, Any]] = {
@@ -57,7 +41,7 @@ KINDS: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_masks_makes_the_same_regions(kind: str, tmp_path: Path) -> None:
-    save(tmp_path, {"a.npy": VECTORS, **KINDS[kind]})
+    write_files(tmp_path, {"a.npy": VECTORS, **KINDS[kind]})
     write_pack(tmp_path / "pack.safetensors", mask_views(tmp_path), {})
     packs = read_features(tmp_path / "pack.safetensors")
     assert packs.views == ("a",)
@@ -68,10 +52,10 @@ def test_every_kind_of_masks_makes_the_same_regions(kind: str, tmp_path: Path) -
 
 
 def test_views_are_named_as_their_cameras_are_and_with_their_folders(tmp_path: Path) -> None:
-    save(tmp_path, {f"{name}.npy": VECTORS for name in ("a.jpg", "frame.0001", "c", "camA/0")})
-    save(tmp_path, {"a.jpg_masks.npy": MASKS, "camA/0_masks.npy": MASKS, "c.PNG": GREY})
-    save(tmp_path, {"frame.0001.json": sam_records(MASKS)})
-    save(tmp_path, {"notes.txt": "passed over", ".thumbnails/0.png": b"no mask"})
+    write_files(tmp_path, {f"{name}.npy": VECTORS for name in ("a.jpg", "frame.0001", "c", "camA/0")})
+    write_files(tmp_path, {"a.jpg_masks.npy": MASKS, "camA/0_masks.npy": MASKS, "c.PNG": GREY})
+    write_files(tmp_path, {"frame.0001.json": sam_records(MASKS)})
+    write_files(tmp_path, {"notes.txt": "passed over", ".thumbnails/0.png": b"no mask"})
     views = mask_views(tmp_path)
     assert [*views] == ["a", "c", "camA/0", "frame.0001"]
     assert {views[view].labels.tolist() == [LABELS.tolist()] for view in views} == {True}
@@ -87,13 +71,13 @@ def test_views_are_named_as_their_cameras_are_and_with_their_folders(tmp_path: P
     ],
 )
 def test_files_without_their_partners_are_refused(files: str, message: str, tmp_path: Path) -> None:
-    save(tmp_path, dict.fromkeys(files.split(), b"not opened yet"))
+    write_files(tmp_path, dict.fromkeys(files.split(), b"not opened yet"))
     with pytest.raises(InvalidFeatures, match=message):
         mask_views(tmp_path)
 
 
 def test_values_that_begin_at_one_are_refused_where_zero_was_expected(tmp_path: Path) -> None:
-    save(tmp_path, {"a.npy": VECTORS, "a.png": GREY})
+    write_files(tmp_path, {"a.npy": VECTORS, "a.png": GREY})
     message = r"values 0\.\.2 for 3 vectors, and 255 for none, got the value 3; .*--unlabelled 0"
     with pytest.raises(InvalidFeatures, match=message):
         mask_views(tmp_path, 255)["a"]

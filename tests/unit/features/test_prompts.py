@@ -17,7 +17,7 @@ from liftcore.features.prompts import prompt_views
 from liftcore.values.pack import read_features
 from liftcore.values.views import Regions
 from tests.promises.command_line import run
-from tests.run_lengths import sam_records
+from tests.run_lengths import sam_records, write_files
 from tests.tiny_scene import labels
 
 PHRASES = {0: "red_apple", 2: "Lamp"}  # the cluster between them has no phrase
@@ -30,20 +30,6 @@ MASKS = {
 def records(view: str, key: str = "class_name", *, as_string: bool = False) -> list[dict[str, Any]]:
     entries = sam_records(np.stack(list(MASKS[view].values())), as_string=as_string)
     return [{**record, key: phrase} for record, phrase in zip(entries, MASKS[view], strict=True)]
-
-
-def save(folder: Path, files: dict[str, Any]) -> Path:
-    """Write arrays as images, bytes and texts as they are, and other values as JSON."""
-    for name, content in files.items():
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if isinstance(content, np.ndarray):
-            Image.fromarray(content).save(path)
-        elif isinstance(content, bytes):
-            path.write_bytes(content)
-        else:
-            path.write_text(content if isinstance(content, str) else json.dumps(content), encoding="utf-8")
-    return folder
 
 
 def binary(name: str) -> dict[str, np.ndarray]:
@@ -96,7 +82,7 @@ KINDS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_makes_the_same_pack(kind: str, tmp_path: Path) -> None:
     files, options = KINDS[kind]
-    save(tmp_path / "masks", files)
+    write_files(tmp_path / "masks", files)
     options = {name: str(tmp_path / "masks" / value) if name == "names" else value for name, value in options.items()}
     flags = [part for name, value in options.items() for part in (f"--{name}", value)]
     pack = tmp_path / "pack.safetensors"
@@ -118,7 +104,7 @@ def test_every_kind_makes_the_same_pack(kind: str, tmp_path: Path) -> None:
 def test_masks_in_black_on_white_in_most_views_give_a_warning(inverted: int, tmp_path: Path) -> None:
     views, files = list(MASKS)[:inverted], binary("{phrase}/{view}")
     files = {name: 255 - mask if Path(name).stem in views else mask for name, mask in files.items()}
-    warnings = prompt_views(save(tmp_path, files)).warnings
+    warnings = prompt_views(write_files(tmp_path, files)).warnings
     assert ("black on white" in " ".join(warnings)) == (inverted == 2)  # of three
 
 
@@ -126,7 +112,7 @@ def test_masks_that_overlap_count_for_both_phrases(tmp_path: Path) -> None:
     mask = MASKS["middle"]["Lamp"]
     empty, full = np.zeros_like(mask), np.ones_like(mask)
     files = {"lamp/a.png": mask, "lamp/b.png": empty, "thing/a.png": full, "ghost/a.png": empty}
-    prompts = prompt_views(save(tmp_path, files))
+    prompts = prompt_views(write_files(tmp_path, files))
     assert prompts.table.words == ("lamp", "thing")
     assert prompts.counts == {"ghost": 0, "lamp": 1, "thing": 1}
     view = prompts.views["a"]
@@ -164,6 +150,6 @@ def test_masks_that_overlap_count_for_both_phrases(tmp_path: Path) -> None:
     ],
 )
 def test_what_is_no_such_folder_is_refused(files: dict[str, Any], message: str, tmp_path: Path) -> None:
-    save(tmp_path / "masks", files)
+    write_files(tmp_path / "masks", files)
     with pytest.raises(InvalidFeatures, match=message):
         prompt_views(tmp_path / "masks").views["a"]

@@ -3,7 +3,7 @@
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from liftcore.query.terms import Example, Pixel, PixelBox, SplatTerm, Stroke, Ve
 from liftcore.query.threshold import find_threshold
 from liftcore.scene.cameras import Cameras
 from liftcore.values.lift_file import save_lift
+from tests.promises.tiny_files import write_lift
 from tests.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH
 
 COUNT = 3 * SPLATS_A_CLUSTER
@@ -85,8 +86,8 @@ def test_words_of_a_table_are_asked_without_torch(tiny_lift: Path) -> None:
     subprocess.run([sys.executable, "-c", code, str(tiny_lift)], check=True)
 
 
-def test_cameras_may_be_added_but_not_moved(lift_tiny: Callable[..., Path], tmp_path: Path) -> None:
-    lift, file = lift_tiny(tmp_path), tmp_path / "c.json"
+def test_cameras_may_be_added_but_not_moved(tmp_path: Path) -> None:
+    lift, file = write_lift(tmp_path), tmp_path / "c.json"
     document = json.loads(file.read_text())
     document["frames"].append({**document["frames"][0], "file_path": "images/new.png"})
     file.write_text(json.dumps(document))
@@ -205,10 +206,8 @@ def test_vectors_come_from_numpy_files(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".splat"])
-def test_a_lift_with_other_rows_than_its_splats_answers_nothing(
-    suffix: str, lift_tiny: Callable[..., Path], tmp_path: Path
-) -> None:
-    path = lift_tiny(tmp_path)
+def test_a_lift_with_other_rows_than_its_splats_answers_nothing(suffix: str, tmp_path: Path) -> None:
+    path = write_lift(tmp_path)
     lift, splats = load_lift(path), tmp_path / f"other{suffix}"
     rows = ("features", "total_weight", "has_feature", "confidence", "cluster", "object", "node")
     cropped = {name: getattr(lift, name)[:-1] for name in rows if getattr(lift, name) is not None}

@@ -1,6 +1,5 @@
 """Answers as splat files: the object alone, and the scene in the colours of its scores."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +12,16 @@ from liftcore.query.question import Answer, Query
 from liftcore.query.scene import Scene
 from liftcore.query.terms import Vector
 from liftcore.scene.harmonics import SH_C0
+from tests.promises.tiny_files import write_lift
 from tests.tiny_scene import AXES, ply, splat_rows
 
 
 @pytest.fixture
-def scene(lift_tiny: Callable[..., Path], tmp_path: Path) -> Scene:
+def scene(tmp_path: Path) -> Scene:
     """The lifted tiny scene with one more splat that no camera sees."""
     behind = splat_rows()[:1].copy()
     behind[0, 2] = 40.0
-    return Scene(lift_tiny(tmp_path, splats=ply(np.concatenate([splat_rows(), behind]))))
+    return Scene(write_lift(tmp_path, splats=ply(np.concatenate([splat_rows(), behind]))))
 
 
 def of_lamp(scene: Scene, threshold: float = 0.5) -> Answer:

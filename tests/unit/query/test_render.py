@@ -1,7 +1,6 @@
 """A scene and its answers seen from a camera: masks, colours, depths, in the pixels of the photo."""
 
 import io
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,6 +32,7 @@ from liftcore.scene.distortion import Fisheye
 from liftcore.scene.drawing import in_photo
 from liftcore.scene.harmonics import SH_C0
 from liftcore.scene.splats import Kernel, Splats
+from tests.promises.tiny_files import write_lift
 from tests.scenes import look_at, random_camera, random_splats
 from tests.tiny_scene import AXES, HEIGHT, SPLATS_A_CLUSTER, WIDTH
 
@@ -40,9 +40,9 @@ from .made_up import answer_with
 
 
 @pytest.fixture(scope="module")
-def lifted(lift_tiny: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def lifted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The tiny scene lifted with a scale of the opacity logits."""
-    return lift_tiny(tmp_path_factory.mktemp("tikhonov"), "tikhonov")
+    return write_lift(tmp_path_factory.mktemp("tikhonov"), preset="tikhonov")
 
 
 @pytest.fixture

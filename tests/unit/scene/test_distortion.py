@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from liftcore.errors import InvalidCameras
 from liftcore.io.colmap import MODELS_BY_NAME, calibration
-from liftcore.scene.cameras import Camera, behind_lens, distortion_warning
+from liftcore.scene.cameras import Camera, behind_lens
 from liftcore.scene.distortion import FARTHEST, Brown, Distortion, Fisheye, Lens
 
 POINTS = np.array([[0.1, 0.2], [-0.6, 0.45], [0.7, -0.5], [0.0, 0.55]])
@@ -140,25 +139,3 @@ def test_the_pinhole_of_a_photo_is_the_largest_that_it_shows_whole(name: str) ->
 def test_what_no_lens_does_is_refused(distortion: Distortion, message: str) -> None:
     with pytest.raises(InvalidCameras, match=f"camera 'v' distortion: .*({message}).*calibrate"):
         camera(distortion)
-
-
-def test_warning_tells_the_least_share_and_knows_no_hundred_percent_or_more() -> None:
-    barrel, slight, undistorted = (
-        camera(Brown(k1=-0.25)),
-        camera(Brown(k1=1e-12)),
-        replace(camera(Brown(k1=0.0)), lens=None),
-    )
-    lens = lens_of(barrel)
-    v, u = np.meshgrid(np.arange(lens.height) + 0.5, np.arange(lens.width) + 0.5, indexing="ij")
-    x, y = lens.on_plane(u, v)
-    x, y = x * barrel.fx + barrel.cx, y * barrel.fy + barrel.cy
-    visible = (x >= 0) & (x <= barrel.width) & (y >= 0) & (y <= barrel.height)  # of the photo by its pinhole
-    assert lens.share == pytest.approx(visible.mean(), abs=0.01)
-    (warning,) = distortion_warning([slight, barrel, undistorted])
-    assert (
-        f"2 of 3 views are of distorted photos, of each of which {lens_of(barrel).share:.0%} or more is lifted"
-        in warning
-    )
-    (warning,) = distortion_warning([slight])
-    assert "of each of which nearly all is lifted: features" in warning
-    assert distortion_warning([undistorted]) == []

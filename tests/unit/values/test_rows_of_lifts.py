@@ -8,6 +8,8 @@ import pytest
 import torch
 
 import liftcore as lc
+from liftcore.values.lift import InputFile
+from liftcore.values.lift_file import found_input, input_file
 from tests.scenes import random_camera, random_splats, write_scene
 
 MATRIX = np.array([[0.0, -2, 0, 1], [2, 0, 0, 2], [0, 0, 2, 3]])
@@ -96,3 +98,14 @@ def test_lift_of_files_knows_its_splats_in_memory(tmp_path: Path) -> None:
         copy.query(np.eye(1, 6), splats=loaded[::-1])
     with pytest.raises(lc.InvalidSplats, match=r"got 49 splats; crop a lift as its splats"):
         copy.query(np.eye(1, 6), splats=loaded[1:])
+
+
+def test_an_input_of_a_store_is_found_by_its_digest(scene, tmp_path: Path) -> None:
+    blob = tmp_path / "blobs" / "x.ply"
+    blob.parent.mkdir()
+    blob.write_bytes(b"splats")
+    digest = input_file(blob).sha256
+    (blob.parent / digest[:2]).mkdir()
+    stored = blob.rename(blob.parent / digest[:2] / f"{digest}.ply")
+    absent = InputFile(path="/nowhere/splats.ply", sha256=digest)
+    assert found_input("splats", absent, scene[2].metadata, tmp_path / "lifts" / "x.safetensors") == stored
