@@ -111,17 +111,11 @@ def settings_of(options: argparse.Namespace) -> LiftSettings:
 
 def pairs_of(pairs: Sequence[str]) -> dict[str, Any]:
     """Parse names and values of ``key=value``; a value is JSON, or else a text."""
-    from liftcore import LiftSettings
-    from liftcore.runtime.arguments import nearest
-
     values: dict[str, Any] = {}
     for pair in pairs:
         key, equals, text = pair.partition("=")
         if not equals or not key:
             raise InvalidSettings("--set", expected="key=value", got=repr(pair))
-        if key not in LiftSettings.model_fields:
-            hint = nearest(key.replace("-", "_"), LiftSettings.model_fields, 3)
-            raise InvalidSettings("--set", expected="a setting of a lift", got=f"the unknown {key[:80]!r}", hint=hint)
         value = _value(text)
         if key in values and values[key] != value:
             raise _contradiction(key, f"--set {key}={values[key]}", f"--set {pair}")

@@ -9,7 +9,10 @@ import numpy as np
 
 from liftcore.errors import InvalidInput, InvalidQuery, Unavailable, reading
 
-__all__ = ["BUILT_IN", "NO_WORDS", "OWN_WORDS", "TextEncoder", "check_encoder", "encoder_file", "open_encoder"]
+__all__ = [
+    "BUILT_IN", "NO_WORDS", "OWN_WORDS", "CachingEncoder", "TextEncoder", "check_encoder", "encoder_file",
+    "open_encoder",
+]  # fmt: skip
 ENCODER_SPECS = (
     "table:FILE.safetensors",
     "lvis",

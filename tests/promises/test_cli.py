@@ -185,7 +185,7 @@ REFUSALS = {  # words -> what the line says
     "lift {s} {c} nope -o {out}/x.safetensors": "nope: expected a feature pack (.safetensors), got a file",
     "lift {s} {c} {f} -o {out}/x.safetensors --set power=3": "power: expected",
     "lift {s} {c} {f} -o {out}/x.safetensors --set power": "--set: expected key=value, got 'power'",
-    "lift {s} {c} {f} -o {out}/x.safetensors --set strides=2": "unknown 'strides'; nearest: stride",
+    "lift {s} {c} {f} -o {out}/x.safetensors --set strides=2": "an unknown setting; nearest: stride",
     "lift {s} {c} {f} -o {out}/x.safetensors --set stride=2 --set stride=3": "expected one value, got --set stride=2",
     "lift {s} {c} {f} -o {out}/x.safetensors --preset row-sum --set preset=argmax": "got --preset row-sum and --set",
     "lift {s} {c} {f} -o {out}/x.safetensors --threads 0": "a whole number of one or more, got '0'",
