@@ -1,8 +1,8 @@
-"""The one kind of child process, for checks, plans and jobs: orders go in, JSON lines come out.
+"""The one kind of child process, for checks, plans, jobs and queries: orders go in, JSON lines come out.
 
 A child leads a process group. It holds the reading end of a pipe, its lifeline: when the server ends, however it
 ends, the kernel ends the group. A spare child has imported what it needs before its order comes. The child of a check
-becomes the spare again after its answer; that of a job is ended with all that it started.
+or a query becomes the spare again after its answer; that of a job is ended with all that it started.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ STOPPED_SECONDS = 2.0  # after which a stopped process (SIGSTOP) is given up
 STOPPED = "its process was stopped"
 GONE_SECONDS = 3.0  # for the kernel to end a process group
 ORDERS = 100  # of a child, then a fresh one takes its place: what libraries keep does not add up
+TRIES = 3  # of an order that a request waits for, whose process is killed
 LINE_BYTES = 8192  # of what a process prints, in one record of the log
 NICENESS = 10  # of jobs, as queries have priority: beside one, a lift gets a tenth of a core
 Message = dict[str, Any]
@@ -163,15 +164,21 @@ def is_last(message: Message) -> bool:
 
 
 class Children:
-    """Starts children with so many threads, and keeps one spare."""
+    """Starts children with so many threads, of a module that calls `do_orders`, and keeps one spare."""
 
-    def __init__(self, threads: int = 1) -> None:
-        self.stopping = threading.Event()
-        self._threads, self._lock, self._running = f"{threads}", threading.Lock(), set[Child]()
+    def __init__(
+        self, threads: int = 1, module: str = "service.process", *arguments: str, orders: float = ORDERS,
+        **environment: str,
+    ) -> None:  # fmt: skip
+        self.stopping, self.starts = threading.Event(), 0
+        self._command, self._orders = (module, *arguments), orders
+        self._environment = environment | {"OMP_NUM_THREADS": f"{threads}", "OPENBLAS_NUM_THREADS": f"{threads}"}
+        self._lock, self._running = threading.Lock(), set[Child]()
         self._spare: Child | None = self._start()
 
     def _start(self) -> Child:
-        return Child("service.process", OMP_NUM_THREADS=self._threads, OPENBLAS_NUM_THREADS=self._threads)
+        self.starts += 1
+        return Child(*self._command, **self._environment)
 
     def count(self) -> int:
         """Return the number of children that work."""
@@ -212,7 +219,7 @@ class Children:
                     else:
                         take(message)
         finally:
-            if last is not None and reusable and not reasons and child.orders < ORDERS:
+            if last is not None and reusable and not reasons and child.orders < self._orders:
                 self._keep(child)
                 status = 0
             else:
@@ -228,10 +235,11 @@ class Children:
         return Ending(None, "".join(reasons) or f"its process ended with {ending}", was_killed)
 
     def check(self, order: Message, seconds: float, argument: str) -> Message:
-        """Return the result of an order that a request waits for. After a kill from outside it is sent once more."""
+        """Return the result of an order that a request waits for. After a kill from outside it is sent again."""
         ending = self.run(order, seconds, reusable=True)
-        if ending.was_killed:
-            ending = self.run(order, seconds, reusable=True)
+        for _ in range(TRIES - 1):
+            if ending.was_killed:
+                ending = self.run(order, seconds, reusable=True)
         if ending.last is not None:
             if "fault" in ending.last:
                 raise Fault(ending.last["fault"])
@@ -338,19 +346,20 @@ class Reporter:
 
 def limit_memory(count: int | None) -> None:
     """Limit private memory to what this process has now, of its imports, and so many bytes; None: no limit."""
-    hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
-    lines = Path("/proc/self/status").read_text().splitlines()
-    present = next(int(line.split()[1]) << 10 for line in lines if line.startswith("VmData:"))
-    resource.setrlimit(resource.RLIMIT_DATA, (hard if count is None else present + count, hard))
+    hard = limit = resource.getrlimit(resource.RLIMIT_DATA)[1]
+    if count is not None:
+        lines = Path("/proc/self/status").read_text().splitlines()
+        limit = count + next(int(line.split()[1]) << 10 for line in lines if line.startswith("VmData:"))
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
 
 
-def run(order: Message, report: Reporter) -> Message:
-    """Do the work of an order; return its last message."""
+def run(tasks: Any, order: Message, report: Reporter) -> Message:
+    """Do the work of an order by the task of its name; return its last message."""
     os.environ["TMPDIR"] = tempfile.tempdir = order["scratch"]
     names = order["names"] | {order["scratch"]: "the server's temporary folder"}
     try:
         limit_memory(order.get("memory"))
-        return {"result": getattr(importlib.import_module(TASKS), order["task"])(order, report)}
+        return {"result": getattr(tasks, order["task"])(order, report)}
     except (SplatliftError, OSError) as error:
         cause = error.__cause__ or error  # a lift in blocks wraps the error of a full folder
         if isinstance(cause, OSError) and cause.errno in FULL:
@@ -363,17 +372,17 @@ def run(order: Message, report: Reporter) -> Message:
         return {"fault": fault_of(InvalidRequest(order["kind"], expected="one that fits the memory", got="more"))}
 
 
-def main() -> None:
-    """Import what tasks need, then do orders until the server has ended."""
+def do_orders(open_tasks: Callable[[], Any]) -> None:
+    """Import what tasks need, then do orders until the server has ended: by a module, or the methods of an object."""
     end_with_parent(int(sys.argv[1]))
     report = Reporter(own_stdout())
     with contextlib.suppress(OSError):  # if memory runs out, the kernel ends this process rather than the server
         Path("/proc/self/oom_score_adj").write_text("500")
-    importlib.import_module(TASKS)
+    tasks = open_tasks()
     for line in sys.stdin.buffer:
-        report.say(run(json.loads(line), report))
+        report.say(run(tasks, json.loads(line), report))
     os._exit(0)  # skip the exit handlers of libraries
 
 
 if __name__ == "__main__":
-    main()
+    do_orders(lambda: importlib.import_module(TASKS))

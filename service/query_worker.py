@@ -1,8 +1,7 @@
 """Answer the requests of the query process: answers, scores, masks, maps, renders and splats over open scenes.
 
-Run as ``python -m service.query_worker LIFELINE ENCODER``. Requests are JSON lines on stdin. Each is answered by a
-JSON line on stdout: ``value``, ``fault`` or ``crash``; or ``bytes``, the number of bytes that follow, 0 if they are
-in the file that the request names as its draft.
+Run as ``python -m service.query_worker LIFELINE ENCODER``. A request is an order (`service.process`) of the task
+``reply``, with an ``operation``.
 """
 
 from __future__ import annotations
@@ -14,11 +13,10 @@ import json
 import math
 import sys
 import threading
-import traceback
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlencode
 
 import zstandard
@@ -40,15 +38,19 @@ from liftcore.errors import InvalidQuery
 from liftcore.files import cameras_of_views, finite
 from liftcore.models import Edit, OwnCamera, SceneTree, SelectionSummary, Viewpoint
 from liftcore.text import OWN_WORDS, CachingEncoder
-from service.errors import FULL, NoSpace, fault_of
-from service.process import end_with_parent, own_stdout
+from service.process import do_orders
 from service.settings import encoder_version
+
+if TYPE_CHECKING:
+    from service.process import Reporter
 
 EDITED = "edited"  # the name of a selection during an edit; names of questions are hexadecimal
 SCENES = 2  # lifts that are kept open
 CACHE_BYTES = 256 << 20  # of answers and views that are kept
 ENTRY_BYTES = 2 << 10  # of what is no array in a cached value: an object, a word
-PIPE_BYTES = 256 << 10  # of an answer in the pipe; a larger one is a file, so that a slow client keeps no memory
+PIPE_BYTES = 256 << 10  # of a document in the pipe; a larger one is a file, so that a slow client keeps no memory
+DOCUMENTS = ("query", "objects", "segment", "what", "askable", "catalogue", "tree")
+VALUES = ("views", "edit", "count_objects")  # for the HTTP process
 WORD_COSINES = 1 << 31  # of splats times words: about a minute and a half on one core
 MASK_PIXELS = 1 << 26  # of all views of an export: a minute, as for the largest picture
 # Files of an answer and of many words, by operation: what `Scene.blocks_of` calls them
@@ -86,44 +88,38 @@ def bytes_of(value: Any) -> int:
 class Answers:
     """Answer requests; a lift is identified by its path, a text encoder by its specification."""
 
-    def __init__(self) -> None:
+    def __init__(self, encoder: str) -> None:
         self._scenes = OrderedDict[str, Scene]()
         self._cache = Cache(CACHE_BYTES)
         self._encoders: dict[str, tuple[object, TextEncoder]] = {}  # spec -> version of its file, encoder
         self._opening = threading.RLock()  # for opening encoders, which the warm-up does too
         self._warm = set[Kernel]()  # kernels of splats whose compiled code is loaded or being loaded
-        self._operations: dict[str, Callable[[Request], Any]] = {
-            "query": self._query,
-            "objects": self._objects,
-            "segment": self._segment,
-            "what": self._nearest_words,
-            "askable": self._askable,
-            "catalogue": self._catalogue,
-            "tree": self._tree,
-        }
-        self._values: dict[str, Callable[[Request], dict[str, Any]]] = {
-            "views": self._views,
-            "edit": self._edit,
-            "count_objects": self._count_objects,
-        }
+        threading.Thread(target=self._warm_up, args=(encoder,), daemon=True).start()
 
-    def warm_up(self, encoder: str) -> None:
+    def _warm_up(self, encoder: str) -> None:
         """Load what the first query would wait for: an encoder and the compiled kernels."""
         with contextlib.suppress(SplatliftError), self._opening:  # the error goes to the queries that need it
             self._encoder(encoder, encoder_version(encoder)).encode(["something"])
         Scene.warm_up()
         self._warm_kernel(Kernel.GAUSSIAN_3D)
 
-    def reply(self, request: Request) -> tuple[dict[str, Any], Iterable[bytes]]:
-        """Return the value for a request by its ``operation``, or the content of its answer."""
+    def reply(self, request: Request, _: Reporter) -> dict[str, Any]:
+        """Answer by a value or the ``content`` of a document; large ones and files are written to the draft."""
         operation = request["operation"]
         if request["lift"] in self._scenes:  # each request describes its selections, whatever another request set
             self._scenes[request["lift"]].selections.clear()
-        if operation in self._values:
-            return {"value": self._values[operation](request)}, ()
-        if operation in self._operations:
-            return {}, [json_of(request.get("head", {}) | self._operations[operation](request))]
-        return {}, self._file(request)
+        if operation in VALUES:
+            return getattr(self, operation)(request)
+        if operation in DOCUMENTS:
+            content = json_of(request["head"] | getattr(self, operation)(request))
+            if len(content) <= PIPE_BYTES:
+                return {"content": content.decode()}
+            blocks: Iterable[bytes] = [content]
+        else:
+            blocks = self._file(request)
+        with Path(request["draft"]).open("wb") as file:
+            file.writelines(blocks)
+        return {}
 
     # Open scenes, encoders and answers
 
@@ -208,7 +204,7 @@ class Answers:
 
     # Documents
 
-    def _query(self, request: Request) -> dict[str, Any]:
+    def query(self, request: Request) -> dict[str, Any]:
         scene, answer = self._scene(request), self._answer(request)
         if request["view"] is not None:
             scene.cameras[request["view"]]  # refuse an unknown view now rather than at its picture
@@ -223,24 +219,24 @@ class Answers:
         document = scene.locate(answer, request["top"]).model_dump(mode="json")
         return document | {"view": view, "links": links}
 
-    def _objects(self, request: Request) -> dict[str, Any]:
+    def objects(self, request: Request) -> dict[str, Any]:
         document = self._answer(request).model_dump(mode="json", include=set(SelectionSummary.model_fields))
         return document | self._grouped(request).model_dump(mode="json")
 
-    def _segment(self, request: Request) -> dict[str, Any]:
+    def segment(self, request: Request) -> dict[str, Any]:
         return self._segmentation(request).summary.model_dump(mode="json")
 
-    def _nearest_words(self, request: Request) -> dict[str, Any]:
+    def what(self, request: Request) -> dict[str, Any]:
         words, encoder = self._words(request)
         best = self._scene(request).nearest_words(request["example"], words, top=request["top"], encoder=encoder)
         return {"words": [word.model_dump(mode="json") for word in best]}
 
-    def _askable(self, request: Request) -> dict[str, Any]:
+    def askable(self, request: Request) -> dict[str, Any]:
         encoder = self._text_encoder(request)
         words = self._scene(request).askable(request["text"], request["count"], encoder=encoder)
         return words.model_dump(mode="json")
 
-    def _catalogue(self, request: Request) -> dict[str, Any]:
+    def catalogue(self, request: Request) -> dict[str, Any]:
         tree, labels = self._named_tree(request), request["object_labels"]
         first, last = request["first"], request["first"] + request["count"]
         objects = [
@@ -251,14 +247,14 @@ class Answers:
         head = tree.model_dump(mode="json", exclude={"nodes"})
         return head | {"count": count, "next": last if last < count else None, "objects": objects}
 
-    def _tree(self, request: Request) -> dict[str, Any]:
+    def tree(self, request: Request) -> dict[str, Any]:
         tree, first, last = self._named_tree(request), request["first"], request["first"] + request["count"]
         page = tree.model_copy(update={"nodes": tree.nodes[first:last]})
         return page.model_dump(mode="json") | {"next": last if last < tree.count else None}
 
     # Values for the HTTP process
 
-    def _views(self, request: Request) -> dict[str, Any]:
+    def views(self, request: Request) -> dict[str, Any]:
         scene, (first, count) = self._scene(request), request["range"]
         names: Iterable[str] = itertools.islice(scene.cameras, first, first + count)
         if "view" in request:
@@ -270,7 +266,7 @@ class Answers:
         ]
         return {"views": cameras, "next": first + count if first + count < len(scene.cameras) else None}
 
-    def _edit(self, request: Request) -> dict[str, Any]:
+    def edit(self, request: Request) -> dict[str, Any]:
         """Return a selection after an edit: its count, box, and bits."""
         scene = self._scene(request)
         answer = self._answer(request) if "query" in request else None
@@ -280,7 +276,7 @@ class Answers:
         bits = selection.bits.hex()
         return {"count": int(selection.splats.sum()), "box": finite(box), "bits": bits}
 
-    def _count_objects(self, request: Request) -> dict[str, Any]:
+    def count_objects(self, request: Request) -> dict[str, Any]:
         views = self._scene(request).object_views
         return {"count": 0 if views is None else len(views)}
 
@@ -374,50 +370,5 @@ def view_of(request: Request) -> str | Camera:
     return Viewpoint(view=request.get("view"), camera=request.get("camera")).seen_from()
 
 
-def write_answer(out: BinaryIO, header: dict[str, Any], blocks: Iterable[bytes], draft: Path) -> None:
-    """Write an answer: a small one to the pipe, a large one to the draft that the HTTP process sends and removes."""
-    rest, content = iter(blocks), b""
-    for block in rest:
-        content += block
-        if len(content) > PIPE_BYTES:
-            try:
-                with draft.open("wb") as file:
-                    file.write(content)
-                    file.writelines(rest)
-            except OSError as error:
-                if error.errno not in FULL:
-                    raise
-                expected, hint = "room on the disk for the answer", "ask again later, or tell the operator"
-                raise NoSpace("data", expected=expected, got="a full disk", hint=hint) from None
-            content = b""
-    out.write(json.dumps(header or {"bytes": len(content)}, allow_nan=False).encode() + b"\n" + content)
-    out.flush()
-
-
-def _warm_up(answers: Answers, encoder: str) -> None:
-    try:
-        answers.warm_up(encoder)
-    except Exception:  # the next request gets the same error
-        traceback.print_exc()
-
-
-def main() -> None:
-    """Answer requests until the server has ended."""
-    end_with_parent(int(sys.argv[1]))
-    out, answers = own_stdout(), Answers()
-    threading.Thread(target=_warm_up, args=(answers, sys.argv[2]), daemon=True).start()
-    for line in sys.stdin.buffer:
-        request = json.loads(line)
-        draft = Path(request.get("draft", ""))
-        try:
-            header, blocks = answers.reply(request)
-            write_answer(out, header, blocks, draft)
-        except SplatliftError as error:
-            write_answer(out, {"fault": fault_of(error, request["names"])}, (), draft)
-        except Exception:
-            traceback.print_exc()
-            write_answer(out, {"crash": True}, (), draft)
-
-
 if __name__ == "__main__":
-    main()
+    do_orders(lambda: Answers(sys.argv[2]))

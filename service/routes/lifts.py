@@ -159,7 +159,7 @@ def get_photo(lift: str, view: View, request: Request, deps: Deps, owner: Caller
 
     def camera_size() -> tuple[int, int] | None:
         work = scene_request("views", record, deps) | {"view": view, "range": (0, 0)}
-        views = deps.queries.call(work)["value"]["views"]
+        views = deps.queries.call(work)["views"]
         return (views[0]["width"], views[0]["height"]) if views else None
 
     record = deps.store.lift(owner, lift)
@@ -179,7 +179,7 @@ def get_photo(lift: str, view: View, request: Request, deps: Deps, owner: Caller
 def list_views(lift: str, deps: Deps, owner: Caller, limit: Limit = models.PAGE, cursor: Number = 0) -> models.Views:
     """List the cameras of the scene with their poses, in pages; also those that were not lifted."""
     record = deps.store.lift(owner, lift)
-    value = deps.queries.call(scene_request("views", record, deps) | {"range": (cursor, limit)})["value"]
+    value = deps.queries.call(scene_request("views", record, deps) | {"range": (cursor, limit)})
     names = [view["name"] for view in value["views"]]
     photos: set[str] = set()
     if record.photos is not None:

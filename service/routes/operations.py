@@ -111,7 +111,7 @@ def readyz(deps: Deps) -> Status:
     deps.store.require_usable()
     for name, is_alive in (
         ("the runner of jobs", deps.runner.is_alive()),
-        ("the query process", deps.queries.revive()),
+        ("the query process", deps.queries.is_ready()),
         ("the process that checks uploads", deps.children.is_ready()),
     ):
         if not is_alive:

@@ -5,18 +5,20 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import os
 import re
 import secrets
 from pathlib import Path
 from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
+import anyio
 from fastapi import APIRouter, Request, Response
 from fastapi import Path as PathParameter
 from fastapi import Query as Parameter
 from fastapi.responses import FileResponse
-from starlette.background import BackgroundTask
 from starlette.convertors import register_url_convertor
+from starlette.types import Receive, Scope, Send
 
 from liftcore import Query, __version__
 from liftcore.text import encoder_file
@@ -102,16 +104,25 @@ def respond(
     draft = deps.store.root / "tmp" / f"{secrets.token_hex(16)}{Path(filename or '').suffix}"
     deps.store.make_folders()
     try:
-        content = deps.queries.call(work | {"draft": str(draft)})["content"]
+        answer = deps.queries.call(work | {"draft": str(draft)})
     except BaseException:
         draft.unlink(missing_ok=True)
         raise
-    if content or not draft.exists():
-        if filename is not None:
-            headers["Content-Disposition"] = f'attachment; filename="{filename}"'
-        return Response(content, headers=headers, media_type=media_type)
-    remove = BackgroundTask(draft.unlink, missing_ok=True)
-    return FileResponse(draft, headers=headers, media_type=media_type, filename=filename, background=remove)
+    if "content" in answer:
+        return Response(answer["content"], headers=headers, media_type=media_type)
+    return DraftResponse(draft, headers=headers, media_type=media_type, filename=filename)
+
+
+class DraftResponse(FileResponse):
+    """A file that is removed after its answer, also one that is refused (416) or broken off."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the file, and remove it."""
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            with anyio.CancelScope(shield=True):
+                await anyio.to_thread.run_sync(os.unlink, self.path)
 
 
 def scene_request(operation: str, lift: models.Lift, deps: Parts) -> dict[str, Any]:
@@ -119,6 +130,9 @@ def scene_request(operation: str, lift: models.Lift, deps: Parts) -> dict[str, A
     splats, cameras = (deps.store.asset(SERVICE, asset) for asset in (lift.splats, lift.cameras))
     names = {str(item.file): item.client_name for item in (splats, cameras)}
     return {
+        "task": "reply",
+        "kind": "query",
+        "scratch": str(deps.store.root / "tmp"),
         "operation": operation,
         "lift": str(lift.file),
         "sha256": lift.sha256,

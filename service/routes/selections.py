@@ -94,7 +94,7 @@ def change_object_label(
 ) -> models.ObjectLabel:
     """Give an object of a lift a name of your own, or hide it from lists and pictures; other fields stay."""
     record = deps.store.lift(owner, lift)
-    count = deps.queries.call(scene_request("count_objects", record, deps))["value"]["count"]
+    count = deps.queries.call(scene_request("count_objects", record, deps))["count"]
     if object_id >= count:
         raise NotFound("object", expected=f"one of the lift's {count} objects", got=str(object_id))
     changes = change.model_dump(exclude_unset=True)
@@ -113,7 +113,7 @@ def _edit(edit: models.EditRequest | None, lift: Lift, deps: Parts, owner: Owner
         work = query_request("edit", edit.query, lift, deps, owner)
     document: dict[str, Any] = edit.model_dump(mode="json", exclude={"query"}, exclude_none=True)
     document |= {"query": work["query"]} if "query" in work else {}
-    value = deps.queries.call(work | {"edit": document, "before": bits_text(before)})["value"]
+    value = deps.queries.call(work | {"edit": document, "before": bits_text(before)})
     return SplatSet(value["count"], value["box"], zlib.compress(bytes.fromhex(value["bits"])))
 
 

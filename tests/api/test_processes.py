@@ -123,6 +123,7 @@ def test_bomb_is_refused_with_reasons(children: Children, tmp_path: Path, kind: 
 
 
 REQUEST = {
+    "task": "reply", "kind": "query", "scratch": "/nowhere", "draft": "/nowhere/draft", "head": {},
     "operation": "query", "lift": "/nowhere/lift", "splats": "/nowhere/splats", "cameras": "/nowhere/cameras",
     "kernel": "3dgs", "world": {}, "names": {"/nowhere": "the data"}, "encoder": None, "encoder_version": None,
     "query": {"like": ["splat:1"]}, "view": None, "top": 1, "links": {},
@@ -152,7 +153,7 @@ def test_query_process_that_is_killed_or_stopped_is_replaced(queries: QueryClien
     thread.start()
     assert fault_of_request(queries) == fault  # killed while it answers: the next one does
     thread.join()
-    until(queries.revive)
+    until(queries.is_ready)
 
 
 def test_calls_beyond_the_line_or_after_the_stop_are_refused(queries: QueryClient) -> None:

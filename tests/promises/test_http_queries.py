@@ -10,6 +10,7 @@ import httpx
 import numpy as np
 import pytest
 
+from tests.server import Server, until
 from tests.tiny_scene import (
     CHANNELS,
     HEIGHT,
@@ -208,3 +209,11 @@ def test_answer_from_the_cache_is_the_answer(client: httpx.Client, lift: dict[st
         if tag is not None:
             other = client.get(path, params=fields | {"lift": lift["id"]}, headers={"If-None-Match": tag})
             assert (other.status_code, other.content) == (304, b"")
+
+
+def test_no_file_of_an_answer_stays_behind_it(client: httpx.Client, server: Server, lift: dict[str, Any]) -> None:
+    for part, status in (("0-3", 206), ("999999-", 416), ("nonsense", 400)):
+        parameters = LAMP | {"lift": lift["id"]}
+        reply = client.get("/query/scores", params=parameters, headers={"Range": f"bytes={part}"})
+        assert reply.status_code == status, reply.text
+    assert until(lambda: not any((server.data / "tmp").iterdir()))
