@@ -13,8 +13,8 @@ export PIP_ROOT_USER_ACTION = ignore
 
 .PHONY: demo test check kernels gpu wheel lint serve docs setup
 
-demo: $(READY)  ## the whole job through the real service; SCENE=DIR takes a scene of your own, ASK=TEXT a question
-	$(BIN)/splatlift demo --out "$(OUT)" $(if $(SCENE),--scene "$(SCENE)") $(if $(ASK),--ask "$(ASK)")
+demo: $(READY)  ## the whole job through the real service; ASK=TEXT asks another question
+	$(BIN)/splatlift demo --out "$(OUT)" $(if $(ASK),--ask "$(ASK)")
 
 # Files of tests are dealt to two processes, in the order in which they lie. A process that dies is not begun anew: it
 # would go on with the test that it died of.

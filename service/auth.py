@@ -17,7 +17,7 @@ import anyio
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from service.errors import Forbidden, Misdirected, TooLarge, TooManyParameters, Unauthorized, UnclearEnd
+from service.errors import Forbidden, MalformedRequest, Misdirected, TooLarge, TooManyParameters, Unauthorized
 from service.models import BITS_BYTES, BODY_BYTES, Key
 from service.settings import ServiceSettings
 from service.store import SERVICE, Owner, Store, admit
@@ -111,9 +111,9 @@ def require_scope(key: Key, line: str) -> None:
 def require_clear_end(headers: Headers, line: str) -> None:
     """Require that a proxy sees the same end of a request (RFC 9112): what it takes for the rest is not answered."""
     if line.startswith("CONNECT "):
-        raise UnclearEnd("method", expected="a method of a route", got="CONNECT")
+        raise MalformedRequest("method", expected="a method of a route", got="CONNECT")
     if "transfer-encoding" in headers and "content-length" in headers:
-        raise UnclearEnd("Content-Length", expected="either it or Transfer-Encoding", got="both")
+        raise MalformedRequest("Content-Length", expected="either it or Transfer-Encoding", got="both")
 
 
 def require_length(headers: Headers, limit: int) -> None:

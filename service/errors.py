@@ -10,7 +10,7 @@ import sqlite3
 from collections.abc import Mapping
 from contextvars import ContextVar
 from http import HTTPStatus
-from typing import Any, ClassVar
+from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
@@ -30,115 +30,110 @@ METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE")
 FIELDS = ("argument", "expected", "got", "hint", "nearest")
 # Words of pydantic around the expected value
 PYDANTIC = re.compile(r"^\w+ should (be|have) |, unable to parse .*| after validation, not \d+$")
+# Of answers by their status; after 400 and 413 the rest of a body must not be taken for the next request
+HEADERS: dict[int, dict[str, str]] = {
+    400: {"Connection": "close"}, 401: {"WWW-Authenticate": 'Bearer realm="splatlift"'},
+    413: {"Connection": "close"}, 503: {"Retry-After": "2"},
+}  # fmt: skip
 REQUEST_ID: ContextVar[str | None] = ContextVar("request_id", default=None)  # of this task, or the thread it awaits
 
 log = logging.getLogger(__name__)
 
 
 class ServiceError(SplatliftError):
-    """An error of the service: its status, the title of its problem, and headers of the answer."""
+    """An error of the service, and the status of its problem."""
 
-    kind, status, title = "service", 422, "The input is not usable"
-    headers: ClassVar[Mapping[str, str]] = {}
+    kind, status = "service", 422
 
 
 class InvalidRequest(ServiceError):
     """A parameter or a body that the route does not accept."""
 
-    kind, title = "invalid-request", "The request is malformed"
+    kind = "invalid-request"
 
 
-class UnreadableBody(ServiceError):
-    """A body that cannot be parsed as JSON, or is a part of a file."""
+class MalformedRequest(ServiceError):
+    """A body that is not JSON, or a part of a file; or a request whose end a proxy may see elsewhere."""
 
-    kind, status, title = "malformed-request", 400, "The request is malformed"
-
-
-class UnclearEnd(UnreadableBody):
-    """A request whose end a proxy may see elsewhere: the connection ends with it."""
-
-    headers: ClassVar = {"Connection": "close"}
+    kind, status = "malformed-request", 400
 
 
 class KeyReused(ServiceError):
     """An Idempotency-Key that was used with another order."""
 
-    kind, title = "key-reused", "The key belongs to another order"
+    kind = "key-reused"
 
 
 class Unauthorized(ServiceError):
     """No key, or a key that is not valid."""
 
-    kind, status, title = "unauthorized", 401, "A key is needed"
-    headers: ClassVar = {"WWW-Authenticate": 'Bearer realm="splatlift"'}
+    kind, status = "unauthorized", 401
 
 
 class Forbidden(ServiceError):
     """A key without the scope that is needed, or a page of another site."""
 
-    kind, status, title = "forbidden", 403, "The request is not allowed"
+    kind, status = "forbidden", 403
 
 
 class Conflict(ServiceError):
     """The state of the resource does not allow the operation."""
 
-    kind, status, title = "conflict", 409, "Its state does not allow that"
+    kind, status = "conflict", 409
 
 
 class VersionMismatch(ServiceError):
     """The resource has another version than the one in If-Match."""
 
-    kind, status, title = "changed", 412, "It was changed meanwhile"
+    kind, status = "changed", 412
 
 
 class TooLarge(ServiceError):
-    """More bytes than the operator allows; the rest of the body must not be taken for the next request."""
+    """More bytes than the operator allows."""
 
-    kind, status, title = "too-large", 413, "The body is too large"
-    headers: ClassVar = {"Connection": "close"}
+    kind, status = "too-large", 413
 
 
 class TooManyParameters(ServiceError):
     """More parameters of a query than any use has: parsing them would delay other requests."""
 
-    kind, status, title = "too-many-parameters", 414, "The address is too long"
+    kind, status = "too-many-parameters", 414
 
 
 class UnsupportedMedia(ServiceError):
     """A body in an encoding or of a media type that the route does not accept."""
 
-    kind, status, title = "unsupported-media-type", 415, "The media type is not supported"
+    kind, status = "unsupported-media-type", 415
 
 
 class Misdirected(ServiceError):
     """A Host header with a name that is not this service's."""
 
-    kind, status, title = "misdirected", 421, "This is another host"
+    kind, status = "misdirected", 421
 
 
 class ProcessDied(ServiceError):
     """A process of the service died without an answer."""
 
-    kind, status, title = "crashed", 500, "A process of the server died"
+    kind, status = "crashed", 500
 
 
 class Busy(ServiceError):
     """A failure that may pass: the client may send the request again."""
 
-    kind, status, title = "busy", 503, "The server is busy"
-    headers: ClassVar = {"Retry-After": "2"}
+    kind, status = "busy", 503
 
 
 class TimedOut(ServiceError):
     """A query that took longer than the operator allows."""
 
-    kind, status, title = "timed-out", 504, "The query took too long"
+    kind, status = "timed-out", 504
 
 
 class NoSpace(ServiceError):
     """Less free disk than the operator reserves."""
 
-    kind, status, title = "no-space", 507, "There is no space left"
+    kind, status = "no-space", 507
 
 
 class Misconfigured(ServiceError):
@@ -168,24 +163,26 @@ PROBLEM: dict[str, Any] = {
 }
 
 
-class Fault(Exception):
+class Fault(SplatliftError):
     """The error of another process, as `fault_of` made it there."""
 
     def __init__(self, fault: dict[str, Any]) -> None:
-        super().__init__(fault["detail"])
+        Exception.__init__(self, fault)
         self.fault = fault
+
+    def __str__(self) -> str:
+        """Return the sentence of the other process."""
+        return self.fault["detail"]
 
 
 def fault_of(error: SplatliftError, names: Mapping[str, str] | None = None) -> dict[str, Any]:
     """Return the error as the JSON of a problem, with clients' names for private paths of the server."""
-    if isinstance(error, ServiceError):
-        status, title = error.status, error.title
-    else:
-        status, title = (
-            (404, "There is no such resource") if isinstance(error, NotFound) else (422, ServiceError.title)
-        )
+    status = getattr(error, "status", 404 if isinstance(error, NotFound) else 422)
     fields = {name: value for name in FIELDS if (value := getattr(error, name, None))}
-    document = {"type": f"/problems/{error.kind}", "title": title, "status": status, "detail": str(error), **fields}
+    document = {
+        "type": f"/problems/{error.kind}", "title": error.kind.replace("-", " ").capitalize(), "status": status,
+        "detail": str(error), **fields,
+    }  # fmt: skip
     return {name: replace_names(value, names or {}) for name, value in document.items()}
 
 
@@ -201,7 +198,8 @@ def answer(fault: dict[str, Any], headers: Mapping[str, str] | None = None) -> J
     """Return a fault as the response to the current request."""
     fields = fault | {"request_id": REQUEST_ID.get()}
     document = {name: _one_line(value) for name, value in fields.items() if value is not None}
-    return JSONResponse(document, fault["status"], headers, MEDIA_TYPE)
+    status = fault["status"]
+    return JSONResponse(document, status, {**HEADERS.get(status, {}), **(headers or {})}, MEDIA_TYPE)
 
 
 def _one_line(value: Any) -> Any:
@@ -213,15 +211,15 @@ def answer_to(error: Exception, request_line: str = "") -> JSONResponse:
     """Return any error as a response."""
     match error:
         case Fault():
-            reply = answer(error.fault, Busy.headers if error.fault["status"] == Busy.status else None)
+            reply = answer(error.fault)
         case SplatliftError():
-            reply = answer(fault_of(error), getattr(error, "headers", None))
+            reply = answer(fault_of(error))
         case RequestValidationError():
             reply = answer_to(_refusal(error))
         case HTTPException():
             reply = _of_framework(error, request_line)
         case ClientDisconnect():
-            reply = answer_to(UnreadableBody("body", expected="all of it", got="a client that left"))
+            reply = answer_to(MalformedRequest("body", expected="all of it", got="a client that left"))
         case _:
             reply = _of_system(error, request_line)
     return reply
@@ -239,8 +237,7 @@ def _of_system(error: Exception, request_line: str) -> JSONResponse:
         hint = "send it again; the server's log says why"
         return answer_to(Busy("data", expected="a disk and a database that can be used", got="an error", hint=hint))
     log.error("%s failed", request_line, exc_info=error)
-    detail = "Something went wrong on our side; the server's log has the details."
-    return answer({"type": "/problems/internal", "title": "An error of the server", "status": 500, "detail": detail})
+    return answer_to(ProcessDied("server", expected="an answer", got="an error, of which the server's log has more"))
 
 
 def _of_framework(error: HTTPException, request_line: str) -> JSONResponse:
@@ -260,7 +257,7 @@ def _refusal(error: RequestValidationError) -> SplatliftError:
     hint = f"in the {place[0]} of the request"
     if kind == "json_invalid":
         got = f"an error at character {place[1]}: {context['error']}"
-        return UnreadableBody("body", expected="JSON", got=got, hint=hint)
+        return MalformedRequest("body", expected="JSON", got=got, hint=hint)
     if place == ["body"] and isinstance(first.get("input"), bytes):  # curl declares a form by default
         hint = "send the header Content-Type: application/json with the body"
         return UnsupportedMedia("Content-Type", expected="application/json", got="another, or none", hint=hint)
@@ -299,6 +296,6 @@ def install(app: FastAPI) -> None:
         error.__cause__ = error.__context__ = error.__traceback__ = None
         return reply
 
-    errors = (SplatliftError, Fault, RequestValidationError, HTTPException, ClientDisconnect, OSError, sqlite3.Error)
+    errors = (SplatliftError, RequestValidationError, HTTPException, ClientDisconnect, OSError, sqlite3.Error)
     for kind in errors:
         app.add_exception_handler(kind, handle)

@@ -1,4 +1,4 @@
-"""``splatlift demo``: run the main job through the real service, on the published example or on a scene of yours."""
+"""``splatlift demo``: run the main job through the real service, on the published example."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import re
 import subprocess
 import sys
 import time
-import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,13 +20,11 @@ import numpy as np
 from PIL import Image
 
 from liftcore.cli import Parser
-from liftcore.errors import InvalidInput, Unavailable
-from liftcore.files import camera_files, identify, visible_files
-from liftcore.text import NO_WORDS
+from liftcore.errors import Unavailable
+from service.errors import Fault
 
 SHIPPED = Path(__file__).with_name("tabletop")
-CAMERA_FILES = ("cameras.json", "transforms.json", "cameras.zip")
-TABLE = "text_table.safetensors"
+FILES = {"splats": "point_cloud.spz", "cameras": "cameras.json", "features": "features.safetensors"}
 STOP_SECONDS = 20
 LAST_CHARACTERS = 3_000  # of the service's log, after a failure
 TIMEOUT = httpx.Timeout(600.0, connect=10.0)  # the first query loads an encoder
@@ -35,16 +32,13 @@ TIMEOUT = httpx.Timeout(600.0, connect=10.0)  # the first query loads an encoder
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    cameras = "cameras.json, transforms.json, cameras.zip or sparse/0"
-    holds = f"its .ply, .sog, .spz or .splat; {cameras}; a feature pack; {TABLE} if any"
-    parser.add_argument("--scene", type=Path, metavar="DIR", help=f"a scene of yours ({holds}); else the shipped one")
     of_text = "what to look for; may be given several times"
     parser.add_argument("--ask", action="append", default=[], metavar="TEXT", help=of_text)
     parser.add_argument("--out", type=Path, default=Path("demo-output"), metavar="DIR", help="of pictures and lift")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Find the scene, run the service as a user would, and report the results."""
+    """Run the service as a user would, and report the results."""
 
     def say(line: str) -> None:
         if not options.json:
@@ -52,17 +46,15 @@ def run(options: argparse.Namespace) -> int:
 
     begin, out, data = time.perf_counter(), options.out, options.out / "service"
     out.mkdir(parents=True, exist_ok=True)
-    if options.scene is None:
-        say("12 published splat objects on a table (sources: scene/LICENCES.md), with CLIP's vectors of words.")
-    folder = options.scene or unpack_tabletop(out / "scene")
-    files, truth = find_files(folder, out / "scene"), read_truth(folder)
+    say("12 published splat objects on a table (sources: scene/LICENCES.md), with CLIP's vectors of words.")
+    folder = unpack_tabletop(out / "scene")
     with serving(data, out / "service.log") as url:
         say(f"The service listens on {url}.")
         try:
-            report = show(files, truth, options.ask, url, out, say)
+            report = show(folder, options.ask, url, out, say)
         except httpx.HTTPError as error:
             raise Unavailable("service", expected="an answer to each request", got=repr(error)) from None
-    report |= {"scene": folder.name, "out": str(out.resolve()), "seconds": round(time.perf_counter() - begin, 1)}
+    report |= {"out": str(out.resolve()), "seconds": round(time.perf_counter() - begin, 1)}
     report["lift_file"] = str((data / "lifts" / f"{report['lift']}.safetensors").resolve())
     say(f"Pictures are in {report['out']}. All of it took {report['seconds']:.0f} s.")
     say(f"The lift is {report['lift_file']}")
@@ -110,7 +102,7 @@ def client_of(url: str) -> httpx.Client:
 def require_no(problem: dict[str, Any] | None) -> None:
     """Raise a problem of the service as an error."""
     if problem is not None:
-        raise InvalidInput("service", expected="success", got=problem["detail"])
+        raise Fault(problem)
 
 
 def lift_files(client: httpx.Client, files: Mapping[str, Path]) -> tuple[dict[str, Any], float]:
@@ -126,49 +118,41 @@ def lift_files(client: httpx.Client, files: Mapping[str, Path]) -> tuple[dict[st
     return client.get(f"/lifts/{job['id']}").json(), job["ended"] - job["started"]
 
 
-def show(
-    files: Mapping[str, Path], truth: Truth | None, phrases: Sequence[str], url: str, out: Path,
-    say: Callable[[str], None],
-) -> dict[str, Any]:  # fmt: skip
+def show(folder: Path, phrases: Sequence[str], url: str, out: Path, say: Callable[[str], None]) -> dict[str, Any]:
     """Upload, lift and query; write pictures to ``out`` and sentences to ``say``; return the results.
 
-    Without phrases those of the truth are asked; without words, for more of what is in the middle of a view.
+    Without phrases those of the truth are asked.
     """
+    truth = read_truth(folder)
     with client_of(url) as client:
-        lift, took = lift_files(client, files)
-        first = client.get(f"/lifts/{lift['id']}/views", params={"limit": 1}).json()["views"][0]
-        views = tuple(truth.masks) if truth else (first["name"],)
+        lift, took = lift_files(client, {kind: folder / name for kind, name in FILES.items()})
+        views = tuple(truth.masks)
         say(f"Lifted {lift['channels']} channels onto {lift['count']:,} splats in {took:.1f} s.")
         pictures = {"rgb": f"render-{views[0]}.png", "pca": f"features-{views[0]}.png"}
         for channel, name in pictures.items():
             parameters = {"lift": lift["id"], "view": views[0], "channel": channel}
             (out / name).write_bytes(client.get("/render", params=parameters).content)
-        has_words = "table" in files or lift["text_space"] not in ("", NO_WORDS)
-        phrases = phrases or (truth.questions if truth and has_words else ())
-        kind = "text" if phrases else "like"
-        if not phrases:
-            phrases = (f"{views[0]}:{first['width'] // 2},{first['height'] // 2}",)
-            say(f"  No words are known for it, so it is asked for more of the middle of the view, {phrases[0]}.")
+        phrases = phrases or truth.questions
         # The first query opens the lift and is not timed.
-        client.get("/query", params={"lift": lift["id"], kind: phrases[0], "threshold": "0"})
-        findings = [ask(client, {"lift": lift["id"], kind: text}, text, views, truth, out, say) for text in phrases]
+        client.get("/query", params={"lift": lift["id"], "text": phrases[0], "threshold": "0"})
+        findings = [ask(client, lift["id"], phrase, truth, out, say) for phrase in phrases]
     return {
         "lift": lift["id"], "splats": lift["count"], "channels": lift["channels"], "views": lift["view_count"],
-        "lift_seconds": took, "diagnostics": lift["diagnostics"], "view": views[0], "text_space": lift["text_space"],
-        "pictures": pictures, "phrases": findings,
+        "lift_seconds": took, "diagnostics": lift["diagnostics"], "view": views[0], "pictures": pictures,
+        "phrases": findings,
     }  # fmt: skip
 
 
 def ask(
-    client: httpx.Client, parameters: dict[str, str], phrase: str, views: Sequence[str], truth: Truth | None,
-    out: Path, say: Callable[[str], None],
-) -> dict[str, Any]:  # fmt: skip
+    client: httpx.Client, lift: str, phrase: str, truth: Truth, out: Path, say: Callable[[str], None]
+) -> dict[str, Any]:
     """Ask one phrase: write its pictures, say what it selects, and return that."""
-    view, begin = views[0], time.perf_counter()
+    parameters, view, begin = {"lift": lift, "text": phrase}, next(iter(truth.masks)), time.perf_counter()
     answer = client.get("/query", params=parameters).json()
     query_ms = 1e3 * (time.perf_counter() - begin)
     masks = {
-        name: pixels(client.get("/query/mask", params=parameters | {"view": name}).content) > 0 for name in views
+        name: pixels(client.get("/query/mask", params=parameters | {"view": name}).content) > 0
+        for name in truth.masks
     }
     slug = "-".join(re.findall(r"\w+", phrase.casefold()))
     names = {picture: f"{slug}-{picture}-{view}.png" for picture in ("mask", "heat", "found")}
@@ -177,7 +161,7 @@ def ask(
     shade = np.where(masks[view][..., None], 1.0, 0.35)
     picture = pixels((out / f"render-{view}.png").read_bytes()) * shade
     Image.fromarray(picture.astype(np.uint8)).save(out / names["found"])
-    label, iou = (truth.name_of(masks), truth.mean_iou(phrase, masks)) if truth else (None, None)
+    label, iou = truth.name_of(masks), truth.mean_iou(phrase, masks)
     if answer["present"] is False:
         say(f'  "{phrase}" finds nothing\n      {answer["reason"]}')
     else:
@@ -198,7 +182,7 @@ def pixels(png: bytes) -> np.ndarray:
         return np.asarray(image)
 
 
-# Content of a scene folder: splats, cameras, a feature pack, words, and labels if there are any
+# The example
 
 
 @dataclass(frozen=True)
@@ -207,7 +191,6 @@ class Truth:
 
     names: tuple[str, ...]  # object names
     masks: Mapping[str, np.ndarray]  # view -> [H, W] integers, rows of names; -1 = none
-    objects_of_phrases: Mapping[str, Sequence[str]]  # phrase without article -> names of its objects
     questions: tuple[str, ...]  # phrases that show what it can do
 
     def name_of(self, masks: Mapping[str, np.ndarray]) -> str | None:
@@ -217,18 +200,13 @@ class Truth:
         return self.names[int(counts.argmax())] if counts.any() else None
 
     def mean_iou(self, phrase: str, masks: Mapping[str, np.ndarray]) -> float | None:
-        """Return the mean intersection over union of masks [H, W] bool, over the views with the phrase's objects."""
-        names = self.objects_of_phrases.get(bare(phrase), ())
-        rows = [self.names.index(name) for name in names]
+        """Return the mean intersection over union of masks [H, W] bool, over the views with the object named so."""
+        name = re.sub(r"^(an?|the)\s+", "", phrase.casefold())
+        rows = [row for row, other in enumerate(self.names) if other == name]
         targets = {view: np.isin(self.masks[view], rows) for view in masks}
         pairs = [(mask, targets[view]) for view, mask in masks.items() if targets[view].any()]
         values = [(mask & target).sum() / (mask | target).sum() for mask, target in pairs]
         return float(np.mean(values)) if values else None
-
-
-def bare(phrase: str) -> str:
-    """Return a phrase without its article, in lower case."""
-    return re.sub(r"^(an?|the)\s+", "", phrase.strip().casefold())
 
 
 def unpack_tabletop(folder: Path) -> Path:
@@ -249,41 +227,11 @@ def unpack_tabletop(folder: Path) -> Path:
     return folder
 
 
-def find_files(folder: Path, scratch: Path) -> dict[str, Path]:
-    """Return the files of a scene folder by kind, found by their content; a COLMAP model as a zip in scratch."""
-    if not folder.is_dir():
-        raise InvalidInput("--scene", expected="a folder", got=f"nothing at {folder}")
-    packs = [path for path in visible_files(folder, "*.safetensors") if identify(path).kind == "features"]
-    packs.sort(key=lambda path: path.name != "features.safetensors")
-    named_files = [folder / name for name in CAMERA_FILES if (folder / name).is_file()]
-    cameras = [file for file in camera_files(next(iter(named_files), folder)) if file.is_file()]
-    if len(cameras) > 1:
-        scratch.mkdir(parents=True, exist_ok=True)
-        with zipfile.ZipFile(scratch / "cameras.zip", "w", zipfile.ZIP_DEFLATED) as archive:
-            for file in cameras:
-                archive.write(file, file.name)
-        cameras = [scratch / "cameras.zip"]
-    splats = [folder / name for name in identify(folder).accepted_over_http]
-    files = {"splats": splats, "cameras": cameras, "features": packs}
-    for kind, paths in files.items():
-        if not paths:
-            expected = f"{kind} that the service takes"
-            raise InvalidInput(f"{kind} of {folder.name}", expected=expected, got="none", hint="--help lists them")
-    table = {"table": folder / TABLE} if (folder / TABLE).is_file() else {}
-    return {kind: paths[0] for kind, paths in files.items()} | table
-
-
-def read_truth(folder: Path) -> Truth | None:
-    """Read ``truth.json`` (objects, meaning of phrases) and ``truth.safetensors`` (``VIEW/mask``), if any."""
+def read_truth(folder: Path) -> Truth:
+    """Read ``truth.json`` (objects, meaning of phrases) and ``truth.safetensors`` (``VIEW/mask``)."""
     from safetensors.numpy import load_file
 
-    names_file, arrays_file = folder / "truth.json", folder / "truth.safetensors"
-    if not (names_file.is_file() and arrays_file.is_file()):
-        return None
-    document = json.loads(names_file.read_text())
-    names = tuple(str(item["class"]) for item in document["objects"])
-    masks = {name.removesuffix("/mask"): mask for name, mask in load_file(arrays_file).items()}
-    phrases = {bare(name): (name,) for name in names}
-    phrases |= {bare(phrase): tuple(objects) for phrase, objects in document.get("phrases", {}).items()}
-    views, questions = document.get("held_out_views", masks), document.get("ask", [f"the {names[0]}"])
-    return Truth(names, {view: masks[view] for view in views}, phrases, tuple(questions))
+    document, masks = json.loads((folder / "truth.json").read_text()), load_file(folder / "truth.safetensors")
+    names = tuple(item["class"] for item in document["objects"])
+    views = {view: masks[f"{view}/mask"] for view in document["held_out_views"]}
+    return Truth(names, views, tuple(document["ask"]))

@@ -21,7 +21,6 @@ from liftcore.cli import Parser
 from liftcore.errors import InvalidInput, InvalidLift, Unavailable
 from liftcore.text import BUILT_IN
 from service.commands.serve import serve
-from service.errors import Fault
 from service.process import Child, Children, end_with_parent
 from service.results import add_lift
 from service.settings import ServiceSettings, read_settings
@@ -123,12 +122,6 @@ def adopt(store: Store, settings: ServiceSettings, path: Path, metadata: dict[st
                 store.add_asset(SERVICE, kind, draft, file["sha256"], content)
             draft, content = link("lift", path)
             return add_lift(store, SERVICE, draft, content).id
-    except Fault as error:
-        fault = error.fault
-        raise InvalidInput(
-            fault.get("argument", "lift"), expected=fault.get("expected", "a file that can be read"),
-            got=fault.get("got", fault["detail"]), hint=fault.get("hint", ""),
-        ) from None  # fmt: skip
     finally:
         children.stop()
 

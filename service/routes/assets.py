@@ -13,7 +13,7 @@ import anyio
 from fastapi import APIRouter, Request, Response
 from fastapi import Path as PathParameter
 
-from service.errors import TooLarge, UnreadableBody, UnsupportedMedia
+from service.errors import MalformedRequest, TooLarge, UnsupportedMedia
 from service.models import Asset, AssetKind
 from service.routes import BINARY, Caller, Deps, Parts, add_list, content_of, file_answer
 
@@ -32,7 +32,7 @@ UPLOAD: dict[str, Any] = {
 REFUSED_HEADERS = {
     "Content-Encoding": ("(?!identity$).+", UnsupportedMedia),
     "Content-Type": ("multipart/.*", UnsupportedMedia),
-    "Content-Range": (".+", UnreadableBody),  # RFC 9110, 14.5: whoever takes no parts of PUT refuses them
+    "Content-Range": (".+", MalformedRequest),  # RFC 9110, 14.5: whoever takes no parts of PUT refuses them
 }
 # OpenAPI takes two templates of the same paths as one path given twice, so the parameter has one name.
 Kind = Annotated[AssetKind, PathParameter(alias="asset", description="its kind")]

@@ -225,7 +225,6 @@ def test_cells_run_in_order_and_print_what_is_saved(
         assert len(pictures) == len(pyplot.get_fignums())
         pyplot.close("all")
     truth = read_truth(names["folder"])
-    assert truth is not None
     overlap = truth.mean_iou(names["phrase"], {"view_030": names["mask"]})
     assert overlap is not None and overlap > 0.8
 

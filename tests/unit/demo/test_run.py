@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 
 
 def test_the_demo_finds_what_it_asks_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert demo.run(argparse.Namespace(scene=None, out=tmp_path, json=True, ask=["penguin", "sofa"])) == 0
+    assert demo.run(argparse.Namespace(out=tmp_path, json=True, ask=["penguin", "sofa"])) == 0
     report = json.loads(capsys.readouterr().out)
     assert (report["splats"], report["channels"], report["views"]) == (166_000, 512, 18)
     penguin, sofa = report["phrases"]
