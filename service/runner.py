@@ -161,7 +161,7 @@ def work_of(order: dict[str, Any], store: Store, owner: Owner, settings: Service
         "splats": str(splats.file), "kernel": splats.kernel(order["settings"]), "cameras": str(cameras.file),
         "features": [str(pack.file) for pack in packs],
         "labels": {item.kind: str(item.file) for item in records[end:]},
-        "settings": order["settings"], "engine": settings.engine, "ray_address": settings.ray_address,
+        "settings": order["settings"], "engine": settings.engine,
         "file_names": {str(item.file): item.download_name for item in records[:end]},
         "names": {str(item.file): item.client_name for item in records},
     }  # fmt: skip

@@ -50,9 +50,9 @@ class ServiceSettings(BaseSettings):
     )
     job_seconds: float = Field(86_400, gt=0, description="wall time that one attempt at a job may take")
     engine: Literal["local", "ray"] | None = Field(
-        None, description="engine of lifts in blocks, of bounded memory: local or ray; not set = in memory"
+        None,
+        description="engine of lifts in blocks, of bounded memory: local, or ray of RAY_ADDRESS; not set = in memory",
     )
-    ray_address: str = Field("auto", description="of the Ray cluster, host:port; auto takes RAY_ADDRESS")
     encoder: str = Field(
         "lvis",
         description="text encoder for lifts of its own text space and, if you set it, for those whose text space has "

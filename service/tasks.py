@@ -199,7 +199,6 @@ def lift(order: Order, report: Reporter) -> dict[str, Any]:
         report.say({"plan": _document(plan, order["names"])})
 
     os.nice(NICENESS)
-    address = order["ray_address"] if order["engine"] == "ray" else None
     lift = lift_files(
         Path(order["splats"]),
         Path(order["cameras"]),
@@ -209,7 +208,7 @@ def lift(order: Order, report: Reporter) -> dict[str, Any]:
         progress=report,
         on_plan=report_plan,
         checkpoint=Checkpoint(Path(order["work"])),
-        engine=open_engine(order["engine"], address, order["threads"]),
+        engine=open_engine(order["engine"], "auto" if order["engine"] == "ray" else None, order["threads"]),
     )
     lift, output = _as_clients_know(lift, order["file_names"]), Path(order["output"])
     lift.save(output, progress=report)
