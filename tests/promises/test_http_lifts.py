@@ -61,6 +61,20 @@ def test_downloaded_lift_is_the_file_that_the_library_reads(
     assert (part.status_code, part.content) == (206, reply.content[100:200])
 
 
+def test_lift_is_brought_without_its_packs_and_asked_but_for_regions(
+    client: httpx.Client, lift: dict[str, Any]
+) -> None:
+    digest = lift["features"][0].removeprefix("sha256:").encode()
+    content = client.get(lift["links"]["features"]).content.replace(digest, b"0" * len(digest))
+    reply = client.post("/lifts", content=content)
+    assert reply.status_code == 201 and reply.json()["features"] == [], reply.text
+    fields = {"lift": reply.json()["id"]}
+    assert client.get("/query", params=fields | {"text": "lamp"}).json()["count"] > 0
+    assert client.post("/query/segment", json=fields).json()["named_words"]
+    assert_problem(client.get("/query", params=fields | {"like": "region:left:0:0"}), 422)
+    delete_lift(client, fields["lift"])
+
+
 def test_each_splat_has_a_colour_of_its_features(client: httpx.Client, lift: dict[str, Any]) -> None:
     colours = array(client.get(f"/lifts/{lift['id']}/colours", params={"what": "pca"}).content)
     assert (colours.shape, colours.dtype) == ((COUNT, 3), np.uint8)
