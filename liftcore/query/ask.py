@@ -13,6 +13,7 @@ from liftcore.errors import InvalidQuery
 from liftcore.io.json_file import finite
 from liftcore.query.candidates import candidates, parts_of
 from liftcore.query.directions import directions, part_phrase, read_query, table_of, unknown_part, wordings
+from liftcore.query.objects import point_of
 from liftcore.query.presence import (
     NOT_IN_WORDS,
     References,
@@ -28,7 +29,6 @@ from liftcore.query.question import (
     Answer,
     Box,
     Candidate,
-    Point,
     Presence,
     Query,
     Threshold,
@@ -240,11 +240,11 @@ def locate(scene: Scene, answer: Answer, count: int | None = None) -> Answer:
         rows = np.concatenate([rows[scores > last], rows[scores == last]])[:count]
     best = rows[np.argsort(-answer.scores[rows], kind="stable")][:count]
     top = tuple(
-        TopSplat(splat=int(row), score=float(answer.scores[row]), position=_point(places[:, row])) for row in best
+        TopSplat(splat=int(row), score=float(answer.scores[row]), position=point_of(places[:, row])) for row in best
     )
     selected_axes = [axis[np.flatnonzero(answer.selected)] for axis in places] if answer.count else []
     ends = [np.array([end(axis) for axis in selected_axes]) for end in (np.min, np.max)] if selected_axes else []
-    return answer.model_copy(update={"top": top, "box": Box(*map(_point, ends)) if ends else None})
+    return answer.model_copy(update={"top": top, "box": Box(*map(point_of, ends)) if ends else None})
 
 
 def best_view(scene: Scene, answer: Answer) -> str | None:
@@ -525,8 +525,3 @@ def _statistics(scores: np.ndarray, counts: np.ndarray | None) -> dict[str, floa
         return {}
     mean = np.average(scores.astype(np.float64), weights=counts)
     return {"min": float(scores.min()), "max": float(scores.max()), "mean": float(mean)}
-
-
-def _point(row: np.ndarray) -> Point:
-    x, y, z = row.tolist()
-    return x, y, z

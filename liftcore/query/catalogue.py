@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -123,15 +123,3 @@ def table_csv(source: SceneTree) -> bytes:
         size = (f"{side:.6g}" for side in obj.size)
         writer.writerow([obj.id, *label, obj.splats, *numbers, " ".join(obj.views), *size, source.world.unit])
     return content.getvalue().encode()
-
-
-def one_object_splats(scene: Scene, number: int, suffix: str = ".ply") -> Iterable[bytes]:
-    """Write the splats of an object or another node as a file, in blocks; a PLY has all their properties unchanged.
-
-    Raises:
-        NotFound: the lift has no such object.
-        InvalidLift: the splats moved or changed since the lift.
-    """
-    from liftcore.io.splats import some_rows
-
-    return some_rows(scene.splat_file, scene.members(number), suffix, scene.world)

@@ -7,18 +7,23 @@ and they can be lifted again.
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.catalogue import one_object_splats, table_csv
+from liftcore.io.labels import document_bytes
+from liftcore.io.splats import blocks_as, labelled, recoloured, some_rows
+from liftcore.query.catalogue import table_csv
+from liftcore.query.coco import masks_json
 from liftcore.query.colours import NOT_SEEN_COLOUR, cluster_colours, heat_colours
+from liftcore.query.labels import labels
 from liftcore.query.objects import MOST_SPLATS, objects
 from liftcore.query.question import Answer
 from liftcore.query.scene import Scene, Source
+from liftcore.query.segment import map_png, picture_png, value_map
 
 if TYPE_CHECKING:  # these load torch
     from PIL.Image import Image
@@ -93,7 +98,6 @@ def _of_view(export: Export) -> Iterable[bytes]:
 def _of_words(export: Export) -> Iterable[bytes]:
     """Return the map or the picture of a segmentation in a view."""
     from liftcore.query.render import render
-    from liftcore.query.segment import map_png, picture_png, value_map
 
     values = value_map(export.scene, export.source.values, export.require_view())
     if export.content == "labels":
@@ -102,24 +106,12 @@ def _of_words(export: Export) -> Iterable[bytes]:
 
 
 def _of_labels(export: Export) -> Iterable[bytes]:
-    from liftcore.io.labels import document_bytes
-    from liftcore.io.splats import labelled
-    from liftcore.query.coco import masks_json
-    from liftcore.query.labels import labels
-
     columns = labels(export.scene, export.source)
     if export.content == "labelled":
         return labelled(export.scene.splat_file, columns, export.suffix or ".ply")
     if export.content == "masks":
         return masks_json(export.scene, columns, [export.view] if isinstance(export.view, str) else None)
     return [document_bytes(columns)]
-
-
-def _recoloured(scene: Scene, colours: np.ndarray) -> Iterable[bytes]:
-    """Write all splats in other colours [P, 3] u8 sRGB, the same from all directions, as a file in blocks."""
-    from liftcore.io.splats import recoloured
-
-    return recoloured(scene.splat_file, colours)
 
 
 def object_splats(scene: Scene, answer: Answer, suffix: str = ".ply") -> Iterable[bytes]:
@@ -133,9 +125,6 @@ def object_splats(scene: Scene, answer: Answer, suffix: str = ".ply") -> Iterabl
             the query keeps some objects, and more splats are selected than are grouped.
         InvalidLift: the splats moved or changed since the lift.
     """
-    from liftcore.io.splats import labelled, some_rows
-    from liftcore.query.labels import labels
-
     if answer.is_dropped:
         hint = "absent=keep selects the most similar splats; or ask in other words or by example"
         raise InvalidQuery("object", expected="an object in the scene", got=answer.reason.rstrip("."), hint=hint)
@@ -171,18 +160,6 @@ def npy(values: np.ndarray) -> bytes:
     return content.getvalue()
 
 
-def splats_as(scene: Scene, suffix: str) -> Iterator[bytes]:
-    """Write the splats of the scene in another format, in the lift's order, in blocks; web viewers read ``.splat``.
-
-    Raises:
-        InvalidLift: the splats moved or changed since the lift.
-        InvalidSplats: the format is not written.
-    """
-    from liftcore.io.splats import blocks_as
-
-    return blocks_as(replace(scene.splats, world=scene.world), suffix)
-
-
 def layer_colours(scene: Scene, layer: str) -> np.ndarray:
     """Colour all splats by a layer, [P, 3] u8 sRGB.
 
@@ -214,7 +191,7 @@ OF_LABELS: Files = {"labelled": _of_labels, "names": _of_labels, "masks": _of_la
 FILES: dict[str, Files] = {  # kind of a source -> the files that are made of it
     "answer": {
         "object": lambda export: object_splats(export.scene, export.source, export.suffix or ".ply"),
-        "coloured": lambda export: _recoloured(export.scene, score_colours(export.source)),
+        "coloured": lambda export: recoloured(export.scene.splat_file, score_colours(export.source)),
         "scores": lambda export: [npy(export.source.scores)],
         "selection": lambda export: [npy(export.source.selected)],
         **dict.fromkeys(("mask", "attention", "overlay"), _of_view),
@@ -222,16 +199,22 @@ FILES: dict[str, Files] = {  # kind of a source -> the files that are made of it
     },
     "answers": OF_LABELS,
     "segmentation": {
-        "coloured": lambda export: _recoloured(export.scene, export.source.colours[export.source.values]),
+        "coloured": lambda export: recoloured(export.scene.splat_file, export.source.colours[export.source.values]),
         **dict.fromkeys(("labels", "picture"), _of_words),
         "splat_labels": lambda export: [npy(export.source.values)],
         **OF_LABELS,
     },
-    "object": {"object": lambda export: one_object_splats(export.scene, export.source, export.suffix or ".ply")},
+    "object": {
+        "object": lambda export: some_rows(
+            export.scene.splat_file, export.scene.members(export.source), export.suffix or ".ply", export.scene.world
+        )
+    },
     "scenetree": {"csv": lambda export: [table_csv(export.source)], **OF_LABELS},
     "scene": {
         **dict.fromkeys(("rgb", "depth", "pca", "cluster", "confidence"), _of_scene),
-        "splats": lambda export: splats_as(export.scene, export.suffix or ".splat"),
+        "splats": lambda export: blocks_as(
+            replace(export.scene.splats, world=export.scene.world), export.suffix or ".splat"
+        ),
     },
     "array": {"npy": lambda export: [npy(export.source)]},
 }

@@ -73,7 +73,7 @@ def objects(scene: Scene, answer: Answer) -> Objects:
                 splats=int(inside.sum()),
                 share=float(weights[inside].sum() / weights.sum()),
                 score=float(np.average(answer.scores[members], weights=member_weights)),
-                centre=_point(np.mean(box, axis=0)),
+                centre=point_of(np.mean(box, axis=0)),
                 box=box,
                 size=size_of(scene.world, box),
             )
@@ -154,14 +154,15 @@ def trimmed_box(means: np.ndarray, weights: np.ndarray) -> Box:
         sums = np.cumsum(weights[order])
         ends = np.searchsorted(sums, [_TAIL * sums[-1], (1 - _TAIL) * sums[-1]])
         corners[:, axis] = means[order[np.minimum(ends, len(order) - 1)], axis]
-    return Box(_point(corners[0]), _point(corners[1]))
+    return Box(point_of(corners[0]), point_of(corners[1]))
 
 
 def size_of(world: "WorldFrame", box: Box) -> Point:
     """Return the sides of a box, in metres if the length of a unit is known, else in scene units."""
-    return _point(np.array([world.length(high - low) for low, high in zip(*box, strict=True)]))
+    return point_of(np.array([world.length(high - low) for low, high in zip(*box, strict=True)]))
 
 
-def _point(row: np.ndarray) -> Point:
+def point_of(row: np.ndarray) -> Point:
+    """Return a row [3] as a point."""
     x, y, z = row.tolist()
     return x, y, z

@@ -74,22 +74,18 @@ class CompetingWords:
 
     def count_nearer(self, scene: Scene, rows: np.ndarray) -> np.ndarray:
         """Count the words that are nearer to each of some splats [n] than the query's words, [n] i64."""
-        return np.minimum(*nearer_counts(scene.features[rows], scene.norms[rows], scene.rough_mean, *self._pair))
+        return self.count_nearer_means(scene, scene.features[rows], scene.norms[rows])
 
-    def count_nearer_means(self, scene: Scene, means: np.ndarray) -> np.ndarray:
-        """Count the words that are nearer to unit features [n, F] than the query's words, [n] i64."""
-        ones = np.ones(len(means), np.float32)
-        return np.minimum(*nearer_counts(means, ones, scene.rough_mean, *self._pair))
+    def count_nearer_means(self, scene: Scene, means: np.ndarray, norms: np.ndarray | None = None) -> np.ndarray:
+        """Count the words that are nearer to features [n, F] than the query's words, [n] i64; norms None: unit."""
+        lengths = np.ones(len(means), np.float32) if norms is None else norms
+        return np.minimum(*nearer_counts(means, lengths, scene.rough_mean, self.directions, self.vectors))
 
     def near_share(self, scene: Scene, rows: np.ndarray) -> float:
         """Return the share of the total weight of some splats, of a sample of them, that the words are near to."""
         rows = rows[:: -(-len(rows) // _BLOCK) or 1]
         near = self.count_nearer(scene, rows) <= self.nearer_limit
         return float(np.average(near, weights=scene.total_weight[rows] + np.float32(1e-30)))
-
-    @property
-    def _pair(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.directions, self.vectors
 
 
 @dataclass(frozen=True)

@@ -51,13 +51,12 @@ class Selection:
     """A named set of splats of a scene, with its edits, which can be undone.
 
     Args:
-        scene: an opened lift. name: ``selection:NAME`` in queries. splats: [P] bool at the start; None: none.
+        scene: an opened lift. name: ``selection:NAME`` in queries.
     """
 
-    def __init__(self, scene: Scene, name: str, splats: np.ndarray | None = None) -> None:
+    def __init__(self, scene: Scene, name: str) -> None:
         self._scene, self.name = scene, name
-        start = np.zeros(len(scene.features), np.bool_) if splats is None else _booleans(scene, splats)
-        self._steps, self._place = [Step.of({"operation": "set"}, start)], 0
+        self._steps, self._place = [Step.of({"operation": "set"}, np.zeros(len(scene.features), np.bool_))], 0
 
     def __repr__(self) -> str:
         return one_line(self, repr(self.name), f"{int(self.splats.sum())} splats", f"step {self._place}")
