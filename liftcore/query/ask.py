@@ -12,7 +12,7 @@ import numpy as np
 from liftcore.errors import InvalidQuery
 from liftcore.io.json_file import finite
 from liftcore.query.candidates import candidates, parts_of
-from liftcore.query.directions import directions, part_phrase, read_query, table_of, unknown_part, wordings
+from liftcore.query.directions import directions, part_phrase, read_query, unknown_part, wordings
 from liftcore.query.objects import point_of
 from liftcore.query.presence import (
     NOT_IN_WORDS,
@@ -24,6 +24,7 @@ from liftcore.query.presence import (
     references_of,
     references_of_space,
     small_table_of,
+    table_of,
 )
 from liftcore.query.question import (
     Answer,

@@ -12,13 +12,12 @@ import numpy as np
 
 from liftcore.errors import InvalidQuery, NotFound
 from liftcore.query.areas import area_feature
-from liftcore.query.presence import references_of
+from liftcore.query.presence import references_of, table_of
 from liftcore.query.question import Query, SuggestedWord, SuggestedWords
 from liftcore.query.scene import Scene, as_numpy
 from liftcore.query.terms import Area, Example, SplatSet, SplatTerm, Term, Vector, parse_example
-from liftcore.text import CachingEncoder, TextEncoder, check_texts
+from liftcore.text import TextEncoder, check_texts
 from liftcore.text.phrases import PartPhrase, part_phrases, read_phrase
-from liftcore.text.table import TableEncoder
 from liftcore.text.wording import Wording, shipped_words
 
 
@@ -86,12 +85,6 @@ def wordings(scene: Scene, query: Query, encoder: TextEncoder | None) -> dict[in
                 raise source.refusal(text, object_words(scene, source.words, source.embeddings))
         by_place[place] = word
     return by_place
-
-
-def table_of(encoder: TextEncoder | None) -> TableEncoder | None:
-    """Return the table of words of an encoder; None for any other encoder."""
-    source = encoder.source if isinstance(encoder, CachingEncoder) else encoder
-    return source if isinstance(source, TableEncoder) else None
 
 
 def part_phrase(scene: Scene, query: Query, encoder: TextEncoder | None) -> PartPhrase | None:

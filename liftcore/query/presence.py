@@ -210,6 +210,12 @@ def best_splats(scene: Scene, scores: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return rows[heaviest], total_weight[rows[heaviest]].astype(np.float64)
 
 
+def table_of(encoder: TextEncoder | None) -> TableEncoder | None:
+    """Return the table of words of an encoder; None for any other encoder."""
+    source = encoder.source if isinstance(encoder, CachingEncoder) else encoder
+    return source if isinstance(source, TableEncoder) else None
+
+
 def references_of(encoder: TextEncoder, text_space: str) -> References | str:
     """Return the reference words of an encoder, or the reason why there are none.
 
@@ -218,8 +224,8 @@ def references_of(encoder: TextEncoder, text_space: str) -> References | str:
     Args:
         encoder: of the words' vectors. text_space: of the lift, "" for none.
     """
-    source = encoder.source if isinstance(encoder, CachingEncoder) else encoder
-    if isinstance(source, TableEncoder):
+    source = table_of(encoder)
+    if source is not None:
         if len(source.words) >= LEAST_WORDS:
             return _of_table(source)
         return references_of_space(source.embeddings, text_space)
@@ -259,8 +265,8 @@ def small_table_of(encoder: TextEncoder) -> np.ndarray | None:
 
     They compete with each other: the table's author distinguishes these words and no others.
     """
-    source = encoder.source if isinstance(encoder, CachingEncoder) else encoder
-    if isinstance(source, TableEncoder) and 1 < len(source.words) < LEAST_WORDS:
+    source = table_of(encoder)
+    if source is not None and 1 < len(source.words) < LEAST_WORDS:
         return _unit(np.asarray(source.embeddings, np.float32))
     return None
 

@@ -309,7 +309,8 @@ class Scene:
 
         reader = self.encoder(encoder)
         words = self.words(reader) if words is None else words
-        return best_words(self, Query(like=[example]), words, reader.encode(words), top)
+        fields: dict[str, Any] = {"like": [example]}
+        return best_words(self, Query(**fields), words, reader.encode(words), top)
 
     def words(self, encoder: AnyEncoder = None) -> list[str]:
         """Return all words of an encoder that is a table, each once; another encoder is an InvalidQuery."""

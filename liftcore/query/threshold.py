@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.question import METHODS, Threshold
+from liftcore.query.question import Threshold
 
 BINS = 300
 SMOOTHING = BINS / 64  # bins, standard deviation of the Gaussian that removes a histogram's ripples
@@ -53,20 +53,6 @@ class Histogram:
 Result = tuple[float, str, bool]  # a threshold, its explanation, and True if the method has a clear result
 
 
-def check_method(method: str | float) -> None:
-    """Raise InvalidQuery for a method that `find_threshold` does not have.
-
-    Raises:
-        InvalidQuery: an unknown method, or a number that no score can be.
-    """
-    if isinstance(method, int | float):
-        if not -1 <= method <= 1:
-            expected = "a number from -1 to 1, as scores are cosines"
-            raise InvalidQuery("threshold", expected=expected, got=f"{method:g}", hint="or leave it out")
-    elif method not in METHODS:
-        raise InvalidQuery("threshold", expected=f"a number or one of {', '.join(METHODS)}", got=repr(method))
-
-
 def find_threshold(
     scores: ArrayLike,
     method: str | float = "auto",
@@ -80,15 +66,14 @@ def find_threshold(
 
     Args:
         scores: [n] f32, finite.
-        method: one of ``METHODS``, or a number to use as it is.
+        method: auto or paper, or a number to use as it is.
         weights: [n] f32, weight of each score, at least zero: the total weight of splats; None: equal ones, as of the
             pixels of a view.
         least: ``auto`` takes no lower score, unless too few lie above it.
 
     Raises:
-        InvalidQuery: as in `check_method`, or scores that are not finite.
+        InvalidQuery: scores that are not finite.
     """
-    check_method(method)
     if isinstance(method, int | float):
         return Threshold(value=float(method), method="fixed", explanation=f"The threshold {method:.4g} was given.")
     values = np.asarray(scores, np.float32).ravel()
