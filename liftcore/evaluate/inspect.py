@@ -17,7 +17,7 @@ from liftcore.features.smoothness import some_grids, unlike_maps
 from liftcore.io.cameras import camera_source, read_cameras
 from liftcore.io.kinds import EXPORT_PLY, SplatFormat, identify
 from liftcore.io.photo_zip import describe_photos
-from liftcore.io.ply import nearest_dialect
+from liftcore.io.ply import dialect_of
 from liftcore.io.splats import format_of, read_splats, splat_files
 from liftcore.runtime.arguments import as_path, check_choice
 from liftcore.scene.cameras import Cameras, distortion_warning
@@ -123,7 +123,7 @@ def describe_splats(splats: Splats) -> dict[str, Any]:
     return {
         "splats": splats.count,
         "kernel": splats.kernel.value,
-        "dialect": nearest_dialect(splats.layout),
+        "dialect": dialect_of(splats.layout),
         "render_mode": None if splats.render_mode is None else splats.render_mode.model.value,
         "render_mode_source": None if splats.render_mode is None else splats.render_mode.source,
         "sh_degree": splats.sh_degree,

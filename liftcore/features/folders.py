@@ -8,8 +8,9 @@ LangSplat's ``IMG_s.npy`` [L, H, W] contains mask ids, -1 for none, numbered thr
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import wraps
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Concatenate, Literal, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -26,6 +27,8 @@ CHANNELS_FIRST = "_fmap_CxHxW"
 LABELS, CODEBOOK = "_s.npy", "_f.npy"  # of LangSplat
 
 Layout = Literal["hwc", "chw"]
+P = ParamSpec("P")
+T = TypeVar("T")
 V_co = TypeVar("V_co", bound=ViewFeatures, covariant=True)
 FLATTEST = 16  # largest ratio of the sides of a grid: a larger one is a list of cells or of channels, not a photo
 
@@ -55,11 +58,23 @@ class ViewFolder(Mapping[str, V_co]):
         return len(self.files)
 
 
+def names_folder(open_views: Callable[Concatenate[Path, P], T]) -> Callable[Concatenate[Path, P], T]:
+    """Name the folder in what is wrong with its files."""
+
+    @wraps(open_views)
+    def open_named(folder: Path, *args: P.args, **options: P.kwargs) -> T:
+        with reading(folder, InvalidFeatures, "a folder of features or masks"):
+            return open_views(folder, *args, **options)
+
+    return open_named
+
+
 def folders_of(views: Iterable[str]) -> list[str]:
     """Return the folders that are part of names like ``camA/000``, sorted."""
     return sorted({view.rpartition("/")[0] for view in views if "/" in view})
 
 
+@names_folder
 def array_views(folder: Path, layout: Layout = "hwc", fit: Fit | Literal[""] = "") -> ViewFolder[FeatureGrid]:
     """Open the grids of a folder of ``.npy``, ``.npz`` or ``.pt`` files [h, w, F], or [F, h, w] for layout ``chw``.
 
@@ -98,6 +113,7 @@ def grids_of(
     return ViewFolder(files, read)
 
 
+@names_folder
 def langsplat_views(folder: Path) -> ViewFolder[Regions]:
     """Open the regions of a folder of ``IMG_s.npy`` and ``IMG_f.npy`` files, and of its sub-folders."""
     files = npy_files(folder, LABELS)
@@ -105,8 +121,7 @@ def langsplat_views(folder: Path) -> ViewFolder[Regions]:
     codebooks = {view: path.with_name(path.name.removesuffix(LABELS) + CODEBOOK) for view, path in labels.items()}
     for view, path in codebooks.items():
         if not path.is_file():
-            got = f"{labels[view].name} alone"
-            raise InvalidFeatures(str(folder), expected=f"embeddings in {path.name}", got=got)
+            raise ValueError(f"embeddings in {path.name}, got {labels[view].name} alone")
 
     def read(view: str) -> Regions:
         codebook = read_floats(codebooks[view], "M, F")
@@ -144,7 +159,7 @@ def npy_files(folder: Path, *suffixes: str) -> list[Path]:
         if pickles:
             got = f"{len(pickles)} pickles ({pickles[0]}), which can run code when they are opened"
             hint = "save them as .npy with the program that wrote them: numpy.save(name, tensor.cpu().numpy())"
-        raise InvalidFeatures(str(folder), expected=f"*{suffixes[0]} files", got=got, hint=hint)
+        raise ValueError(f"*{suffixes[0]} files, got {got}; {hint}")
     return matches
 
 
@@ -159,6 +174,6 @@ def files_by_view(
         view = without_image_suffix(inner.removesuffix(suffix))
         if view in by_view:
             got = f"{by_view[view].name} and {path.name}, both of the view {view!r}"
-            raise InvalidFeatures(str(folder), expected=f"one {noun} a view", got=got, hint=hint)
+            raise ValueError(f"one {noun} a view, got {got}; {hint}")
         by_view[view] = path
     return by_view

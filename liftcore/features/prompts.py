@@ -29,7 +29,7 @@ from typing import Literal
 import numpy as np
 
 from liftcore.errors import InvalidFeatures, reading
-from liftcore.features.folders import ViewFolder, files_below
+from liftcore.features.folders import ViewFolder, files_below, names_folder
 from liftcore.features.mask_files import AS_COCO, StoredMask, binary_mask, binary_picture, label_png
 from liftcore.features.mask_json import (
     VOID,
@@ -41,6 +41,7 @@ from liftcore.features.mask_json import (
 )
 from liftcore.io.files import visible_files
 from liftcore.io.npy import ARRAYS, NUMBERS, open_array, without_unit_axes
+from liftcore.runtime.one_line import join_names
 from liftcore.scene.views import composed, require_name, without_image_suffix
 from liftcore.text.table import TableEncoder, normalize_text
 from liftcore.values.views import NO_LABEL, Regions, label_levels
@@ -67,6 +68,7 @@ BEYOND = (
 MASK_DATA = "mask_data"  # folder of Grounded SAM 2's tracking, next to json_data
 
 Unannotated = Literal["skip", "negative"]
+Images = Sequence[tuple[MaskDocument, ImageMasks]]
 Masks = Iterable[tuple[str | None, np.ndarray]]  # of a file: [h, w] bool by phrase, or by VOID for unlabelled pixels
 
 
@@ -126,6 +128,7 @@ class Prompts:
     warnings: tuple[str, ...] = ()  # of omitted images and unlabelled pixels
 
 
+@names_folder
 def prompt_views(
     folder: Path,
     names: Path | None = None,
@@ -164,7 +167,7 @@ def prompt_views(
         suffix, count = Counter(path.suffix.lower() for path in files).most_common(1)[0] if files else ("", 0)
         hint = "give the folder that also contains json_data" if arrays else OTHER_FILES.get(suffix, "")
         got = f"{len(files)} other files" + (f", {count} of them {suffix}" if suffix else "")
-        raise InvalidFeatures(str(folder), expected=f"one of {LAYOUTS}", got=got, hint=hint)
+        raise ValueError(f"one of {LAYOUTS}, got {got}; {hint}")
     return _prompts(index, files, warnings)
 
 
@@ -173,8 +176,8 @@ def _prompts(index: _MaskIndex, files: Sequence[Path], warnings: list[str]) -> P
     seen_in = Counter(phrase for view in index.views.values() for phrase in view.phrases)
     order = sorted(seen_in)
     if not 1 <= len(order) <= MAX_PHRASES:
-        expected, got = f"1 to {MAX_PHRASES} phrases with masks", f"{len(order)} of {len(index.phrases)} phrases"
-        raise InvalidFeatures("masks", expected=expected, got=got, hint="; ".join(warnings))
+        got = f"{len(order)} of {len(index.phrases)} phrases"
+        raise ValueError(f"1 to {MAX_PHRASES} phrases with masks, got {got}; {'; '.join(warnings)}")
     labelled_views = {
         name: view for name, view in index.views.items() if view.phrases or view.has_void or view.was_searched(order)
     }
@@ -326,20 +329,17 @@ def _add_documents(
 ) -> list[str]:
     """Add the masks of all documents, and return warnings."""
     documents = [read_mask_document(path, unannotated_negative=negative) for path in paths]
-    views, id_files = _document_views(documents, folder), _id_files(documents, folder, other_files)
-    names_images = all(image.image or image.ids for document in documents for image in document.images)
+    images = [(document, image) for document in documents for image in document.images]
+    views, id_files = _views_of(images, folder), _id_files(images, folder, other_files)
+    names_images = all(image.image or image.ids for _, image in images)
     if not names_images and (pictures := [path.name for path in other_files if path.suffix.lower() == PICTURE]):
         # Documents that name their images are stored together with photos (Roboflow) or pictures of ids.
         hint = "give the file of names with --names (in Python names=), or use one folder for each kind of masks"
-        got = f"{paths[0].name} and {pictures[0]}"
-        raise InvalidFeatures(str(folder), expected=f"one of {LAYOUTS}", got=got, hint=hint)
+        raise ValueError(f"one of {LAYOUTS}, got {paths[0].name} and {pictures[0]}; {hint}")
     file_names: dict[str, str] = {}  # view -> its file, of data sets
-    for document, image in ((source, image) for source in documents for image in source.images):
+    for (document, image), own_name in zip(images, views, strict=True):
         id_file = _id_file(image.ids, document.path, id_files) if image.ids else None
-        if id_file is not None:
-            name = tracked_view(id_file, document.path, folder, image.ids)
-        else:
-            name = views[document.path, image.image]
+        name = own_name if id_file is None else tracked_view(id_file, document.path, folder, image.ids)
         if image.file and file_names.setdefault(name, image.file) != image.file:
             got = f"{file_names[name]} and {image.file}, both of the view {name!r}"
             hint = "rotated, cropped or mirrored copies do not match their photo: export without augmentation"
@@ -352,7 +352,13 @@ def _add_documents(
         if id_file is not None:
             with reading(id_file, InvalidFeatures, "ids [h, w]"):
                 _add_tracked(index, name, id_file, image)
-    return _document_warnings(documents, views)
+    records = [view for (_, image), view in zip(images, views, strict=True) if image.image and not image.file]
+    merged = Counter(view for (_, image), view in zip(images, views, strict=True) if image.image)
+    return _document_warnings(documents) + [
+        f"{merged[view]} files are of one image, {view!r}: their masks are merged"
+        for view in sorted(set(records))
+        if merged[view] > 1
+    ]
 
 
 def _decoded(masks: Sequence[tuple[str | None, StoredMask]]) -> Masks:
@@ -368,13 +374,9 @@ def _add_tracked(index: _MaskIndex, name: str, path: Path, image: ImageMasks) ->
     _add_ids(index, name, path, values, image.id_phrases)
 
 
-def _id_files(documents: Sequence[MaskDocument], folder: Path, files: Sequence[Path]) -> dict[str, list[Path]]:
+def _id_files(images: Images, folder: Path, files: Sequence[Path]) -> dict[str, list[Path]]:
     """Return name without suffix -> files that may contain ids: below the folder, or in a sibling ``mask_data``."""
-    sibling_folders = {
-        document.path.parent.parent / MASK_DATA
-        for document in documents
-        if any(image.ids for image in document.images)
-    }
+    sibling_folders = {document.path.parent.parent / MASK_DATA for document, image in images if image.ids}
     outside = [path for path in sorted(sibling_folders) if path.is_dir() and not path.is_relative_to(folder)]
     by_stem: dict[str, list[Path]] = {}
     for path in [*files, *(file for sibling in outside for file in visible_files(sibling))]:
@@ -393,31 +395,23 @@ def _id_file(name: str, document: Path, files: Mapping[str, Sequence[Path]]) -> 
     return min(files[stem], key=lambda path: sum(not path.is_relative_to(parent) for parent in document.parents))
 
 
-def _document_views(documents: Sequence[MaskDocument], folder: Path) -> dict[tuple[Path, str | None], str]:
-    """Return (document, image) -> view.
-
-    Images of data sets keep the folders of their relative paths. A document of one image belongs to the view with its
-    own name, unless it names another image.
-    """
-    views: dict[tuple[Path, str | None], str] = {}
-    by_path: dict[tuple[Path, str], str] = {}
-    for document, image in ((source, image) for source in documents for image in source.images):
-        document_view, name = _view_of(document.path, folder), image.image
-        if name is None:
-            views[document.path, None] = document_view
+def _views_of(images: Images, folder: Path) -> list[str]:
+    """Return the view of each image: of data sets by its relative path, else by its document or its own name."""
+    views: list[str] = []
+    elsewhere: dict[int, str] = {}
+    for document, image in images:
+        own_view, path = _view_of(document.path, folder), without_image_suffix(image.image or "")
+        if image.image is None or (not image.file and PurePosixPath(path).name == PurePosixPath(own_view).name):
+            views.append(own_view)
             continue
-        path = without_image_suffix(name)
-        if image.file and not (path.startswith("/") or path[1:3] == ":/"):
-            views[document.path, name] = path
-        elif not image.file and PurePosixPath(path).name == PurePosixPath(document_view).name:
-            views[document.path, name] = document_view
-        else:
-            by_path[document.path, name] = name
-    image_views = views_of_images([*by_path.values()]) if by_path else {}
-    return views | {key: image_views[name] for key, name in by_path.items()}
+        if not image.file or path.startswith("/") or path[1:3] == ":/":
+            elsewhere[len(views)] = image.image
+        views.append(path)
+    names = views_of_images([*elsewhere.values()]) if elsewhere else {}
+    return [names[elsewhere[place]] if place in elsewhere else view for place, view in enumerate(views)]
 
 
-def _document_warnings(documents: Sequence[MaskDocument], views: Mapping[tuple[Path, str | None], str]) -> list[str]:
+def _document_warnings(documents: Sequence[MaskDocument]) -> list[str]:
     warnings = list[str]()
     for document in documents:
         missing = sum(not image.annotated for image in document.images)
@@ -426,21 +420,9 @@ def _document_warnings(documents: Sequence[MaskDocument], views: Mapping[tuple[P
                 f"{missing} of {len(document.images)} images of {document.path.name} have no annotation and are "
                 "omitted; with --unannotated negative they show none of its phrases"
             )
-    for counts, text in (
-        ({document.path.name: document.boxes for document in documents}, BOXES),
-        ({document.path.name: document.beyond for document in documents}, BEYOND),
-    ):
-        names = [name for name, count in counts.items() if count]
-        if names:
-            files = names[0] if len(names) == 1 else f"{len(names)} files ({names[0]}, ...)"
+    for name, text in (("boxes", BOXES), ("beyond", BEYOND)):
+        counts = {document.path.name: getattr(document, name) for document in documents if getattr(document, name)}
+        if counts:
+            files = join_names([*counts], 1)
             warnings.append(text.format(count=sum(counts.values()), files=files))
-    several = Counter(view for (_, image), view in views.items() if image is not None)
-    records = {
-        views[document.path, image.image]
-        for document in documents
-        for image in document.images
-        if image.image is not None and not image.file
-    }
-    for view in sorted(view for view in records if several[view] > 1):
-        warnings.append(f"{several[view]} files are of one image, {view!r}: their masks are merged")
     return warnings

@@ -17,7 +17,6 @@ from liftcore.scene.render_mode import mode_of_comments
 
 CHUNK_ROWS = 256
 AXES = ("x", "y", "z")
-PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 SH_COLUMNS = (9, 24, 45)  # of degree 1 to 3
 SH_RANGE = 8.0  # of a higher harmonic, from -4 to 4
 
@@ -66,25 +65,16 @@ def read_compressed_ply(path: Path, *, colour: bool = True) -> Fields:
 
 
 def _check_tables(tables: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Check the columns of the format, and return the tables of chunks, vertices and harmonics."""
-    ends = [f"{end}_{name}" for end in ("min", "max") for name in (*AXES, *(f"scale_{axis}" for axis in AXES))]
-    colours = [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
+    """Return the tables of chunks, vertices and harmonics, which fit together."""
     chunks, vertices, harmonics = (tables.get(name) for name in ("chunk", "vertex", "sh"))
     if chunks is None or vertices is None or not len(vertices):
         raise ValueError("at least one splat in chunks, got an empty scene")
-    names = set(chunks.dtype.names or ())
-    required = {"chunk": [*ends, *(colours if names.intersection(colours) else [])], "vertex": PACKED}
-    for element, code in (("chunk", "<f4"), ("vertex", "<u4")):
-        for name in required[element]:
-            if name not in (tables[element].dtype.names or ()) or tables[element].dtype[name] != code:
-                kind = "float" if code == "<f4" else "uint"
-                raise ValueError(f"the {kind} {name!r} of the element {element!r}, got none")
     if len(chunks) != -(-len(vertices) // CHUNK_ROWS):
         raise ValueError(f"a chunk for {CHUNK_ROWS} splats, got {len(chunks)} for {len(vertices)}")
     if harmonics is not None:
         columns = harmonics.dtype.names or ()
-        complete = {f"f_rest_{i}" for i in range(len(columns))} == set(columns) and len(columns) in SH_COLUMNS
-        if not complete or len(harmonics) != len(vertices) or any(harmonics.dtype[name] != "u1" for name in columns):
+        is_bytes = all(harmonics.dtype[name] == "u1" for name in columns)
+        if len(columns) not in SH_COLUMNS or len(harmonics) != len(vertices) or not is_bytes:
             expected = f"{' or '.join(map(str, SH_COLUMNS))} uchar f_rest_* of each splat in the element 'sh'"
             raise ValueError(f"{expected}, got {len(columns)} of {len(harmonics)} splats")
     return chunks, vertices, harmonics

@@ -11,12 +11,13 @@ import posixpath
 import warnings
 import zipfile
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from enum import Enum
 from pathlib import Path, PurePosixPath
 from typing import IO, TYPE_CHECKING, NamedTuple
 
-from liftcore.errors import InvalidInput
+from liftcore.errors import InvalidInput, reading
 from liftcore.io.files import BROKEN_ZIP
 from liftcore.runtime.one_line import join_names
 from liftcore.scene.views import IMAGE_SUFFIXES, without_image_suffix
@@ -77,26 +78,36 @@ def orientation_warnings(readings: Mapping[str, Reading], counterparts: str) -> 
         Reading.ORIENTED: f"were turned as their EXIF asks, as the sizes of {counterparts} tell",
     }
     lines = []
-    for reading, text in advice.items():
-        if views := [view for view, value in readings.items() if value is reading]:
+    for orientation, text in advice.items():
+        if views := [view for view, value in readings.items() if value is orientation]:
             view_names = join_names(views, MAX_LISTED)
             lines.append(f"{len(views)} of {len(readings)} photos ({view_names}) {text}")
     return lines
 
 
-def read_header(photo: Path | IO[bytes], name: str = "") -> PhotoHeader:
-    """Read the size and the orientation of a photo; no pixel is decoded."""
+@contextmanager
+def open_photo(photo: Path | IO[bytes], name: str = "") -> Iterator[Image.Image]:
+    """Open a photo with Pillow, which decodes no pixel yet; errors name the file."""
     from PIL import Image, UnidentifiedImageError
 
     source = name or str(photo)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about large images, whose header alone is read, and odd EXIF
+    hint = UNREAD.get(PurePosixPath(source).suffix.lower(), "")
+    with reading(source, InvalidInput, "a complete image", hint), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about large images, and odd EXIF
+        try:
             with Image.open(photo) as image:
-                return header_of(image)
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError, EOFError):
-        hint = UNREAD.get(PurePosixPath(source).suffix.lower(), "")
-        raise InvalidInput(source, expected="an image", got="a file that does not open as one", hint=hint) from None
+                yield image
+        except UnidentifiedImageError:
+            raise ValueError("a file that Pillow cannot identify") from None
+        except Image.DecompressionBombError:
+            limit = 2 * (Image.MAX_IMAGE_PIXELS or 0)
+            raise ValueError(f"an image of at most {limit} pixels, got a larger one") from None
+
+
+def read_header(photo: Path | IO[bytes], name: str = "") -> PhotoHeader:
+    """Read the size and the orientation of a photo; no pixel is decoded."""
+    with open_photo(photo, name) as image:
+        return header_of(image)
 
 
 def header_of(image: Image.Image) -> PhotoHeader:

@@ -74,15 +74,6 @@ PADDING = b"\0 \t\r\n"  # bytes that some programs end a file with
 MAX_PADDING_BYTES = 4096  # that are read
 FLOAT_BYTES = 4  # of a column that a header may lack
 _COUNT = re.compile("[0-9]{1,18}")
-_GSPLAT = {"x", "y", "z", "f_dc_0", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_3"}
-_SIGNATURES = {
-    "Inria 3DGS": {*_GSPLAT, "nx"},
-    "gsplat": _GSPLAT,
-    "2DGS": {*_GSPLAT, "nx"} - {"scale_2"},
-    "DBS": {*_GSPLAT, "sh0_0", "beta"} - {"f_dc_0"},
-    "a point cloud, which has no splats": {"x", "y", "z", "red", "green", "blue", "nx"},
-}
-
 
 # ---- splats
 
@@ -193,12 +184,14 @@ def rewritten(
         for first in range(0, count, BLOCK_ROWS):
             rows = np.fromfile(source, header.dtype, min(BLOCK_ROWS, count - first))
             block = slice(first, first + len(rows))
-            if columns:
+            changed_rows = rows
+            if dtype != header.dtype:
                 changed_rows = np.empty(len(rows), dtype)
-                for name in types:
-                    changed_rows[name] = columns[name][block] if name in columns else rows[name]
-                rows = changed_rows
-            yield (rows if mask is None else rows[mask[block]]).tobytes()
+                for name in types.keys() - columns.keys():
+                    changed_rows[name] = rows[name]
+            for name, values in columns.items():
+                changed_rows[name] = values[block]
+            yield (changed_rows if mask is None else changed_rows[mask[block]]).tobytes()
 
 
 def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
@@ -289,23 +282,20 @@ def _default_layout(splats: Splats) -> tuple[str, ...]:
 
 def _columns_of(splats: Splats, layout: Sequence[str]) -> dict[str, np.ndarray]:
     """Column name -> [P]; normals that the splats never had are left out and stay zero."""
-    with reading("layout", InvalidSplats, "columns of the splats"):
-        slots = model_slots(layout, splats.kernel)
     columns: dict[str, np.ndarray] = {}
-    for name in layout:
-        if name in slots:
-            field = slots[name].field
-            values = splats.positions() if field == "means" else getattr(splats, field)
-            index = slots[name].index
-            if values is None or any(i >= n for i, n in zip(index, values.shape[1:], strict=True)):
-                expected, hint = "columns of the splats", "clear the layout"
-                raise InvalidSplats("layout", expected=expected, got=repr(name), hint=hint)
-            values = values if isinstance(values, np.ndarray) else values.cpu().numpy()
-            columns[name] = values[(slice(None), *index)]
-        elif name in splats.extras:
-            columns[name] = splats.extras[name].cpu().numpy()
-        elif name not in NORMALS:
-            raise InvalidSplats("layout", expected="columns of the splats", got=repr(name))
+    with reading("layout", InvalidSplats, "columns of the splats", "clear the layout"):
+        slots = model_slots(layout, splats.kernel)
+        for name in layout:
+            if name in slots:
+                field, tensor = slots[name].field, getattr(splats, slots[name].field)
+                values = (
+                    splats.positions() if field == "means" else np.asarray(None if tensor is None else tensor.cpu())
+                )
+                columns[name] = values[(slice(None), *slots[name].index)]
+            elif name in splats.extras:
+                columns[name] = splats.extras[name].cpu().numpy()
+            elif name not in NORMALS:
+                raise ValueError(repr(name))
     return columns
 
 
@@ -356,10 +346,12 @@ def full_level(levels: np.ndarray) -> float:
     return 255.0 if finite.size and np.median(finite) > 1 else 1.0
 
 
-def nearest_dialect(names: Collection[str]) -> str:
-    """Return the dialect that shares most of these columns."""
-    columns = set(names)
-    return max(_SIGNATURES, key=lambda dialect: len(_SIGNATURES[dialect] & columns) / len(_SIGNATURES[dialect]))
+def dialect_of(names: Collection[str]) -> str:
+    """Return the dialect of these columns, by the kernel and the normals that it has."""
+    kernel = recognise_kernel(names)
+    if kernel is Kernel.GAUSSIAN_3D:
+        return "Inria 3DGS" if "nx" in names else "gsplat"
+    return kernel.upper()
 
 
 def usual_layout(kernel: Kernel, sh_rows: int, lobes: int) -> tuple[str, ...]:
@@ -377,7 +369,7 @@ def model_slots(names: Sequence[str], kernel: Kernel) -> dict[str, Slot]:
     for name in _columns(kernel, 0, 0, beta_names=False):
         if name not in names:
             listing = ", ".join([*names[:8], "..."] if len(names) > 8 else names)
-            got = f"{len(names)} properties without it ({listing}); the nearest dialect is {nearest_dialect(names)}"
+            got = f"{len(names)} properties without it ({listing}); the nearest dialect is {dialect_of(names)}"
             raise ValueError(f"the property {name!r} of a {kernel} splat, got {got}")
     beta_names = "sh0_0" in names
     first, rest = ("sh0", "shN") if beta_names else ("f_dc", "f_rest")

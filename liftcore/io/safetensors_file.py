@@ -20,10 +20,11 @@ import numpy as np
 from liftcore.io.files import first_bytes, open_regular, whole_file
 from liftcore.runtime.memory import map_anonymous
 
-DTYPES = {
-    "F64": np.float64, "F32": np.float32, "F16": np.float16, "I64": np.int64, "I32": np.int32, "I16": np.int16,
-    "I8": np.int8, "U8": np.uint8, "U16": np.uint16, "BOOL": np.bool_,
+NAMES = {
+    "F64": "float64", "F32": "float32", "F16": "float16", "I64": "int64", "I32": "int32", "I16": "int16",
+    "I8": "int8", "U8": "uint8", "U16": "uint16", "BOOL": "bool",
 }  # fmt: skip
+TYPES = {f"torch.{name}": code for code, name in NAMES.items()}
 
 if TYPE_CHECKING:
     import torch
@@ -31,18 +32,6 @@ if TYPE_CHECKING:
 
     Spec = tuple[str, torch.dtype, tuple[int, ...]]  # a tensor's name, type and shape
 
-TYPES = {
-    "torch.float64": "F64",
-    "torch.int64": "I64",
-    "torch.float32": "F32",
-    "torch.int32": "I32",
-    "torch.float16": "F16",
-    "torch.int16": "I16",
-    "torch.int8": "I8",
-    "torch.uint8": "U8",
-    "torch.uint16": "U16",
-    "torch.bool": "BOOL",
-}
 COPIED_BYTES = 1 << 20
 NO_RESERVE = 0x4000 if sys.platform == "linux" else 0  # flags of mmap, which Python does not name
 FIXED = 0x10
@@ -188,9 +177,9 @@ def map_file(file: IO[bytes]) -> mmap.mmap:
 
 
 def _array(mapped: mmap.mmap, start: int, entry: dict) -> np.ndarray:
-    if entry["dtype"] not in DTYPES:
+    if entry["dtype"] not in NAMES:
         raise ValueError(f"tensors of the type {entry['dtype']}")
-    dtype, count = np.dtype(DTYPES[entry["dtype"]]), math.prod(entry["shape"])
+    dtype, count = np.dtype(NAMES[entry["dtype"]]), math.prod(entry["shape"])
     if count == 0:
         return np.empty(entry["shape"], dtype)
     array = np.frombuffer(mapped, dtype, count, start + entry["data_offsets"][0]).reshape(entry["shape"])

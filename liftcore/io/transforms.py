@@ -79,9 +79,6 @@ def parse_transforms(document: Any, source: str, photos: PhotosBeside | None = N
         photos: source of sizes that the document does not have; None: none.
     """
     with reading(source, InvalidCameras, FORMATS):
-        if not isinstance(document, dict) or "frames" not in document:
-            listing = ", ".join(list(document)[:5]) if isinstance(document, dict) else type(document).__name__
-            raise ValueError(f"{FORMATS}, got {f'an object with {listing}' if document else 'an empty object'}")
         names, frames = _named_frames(document["frames"], source)
     views = zip(names, [ChainMap(frame, document) for frame in frames], strict=True)
     cameras, warnings = read_views(views, lambda name, keys: _cameras(name, keys, source, photos))

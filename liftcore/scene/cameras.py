@@ -103,10 +103,16 @@ class Camera:
         fields = {"viewmat": _matrix(viewmat), "K": _matrix(K), "width": _pixels(width), "height": _pixels(height)}
         for field, value in {**fields, "lens": lens, "name": composed(name)}.items():
             object.__setattr__(self, field, value)
-        if not (0 < self.width <= MAX_SIDE and 0 < self.height <= MAX_SIDE):
-            self._refuse("size", f"width and height, whole numbers in 1..{MAX_SIDE}", f"{width!r} x {height!r}")
-        self._check_intrinsics()
-        self._check_pose(self.viewmat)
+        label = f"camera {self.name!r}"
+        with reading(f"{label} size", InvalidCameras, f"width and height, whole numbers in 1..{MAX_SIDE}"):
+            if not (0 < self.width <= MAX_SIDE and 0 < self.height <= MAX_SIDE):
+                raise ValueError(f"{width!r} x {height!r}")
+        with reading(f"{label} K", InvalidCameras, "a 3x3 matrix (fx 0 cx; 0 fy cy; 0 0 1) without skew"):
+            _check_matrix(self.K)
+        with reading(f"{label} intrinsics", InvalidCameras, "fx, fy, cx, cy in pixels"):
+            self._check_intrinsics()
+        with reading(f"{label} pose", InvalidPose, "a pose"):
+            _check_pose(self.viewmat)
 
     @classmethod
     def pinhole(
@@ -195,49 +201,17 @@ class Camera:
             return replace(self, K=K, **changes)
 
     def _check_intrinsics(self) -> None:
-        K = self.K
-        if K.shape != (3, 3) or (K[1, 0], *K[2].tolist()) != (0.0, 0.0, 0.0, 1.0) or K[0, 1] != 0:
-            rows = "fx 0 cx; 0 fy cy; 0 0 1"
-            got = f"shape {list(K.shape)}"
-            if K.shape == (3, 3):
-                got = "; ".join(" ".join(f"{value:g}" for value in row) for row in K)
-            self._refuse("K", f"a 3x3 matrix ({rows}) without skew", got[:MAX_TEXT])
         intrinsics = (self.fx, self.fy, self.cx, self.cy)
         if not all(math.isfinite(value) for value in intrinsics) or self.fx <= 0 or self.fy <= 0:
-            self._refuse("intrinsics", "finite fx, fy, cx, cy with positive focal lengths", str(intrinsics))
-        if (
-            min(self.width, self.height) >= MIN_PIXELS
-            and max(intrinsics[:2]) < MIN_PIXELS
-            and max(intrinsics[2:]) <= 1
-        ):
+            raise ValueError(f"finite fx, fy, cx, cy with positive focal lengths, got {intrinsics}")
+        is_share = max(intrinsics[:2]) < MIN_PIXELS and max(intrinsics[2:]) <= 1
+        if min(self.width, self.height) >= MIN_PIXELS and is_share:
             hint = f"multiply fx and cx by {self.width}, fy and cy by {self.height}"
-            self._refuse("intrinsics", "fx, fy, cx, cy in pixels", f"{intrinsics}, shares of the image's size", hint)
+            raise ValueError(f"fx, fy, cx, cy in pixels, got {intrinsics}, shares of the image's size; {hint}")
         if not (min(intrinsics[:2]) >= MIN_FOCAL and max(intrinsics[:2]) <= MAX_FOCAL):
-            self._refuse("intrinsics", f"focal lengths in {MIN_FOCAL:g}..{MAX_FOCAL:g} pixels", str(intrinsics))
+            raise ValueError(f"focal lengths in {MIN_FOCAL:g}..{MAX_FOCAL:g} pixels, got {intrinsics}")
         if max(abs(self.cx), abs(self.cy)) > MAX_OFF_CENTRE:
-            self._refuse("intrinsics", f"a principal point within {MAX_OFF_CENTRE:g} pixels", str(intrinsics))
-
-    def _check_pose(self, pose: np.ndarray) -> None:
-        if pose.shape != (4, 4) or not np.isfinite(pose).all():
-            self._refuse_pose("a finite 4x4 matrix", f"shape {list(pose.shape)}")
-        if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > ROUNDING:
-            self._refuse_pose("0 0 0 1 as the last row", " ".join(f"{value:g}" for value in pose[3]))
-        rotation = pose[:3, :3]
-        # Large entries are refused before the product, which they could overflow.
-        error = float(np.abs(rotation).max())
-        if error <= 2:
-            error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-        if error > 1e-3 or np.linalg.det(rotation) < 0:
-            self._refuse_pose("a proper rotation", *_what_it_is(rotation, error))
-        reach = float(np.abs(pose[:3, 3]).max())
-        if reach > MAX_REACH:
-            self._refuse_pose(f"a translation within {MAX_REACH:g}", f"{reach:.2g}")
-
-    def _refuse(self, part: str, expected: str, got: str, hint: str = "") -> None:
-        raise InvalidCameras(f"camera {self.name!r} {part}", expected=expected, got=got, hint=hint)
-
-    def _refuse_pose(self, expected: str, got: str, hint: str = "") -> None:
-        raise InvalidPose(f"camera {self.name!r} pose", expected=expected, got=got, hint=hint)
+            raise ValueError(f"a principal point within {MAX_OFF_CENTRE:g} pixels, got {intrinsics}")
 
     @property
     def fx(self) -> float:
@@ -303,15 +277,41 @@ def _pixels(side: Any) -> int:
         return 0
 
 
-def _what_it_is(matrix: np.ndarray, error: float) -> tuple[str, str]:
+def _check_matrix(K: np.ndarray) -> None:
+    """Refuse a matrix that is none of intrinsics."""
+    if K.shape != (3, 3):
+        raise ValueError(f"shape {list(K.shape)}")
+    if (K[0, 1], K[1, 0], *K[2].tolist()) != (0.0, 0.0, 0.0, 0.0, 1.0):
+        raise ValueError(" | ".join(" ".join(f"{value:g}" for value in row) for row in K))
+
+
+def _check_pose(pose: np.ndarray) -> None:
+    """Refuse a matrix that is no rigid motion."""
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise ValueError(f"a finite 4x4 matrix, got shape {list(pose.shape)}")
+    if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > ROUNDING:
+        raise ValueError(f"0 0 0 1 as the last row, got {' '.join(f'{value:g}' for value in pose[3])}")
+    rotation = pose[:3, :3]
+    # Large entries are refused before the product, which they could overflow.
+    error = float(np.abs(rotation).max())
+    if error <= 2:
+        error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if error > 1e-3 or np.linalg.det(rotation) < 0:
+        raise ValueError(f"a proper rotation, got {_what_it_is(rotation, error)}")
+    reach = float(np.abs(pose[:3, 3]).max())
+    if reach > MAX_REACH:
+        raise ValueError(f"a translation within {MAX_REACH:g}, got {reach:.2g}")
+
+
+def _what_it_is(matrix: np.ndarray, error: float) -> str:
     """Describe a matrix that is no proper rotation, and say what to do."""
     if error <= 1e-3:
         hint = "negate one axis of the transform that was applied, such as a normalisation, for cameras and splats"
-        return "a matrix that mirrors (determinant -1)", hint
+        return f"a matrix that mirrors (determinant -1); {hint}"
     scale = float(np.cbrt(np.linalg.det(matrix))) if np.abs(matrix).max() < MAX_REACH else 0.0
     if scale > 0 and np.abs(matrix @ matrix.T / scale**2 - np.eye(3)).max() < 1e-3:
-        return f"a rotation scaled by {scale:.3g}", ""
-    return f"a matrix off by {error:.2g}", ""
+        return f"a rotation scaled by {scale:.3g}"
+    return f"a matrix off by {error:.2g}"
 
 
 def intrinsics_factor(cameras: Sequence[Camera]) -> float | None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from liftcore.errors import InvalidInput, InvalidSplats
+from liftcore.errors import InvalidInput, InvalidSplats, reading
 from liftcore.runtime.one_line import one_line, point_text
 from liftcore.scene.harmonics import SH_C0, band_rotation
 from liftcore.scene.kernel import DARK_LOBE, LOBE_COLOURS, NORMALS, Kernel, kernel_named, scale_count
@@ -307,12 +307,10 @@ def _move_to_origin(
     """Return the origin of the means, which are shifted if it is chosen here, and a warning of rounded means."""
     stored = shared_tensor(means)
     if origin is not None and (any(origin) or stored.dtype != torch.float64):
-        try:
-            x, y, z = (float(value) for value in origin)
-        except (TypeError, ValueError):
-            x = y = z = math.nan
-        if not all(map(math.isfinite, (x, y, z))):
-            raise InvalidSplats("origin", expected="three finite numbers", got=repr(origin)[:80])
+        with reading("origin", InvalidSplats, "three finite numbers"):
+            x, y, z = map(float, origin)
+            if not all(map(math.isfinite, (x, y, z))):
+                raise ValueError(repr(origin)[:80])
         return (x, y, z), []
     local = local_origin(stored, columns["log_scales"])
     if local == FILE_ORIGIN:
@@ -425,25 +423,19 @@ def shared_tensor(values: object) -> Tensor:
 
 def _extra(name: str, values: Array, count: int) -> Tensor:
     """Convert a further column [P] of any type."""
-    try:
+    with reading(f"extras[{name!r}]", InvalidSplats, f"numbers [{count}], one a splat"):
         column = shared_tensor(values)
-    except (TypeError, ValueError):
-        column = torch.zeros(0, 0)
-    if column.shape != (count,):
-        got = f"shape {list(column.shape)}" if column.numel() else repr(values)[:80]
-        raise InvalidSplats(f"extras[{name!r}]", expected=f"numbers [{count}], one a splat", got=got)
+        if column.shape != (count,):
+            raise ValueError(f"shape {list(column.shape)}")
     return column
 
 
 def _floats(name: str, values: Array) -> Tensor:
     """Convert values to f32 on their device, without a copy if they are f32."""
-    try:
+    with reading(name, InvalidSplats, "an array of torch or numpy"):
         tensor = shared_tensor(values)
-    except (TypeError, ValueError, RuntimeError) as error:
-        expected, got = "an array of torch or numpy", f"{type(values).__name__} ({str(error)[:80]})"
-        raise InvalidSplats(name, expected=expected, got=got) from None
-    if not tensor.is_floating_point():
-        raise InvalidSplats(name, expected="floats", got=str(tensor.dtype).removeprefix("torch."))
+        if not tensor.is_floating_point():
+            raise ValueError(f"floats, got {str(tensor.dtype).removeprefix('torch.')}")
     return tensor.to(torch.float32)
 
 
@@ -452,13 +444,13 @@ def _column(name: str, values: Array, shape: tuple[Any, ...], device: torch.devi
     column = _floats(name, values)
     if len(shape) == 1 and column.ndim == 2 and column.shape[1] == 1:  # as Inria's code keeps opacities
         column = column[:, 0]
-    if column.ndim != len(shape) or any(
-        expected not in (..., side) for expected, side in zip(shape, column.shape, strict=True)
-    ):
-        sides = ", ".join("any" if side is ... else str(side) for side in shape)
-        raise InvalidSplats(name, expected=f"floats of shape [{sides}]", got=f"shape {list(column.shape)}")
-    if column.device != device:
-        raise InvalidSplats(name, expected=f"an array on {device}, where the means are", got=str(column.device))
+    with reading(name, InvalidSplats, "floats"):
+        sides = zip(shape, column.shape, strict=False)
+        if column.ndim != len(shape) or any(expected not in (..., side) for expected, side in sides):
+            expected_sides = ", ".join("any" if side is ... else str(side) for side in shape)
+            raise ValueError(f"floats of shape [{expected_sides}], got shape {list(column.shape)}")
+        if column.device != device:
+            raise ValueError(f"an array on {device}, where the means are, got {column.device}")
     return column
 
 

@@ -234,7 +234,7 @@ SPLAT_FILES = [
     ("checkpoint of integers", checkpoint({"splats": {"means": torch.zeros(2, 3, dtype=torch.int32)}}), "floats"),
     ("spz of version 9", b"NGSP\x09\0\0\0" + bytes(40), "version 9"),
     ("spz cut", sample("degree3.v4.spz")[:-40], "truncated"),
-    ("compressed PLY without bounds", compressed(b"float min_x", b"float mon_x"), "'min_x'"),
+    ("compressed PLY without bounds", compressed(b"float min_x", b"float mon_x"), "min_x"),
     ("SOG of version 1", sog("", "version", 1), "version 2"),
     ("SOG of more splats than pixels", sog("", "count", 400), "400"),
     ("SOG without places", sog("", "means", None), "'means'"),

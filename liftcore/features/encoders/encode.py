@@ -3,14 +3,13 @@
 Photos are read in the orientation of their cameras (`liftcore.io.photos`).
 """
 
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Tensor
 
 from liftcore.errors import InvalidFeatures, InvalidInput, reading
@@ -18,7 +17,7 @@ from liftcore.features.encoders import ImageEncoder, Pixels, open_image_encoder
 from liftcore.features.folders import files_below, folders_of, grids_of
 from liftcore.io.cameras import read_cameras
 from liftcore.io.files import check_output, writing
-from liftcore.io.photos import ORIENTATION, UNREAD, UPRIGHT, PhotoHeader, Reading, header_of, orientation_warnings
+from liftcore.io.photos import ORIENTATION, UPRIGHT, PhotoHeader, Reading, header_of, open_photo, orientation_warnings
 from liftcore.runtime.arguments import as_path, as_paths
 from liftcore.runtime.folders import scratch_folder
 from liftcore.runtime.progress import Progress, shown_progress
@@ -194,24 +193,10 @@ def read_image(path: Path | str, size: tuple[int, int] | None = None) -> tuple[I
     Args:
         path: of the image. size: width and height of its camera or masks, of any resolution; None: unknown.
     """
-    path = Path(path)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about images between one and two times Pillow's limit, and invalid EXIF
-            with Image.open(path) as image:
-                header = header_of(image)
-                image.load()
-                return _colours(_apply_orientation(image, header, size)), _reading(header, size)
-    except Image.DecompressionBombError:
-        limit = 2 * (Image.MAX_IMAGE_PIXELS or 0)
-        raise InvalidInput(str(path), expected=f"an image of at most {limit} pixels", got="a larger one") from None
-    except UnidentifiedImageError:
-        hint = UNREAD.get(path.suffix.lower(), "")
-        raise InvalidInput(
-            str(path), expected="an image", got="a file that Pillow cannot identify", hint=hint
-        ) from None
-    except (OSError, SyntaxError, ValueError, EOFError) as error:  # Pillow's errors for truncated or broken files
-        raise InvalidInput(str(path), expected="a complete image", got=str(error)[:160]) from None
+    with open_photo(Path(path)) as image:
+        header = header_of(image)
+        image.load()
+        return _colours(_apply_orientation(image, header, size)), _reading(header, size)
 
 
 def readings_of(headers: Mapping[str, PhotoHeader], sizes: Mapping[str, tuple[int, int]]) -> dict[str, Reading]:

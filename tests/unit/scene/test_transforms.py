@@ -255,7 +255,7 @@ def test_a_photo_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(InvalidCameras, match=r"frame 'c'.*size, w and h, got none, and no photo \S*/train/c \(\.png"):
         read_cameras(path)
     (tmp_path / "train/c.jpg").write_bytes(b"no photo")
-    with pytest.raises(InvalidCameras, match=r"frame 'c'.*does not open as one \(\S*/train/c\.jpg\)"):
+    with pytest.raises(InvalidCameras, match=r"frame 'c'.*cannot identify \(\S*/train/c\.jpg\)"):
         read_cameras(path)
 
 
