@@ -293,10 +293,13 @@ def _is_safetensors(head: bytes, size: int) -> bool:
 
 
 def _safetensors(path: Path) -> FileKind:
+    from safetensors import SafetensorError, safe_open
+
     try:
-        keys, metadata = keys_of(path)
-    except InvalidInput as error:
-        return FileKind(None, error.got, error.hint, recognised=False)
+        with safe_open(str(path), framework="np") as handle:
+            keys, metadata = set(handle.keys()), handle.metadata() or {}
+    except (SafetensorError, OSError) as error:
+        return FileKind(None, f"one that does not open ({str(error)[:120]})", recognised=False)
     parts = {key.rpartition("/")[2] for key in keys}
     signs = {
         "lift": LIFT_KEY in metadata, "table": keys == {"embeddings"}, "masks": "mask" in parts,
@@ -308,18 +311,6 @@ def _safetensors(path: Path) -> FileKind:
     tensors = ", ".join(repr(key[:40]) for key in sorted(keys)[:3]) or "no tensor"
     hint = "weights of an encoder go to --weights or the encoder's name; 'splatlift pack' makes feature packs"
     return FileKind(None, f"a safetensors file of {tensors}", hint)
-
-
-def keys_of(path: Path) -> tuple[set[str], dict[str, str]]:
-    """Return the names of a safetensors file's tensors, and its metadata."""
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(str(path), framework="np") as handle:
-            return set(handle.keys()), handle.metadata() or {}
-    except (SafetensorError, OSError) as error:
-        got = f"one that does not open ({str(error)[:120]})"
-        raise InvalidInput(str(path), expected="a safetensors file", got=got) from None
 
 
 def _by_magic(head: bytes) -> FileKind | None:

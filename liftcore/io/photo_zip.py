@@ -15,7 +15,7 @@ from typing import Any
 
 from liftcore.errors import InvalidCameras, InvalidPhotos, NotFound
 from liftcore.io.files import BROKEN_ZIP, is_system_file, open_zip
-from liftcore.io.photos import UPRIGHT, header_of
+from liftcore.io.photos import UPRIGHT, read_header
 from liftcore.scene.views import cameras_of_views, view_names
 
 MAX_PHOTOS = 10_000  # photos
@@ -167,16 +167,13 @@ def in_camera_orientation(
         photo: the blocks of the file.
         camera_size: returns width and height of the photo's camera; called only if the photo has an orientation.
     """
-    from PIL import Image
-
     first = next(photo, b"")
     is_png = first.startswith(b"\x89PNG")
     begin = first.find(b"eXIf" if is_png else b"Exif\0\0") - 4  # of its chunk or segment
     if begin < 0:
         return chain([first], photo), False
     content = first + b"".join(photo)
-    with Image.open(io.BytesIO(content), formats=[*FORMATS.values()]) as image:
-        header = header_of(image)
+    header = read_header(io.BytesIO(content), "photo")
     if header.orientation == UPRIGHT or header.turns_for(camera_size()):
         return iter([content]), False
     size = 12 + int.from_bytes(content[begin : begin + 4], "big")

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from liftcore.errors import InvalidInput, InvalidLift
+from liftcore.errors import InvalidInput, InvalidLift, reading
 from liftcore.io.files import open_regular
 from liftcore.io.kinds import wrong_kind
 from liftcore.io.safetensors_file import check_arrays, map_tensors
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from liftcore.values.lift import InputFile, Lift, LiftMetadata
 
 FORMAT = "splatlift-lift/2"
+EXPECTED, AGAIN = "a lift file (.safetensors)", "copy the file again, or lift again"
 TENSORS = ("features", "total_weight", "has_feature")
 CONFIDENCE = "confidence"  # in lifts that were reweighted
 NEAR = 3  # folders of an input's path, and above a lift, among which it is looked for
@@ -101,29 +102,19 @@ def read_lift(path: Path | str) -> tuple[dict[str, np.ndarray], str]:
     """Return the mapped arrays of a lift by their names, and its metadata as JSON: without torch and pydantic."""
     source = as_path(path)
     try:
-        return _read_arrays(source, path)
+        with reading(path, InvalidLift, EXPECTED, AGAIN):
+            tensors, header = map_tensors(source)
+            if "splatlift" not in header:
+                raise ValueError(f"{EXPECTED}, got safetensors without lift metadata")
+            if missing := [name for name in TENSORS if name not in tensors]:
+                _check_format(header["splatlift"])
+                raise ValueError(f"{EXPECTED}, got one without {missing[0]}")
+            arrays = {name: tensors[name] for name in SCHEMA if name in tensors}
+            _check_tensors(arrays)
     except InvalidLift as error:
         raise wrong_kind(source, "lift", InvalidLift, argument=str(path)) or error from None
-
-
-def _read_arrays(source: Path, path: Path | str) -> tuple[dict[str, np.ndarray], str]:
-    try:
-        tensors, header = map_tensors(source)
-        if "splatlift" not in header:
-            raise InvalidLift(str(path), expected="a lift file", got="safetensors without lift metadata")
-        missing = [name for name in TENSORS if name not in tensors]
-        if missing:
-            _check_format(header["splatlift"], path)
-            raise ValueError(f"no {missing[0]} in it")
-        arrays = {name: tensors[name] for name in SCHEMA if name in tensors}
-        _check_tensors(arrays)
-        for name, dtype in NARROWED.items():
-            if name in arrays:
-                arrays[name] = arrays[name].astype(dtype, copy=False)
-    except FileNotFoundError:
-        raise InvalidLift(str(path), expected="a lift file", got="no such file") from None
-    except (OSError, ValueError) as error:
-        raise _no_lift(path, error) from None
+    for name in NARROWED.keys() & arrays.keys():
+        arrays[name] = arrays[name].astype(NARROWED[name], copy=False)
     return arrays, header["splatlift"]
 
 
@@ -131,26 +122,18 @@ def parse_metadata(text: str, path: Path | str) -> LiftMetadata:
     """Return the metadata of a lift file from its JSON."""
     from liftcore.values.lift import LiftMetadata
 
-    try:
-        _check_format(text, path)
+    with reading(path, InvalidLift, EXPECTED, AGAIN):
+        _check_format(text)
         return LiftMetadata.model_validate_json(text)
-    except ValueError as error:  # pydantic's
-        raise _no_lift(path, error) from None
 
 
-def _check_format(text: str, path: Path | str) -> None:
+def _check_format(text: str) -> None:
     """Refuse the metadata of a lift of a later format."""
     metadata = json.loads(text)
     name = metadata.get("format", FORMAT) if isinstance(metadata, dict) else FORMAT
     if name != FORMAT:
         hint = "install the version of splatlift that wrote it, or a later one"
-        raise InvalidLift(str(path), expected=f"a lift of {FORMAT}", got=repr(name)[:80], hint=hint)
-
-
-def _no_lift(path: Path | str, error: Exception) -> InvalidLift:
-    got = f"a file that does not open as one: {error}"
-    hint = "copy the file again, or lift again"
-    return InvalidLift(str(path), expected="a lift file (.safetensors)", got=got, hint=hint)
+        raise ValueError(f"a lift of {FORMAT}, got {name!r}; {hint}")
 
 
 def _check_tensors(arrays: dict[str, np.ndarray]) -> None:
