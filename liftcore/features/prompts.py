@@ -398,17 +398,17 @@ def _id_file(name: str, document: Path, files: Mapping[str, Sequence[Path]]) -> 
 def _views_of(images: Images, folder: Path) -> list[str]:
     """Return the view of each image: of data sets by its relative path, else by its document or its own name."""
     views: list[str] = []
-    elsewhere: dict[int, str] = {}
+    other_names: dict[int, str] = {}
     for document, image in images:
         own_view, path = _view_of(document.path, folder), without_image_suffix(image.image or "")
         if image.image is None or (not image.file and PurePosixPath(path).name == PurePosixPath(own_view).name):
             views.append(own_view)
             continue
         if not image.file or path.startswith("/") or path[1:3] == ":/":
-            elsewhere[len(views)] = image.image
+            other_names[len(views)] = image.image
         views.append(path)
-    names = views_of_images([*elsewhere.values()]) if elsewhere else {}
-    return [names[elsewhere[place]] if place in elsewhere else view for place, view in enumerate(views)]
+    names = views_of_images([*other_names.values()]) if other_names else {}
+    return [names[other_names[place]] if place in other_names else view for place, view in enumerate(views)]
 
 
 def _document_warnings(documents: Sequence[MaskDocument]) -> list[str]:
