@@ -166,7 +166,8 @@ def _cameras(name: str, image: _Image, sensors: Mapping[int, _Sensor], files: tu
         raise InvalidPose(f"{source} image {name!r}", expected=expected, got=got)
     pose[:3, :3] = rotation_matrices(np.array(image.quaternion))
     pose[:3, 3] = image.translation
-    intrinsics, distortion = calibration(sensor.model, sensor.parameters, f"{files[0]} camera {image.camera}")
+    with reading(f"{files[0]} camera {image.camera}", InvalidCameras, f"a camera of {READ_MODELS}"):
+        intrinsics, distortion = calibration(sensor.model, sensor.parameters)
     camera = Camera.pinhole(name, sensor.width, sensor.height, *intrinsics, viewmat=pose)
     return [camera if distortion is None else behind_lens(camera, distortion)]
 
@@ -262,19 +263,17 @@ def _bad_line(expected: str, line: str) -> ValueError:
     return ValueError(f"lines {expected!r}, got {line[:80]!r}")
 
 
-def calibration(model: CameraModel, parameters: Sequence[float], source: str) -> tuple[Intrinsics, Distortion | None]:
+def calibration(model: CameraModel, parameters: Sequence[float]) -> tuple[Intrinsics, Distortion | None]:
     """Return the intrinsics of a camera of this model, and its distortion; None without distortion."""
     if model.distortion is None:
         hint = PINHOLES if model.name == PANORAMA else UNDISTORT
-        raise InvalidCameras(source, expected=f"a camera of {READ_MODELS}", got=model.name, hint=hint)
+        raise ValueError(f"a camera of {READ_MODELS}, got {model.name}; {hint}")
     if len(parameters) != model.parameters:
-        raise InvalidCameras(
-            source, expected=f"{model.parameters} parameters of {model.name}", got=str(len(parameters))
-        )
+        raise ValueError(f"{model.parameters} parameters of {model.name}, got {len(parameters)}")
     centre = model.focals + 2
     if not np.isfinite(parameters[centre:]).all():
         got = " ".join(f"{value:g}" for value in parameters[centre:])
-        raise InvalidCameras(source, expected=f"finite {', '.join(model.distortion)}", got=got)
+        raise ValueError(f"finite {', '.join(model.distortion)}, got {got}")
     intrinsics = Intrinsics(parameters[0], parameters[model.focals - 1], *parameters[model.focals : centre])
     coefficients = dict(zip(model.distortion, parameters[centre:], strict=True))
     return intrinsics, distortion_of(coefficients, fisheye=model.fisheye)

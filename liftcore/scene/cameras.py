@@ -479,13 +479,9 @@ def behind_lens(camera: Camera, distortion: Distortion) -> Camera:
     """Return the camera of a distorted photo, from a camera with the photo's size and intrinsics."""
     photo = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
     lens = shared_lens(Lens(*photo, distortion))
-    try:
+    hint = "calibrate the camera again, or undistort the photos, and train and lift on them"
+    with reading(f"camera {camera.name!r} distortion", InvalidCameras, "one that a lens may have", hint):
         return _pinhole(camera, lens, lens.inner)
-    except ValueError as error:
-        hint = "calibrate the camera again, or undistort the photos, and train and lift on them"
-        raise InvalidCameras(
-            f"camera {camera.name!r} distortion", expected="one that a lens may have", got=str(error), hint=hint
-        ) from None
 
 
 def photo_sizes(photos: Collection[str], cameras: Cameras) -> dict[str, tuple[int, int]]:

@@ -66,7 +66,7 @@ def test_lenses_bend_as_those_of_opencv(lens: Distortion, points: np.ndarray, di
 @pytest.mark.parametrize("name", OF_COLMAP)
 def test_models_of_colmap_show_a_ray_where_colmap_does(name: str) -> None:
     parameters, expected = OF_COLMAP[name]
-    intrinsics, lens = calibration(MODELS_BY_NAME[name], parameters, "a camera")
+    intrinsics, lens = calibration(MODELS_BY_NAME[name], parameters)
     u, v = (0.5, -0.4) if lens is None else distorted_points(lens, np.array([[0.5, -0.4]]))[0]
     assert np.allclose((intrinsics.fx * u + intrinsics.cx, intrinsics.fy * v + intrinsics.cy), expected, atol=1e-9)
 
