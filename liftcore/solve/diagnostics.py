@@ -109,11 +109,11 @@ def measure_rows(weights: np.ndarray, X: np.ndarray, B: np.ndarray) -> np.ndarra
     """
     total = weights.sum()
     residuals = np.square(weights @ X - B).sum(axis=1)
-    offsets = X[None] - B[:, None]
-    squares = np.einsum("rnf,rnf->rn", offsets, offsets)
+    lengths = np.einsum("rf,rf->r", B, B)
+    squares = (lengths[:, None] - 2.0 * (B @ X.T) + np.einsum("nf,nf->n", X, X)).clip(min=0.0)
     surrogates, distances = squares @ weights, np.sqrt(squares) @ weights
     # A row whose splats all equal its observation has no dispersion.
-    disperse = distances > _MU_FLOOR * total * np.sqrt(np.square(B).sum(axis=1))
+    disperse = distances > _MU_FLOOR * total * np.sqrt(lengths)
     betas = np.divide(surrogates * total, distances**2, out=np.ones_like(surrogates), where=disperse) - 1.0
     return np.stack([residuals, surrogates, betas.clip(min=0.0) if total else np.full(len(B), np.nan)], axis=1)
 
