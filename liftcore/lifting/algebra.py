@@ -26,7 +26,7 @@ from liftcore.solve.objects import (
     number_objects,
 )
 from liftcore.solve.region_tree import RegionTree, region_tree
-from liftcore.solve.reweight import SceneConsistency, mask_regions, median_reliability
+from liftcore.solve.reweight import SceneConsistency, median_reliability
 
 if TYPE_CHECKING:
     from liftcore.lifting.engines import Engine
@@ -148,23 +148,18 @@ class Algebra:
         Returns:
             None without masks.
         """
-        scene = replace(self.scene, levels_apart=levels_apart)
-        codebook, masks = scene.codebook, mask_regions(scene.load("regions")["levels"])
+        scene = self.scene = replace(self.scene, levels_apart=levels_apart)
+        codebook, mask = scene.codebook, scene.load("regions")["levels"] >= 0
         entries = sum(scene.load("rows", number)["region"].size for number in range(scene.splat_pieces))
         totals = torch.from_numpy(self._region_totals())
         directions = RegionDirections.of(codebook, totals, entries, scene.settings.robust_directions)
         axes = {} if directions.axes is None else {"axes": directions.axes}
         scene.save("directions", None, {"mean": directions.mean, "distances": directions.distances, **axes})
-        sums = np.zeros((2, codebook.regions))
-        for turn, regions in enumerate(steps.compared_regions(scene)):
-            self.scene = replace(scene, turn=turn)
-            self.run("reweight", steps.compare, scene.splat_pieces)
-            table = scene.table(f"cosines-{turn}", (2, codebook.regions + 1))
-            sums += table[:, :-1]
-            consistency = SceneConsistency.of(table, None if masks is None else masks & torch.from_numpy(regions))
-            numbers = np.array([consistency.mean_cosine, consistency.power])
-            scene.save(f"consistency-{turn}", None, {"regions": consistency.regions, "numbers": numbers})
-        return median_reliability(sums, masks)
+        self.run("reweight", steps.compare, scene.splat_pieces)
+        groups = steps.compared_groups(scene)
+        sums = scene.table("cosines", (2, codebook.regions + int(groups.max(initial=0)) + 1))
+        scene.save("consistency", None, vars(SceneConsistency.of(sums, groups, mask)))
+        return median_reliability(sums, mask)
 
     def solve(self) -> tuple[Tensor, SplatSupport]:
         """Solve for X [P, F] in closed form."""

@@ -52,7 +52,7 @@ from liftcore.solve.objects import (
     view_shares,
 )
 from liftcore.solve.region_tree import RegionTree
-from liftcore.solve.reweight import BlockReweighter, SceneConsistency, confidence_of, of_regions, scale_weights
+from liftcore.solve.reweight import BlockReweighter, SceneConsistency, confidence_of, scale_weights
 from liftcore.solve.sums import PieceSums
 from liftcore.values.region_weights import RegionWeights
 
@@ -239,27 +239,18 @@ def _tree(scene: Pieces) -> dict[str, Any]:
     return {name: scene.load(f"tree-{scene.turn}")[name] for name in names}
 
 
-def compared_regions(scene: Pieces) -> list[np.ndarray]:
-    """Return the regions that are compared with each other, [M] bool each: all, or those of each level."""
+def compared_groups(scene: Pieces) -> np.ndarray:
+    """Return the group of each region [M] i8, in which regions are compared: one, or the levels."""
     levels = scene.load("regions")["levels"]
-    return (
-        [levels == level for level in np.unique(levels)] if scene.levels_apart else [np.ones(levels.size, np.bool_)]
-    )
+    groups = np.unique(levels, return_inverse=True)[1].astype(np.int8)
+    return groups if scene.levels_apart else np.zeros_like(groups)
 
 
-def by_level(scene: Pieces, W: RegionWeights, turns: Iterable[int]) -> Iterator[tuple[RegionWeights, Any]]:
-    """Yield W of compared regions alone, and the indices of its entries in W."""
-    parts = compared_regions(scene)
-    for turn in turns:
-        yield of_regions(W, parts[turn]) if scene.levels_apart else (W, slice(None))
-
-
-@saved_as("cosines-{}")
+@saved_as("cosines")
 def compare(scene: Pieces, piece: int, threads: int | None) -> Saved:
-    """Save the cosines of regions with their sums over the scene, of one level or of all."""
+    """Save the cosines of regions with their sums over the scene."""
     block, levels = splat_block(scene, piece), scene.load("regions")["levels"]
-    [(W, _)] = by_level(scene, block.W, [scene.turn])
-    reweighter = BlockReweighter(W, block.means, threads)
+    reweighter = BlockReweighter(block.W, compared_groups(scene), block.means, threads)
     cosines, sums = reweighter.cosines(_directions(scene), by_region=bool((levels >= 0).any()))
     return {"cosines": cosines}, sums, reweighter.shape
 
@@ -277,14 +268,9 @@ def reweighted(
     if not scene.settings.robust:
         return block.W, None
     scores, consensus = np.zeros((2, block.means.shape[0])), consensus_of(scene, piece, block.W, threads)
-    factors, turns = torch.empty(0, dtype=torch.float32), range(len(compared_regions(scene)))
-    for turn, (W, entries) in zip(turns, by_level(scene, block.W, turns), strict=True):
-        part = scene.writable(scene.load(f"cosines-{turn}", piece)["cosines"])
-        of_level = None if consensus is None else consensus[entries]
-        BlockReweighter(W, None, threads).weigh(part, scene_consistency(scene, turn), of_level, scores)
-        if turn == 0:
-            factors = part if len(turns) == 1 else values_of(block.W.weight.shape[0], torch.float32)
-        factors[entries] = part
+    factors, facts = scene.writable(scene.load("cosines", piece)["cosines"]), scene.load("consistency")
+    consistency = SceneConsistency(*(facts[name] for name in ("mean_cosines", "powers", "regions")))
+    BlockReweighter(block.W, compared_groups(scene), None, threads).weigh(factors, consistency, consensus, scores)
     return scale_weights(block.W, factors), confidence_of(scores)
 
 
@@ -307,13 +293,6 @@ def consensus_of(scene: Pieces, piece: int, W: RegionWeights, threads: int | Non
     return sums
 
 
-def scene_consistency(scene: Pieces, turn: int) -> SceneConsistency:
-    """Load the totals of the robust step, of one level or of all."""
-    arrays = scene.load(f"consistency-{turn}")
-    mean_cosine, power = arrays["numbers"].tolist()
-    return SceneConsistency(mean_cosine, torch.from_numpy(arrays["regions"]), power)
-
-
 @saved_as("columns")
 def solve(scene: Pieces, piece: int, threads: int | None) -> Saved:
     """Save X of a block of splats, and their confidence."""
@@ -321,8 +300,7 @@ def solve(scene: Pieces, piece: int, threads: int | None) -> Saved:
     W, confidence = reweighted(scene, piece, block, threads)
     sums, means = None if W is not block.W else torch.from_numpy(scene.load("rows", piece)["sums"]), block.means
     del block
-    cosines = [f"cosines-{turn}" for turn in range(len(compared_regions(scene)))]
-    scene.drop("rows", "weights", "share", *cosines)  # in memory W is now that of the solve alone
+    scene.drop("rows", "weights", "share", "cosines")  # in memory W is now that of the solve alone
     X = scene.new_features(piece)
     solve_rows(X, W, scene.codebook, sums=sums, means=means, threads=threads)
     scene.save_features(piece, X)

@@ -71,16 +71,6 @@ NO_CONSENSUS = 1e-6  # of a splat's weight: a shorter r is the rounding error of
 SHARPNESS = 4.0  # the largest value that costs correct masks at most .001 of accuracy in any scene (docs/method.md)
 
 
-def mask_regions(levels: np.ndarray) -> Tensor | None:
-    """Return [M] bool, the regions that are masks, which have a reliability; None if there is none.
-
-    Args:
-        levels: [M] i8, -1 for cells of grids.
-    """
-    mask = levels >= 0
-    return torch.from_numpy(mask) if mask.any() else None
-
-
 def reweighting_facts(
     levels: np.ndarray, reliability: float | None, confidence: Tensor | None, levels_apart: bool
 ) -> dict[str, Any]:
@@ -105,44 +95,44 @@ def scale_weights(W: RegionWeights, factors: Tensor) -> RegionWeights:
 
 @dataclass(frozen=True)
 class SceneConsistency:
-    """Quantities of the whole scene that a step needs."""
+    """Quantities of the whole scene that a step needs; those of G groups of regions."""
 
-    mean_cosine: float  # c
-    regions: Tensor  # [M] f32, r_m / r of each region; 1 for regions without a reliability
-    power: float  # exponent of the consensus, SHARPNESS (1 - r)
+    mean_cosines: np.ndarray  # [G] f64, c
+    powers: np.ndarray  # [G] f64, exponents of the consensus, SHARPNESS (1 - r)
+    regions: np.ndarray  # [M] f32, r_m / r of each region; 1 for regions without a reliability
 
     @classmethod
-    def of(cls, sums: np.ndarray, mask: Tensor | None) -> "SceneConsistency":
+    def of(cls, sums: np.ndarray, group: np.ndarray, mask: np.ndarray) -> "SceneConsistency":
         """Compute from the sums of `BlockReweighter.cosines` over all splats.
 
         Args:
-            sums: [2, M + 1] f64. mask: [M] bool, the regions with a reliability; None: none.
+            sums: [2, M + G] f64. group: [M] i8. mask: [M] bool, the regions with a reliability.
         """
-        confirmed, total = sums[:, -1]
-        mean_cosine = float(confirmed / total) if total > 0 else 0.0
-        regions = torch.ones(sums.shape[1] - 1, dtype=torch.float32)
-        if mask is None:
-            return cls(mean_cosine, regions, 1.0)
-        has_sum, reliable = _reliabilities(sums[:, :-1], mask)
-        median = median_reliability(sums[:, :-1], mask) or 0.0
-        if median > 0:
-            regions = torch.where(has_sum, reliable / median, regions.double()).float()
-        return cls(mean_cosine, regions, SHARPNESS * (1.0 - median))
+        confirmed, totals = sums[:, group.size :]
+        mean_cosines = np.divide(confirmed, totals, out=np.zeros_like(totals), where=totals > 0)
+        regions, powers = np.ones(group.size, np.float32), np.ones_like(totals)
+        for turn in range(totals.size):
+            of_group = mask & (group == turn)
+            if mask.any():
+                median = median_reliability(sums, of_group) or 0.0
+                powers[turn] = SHARPNESS * (1.0 - median)
+                if median > 0:
+                    seen, reliable = _reliabilities(sums, of_group)
+                    regions[seen] = reliable / median
+        return cls(mean_cosines, powers, regions)
 
 
-def _reliabilities(sums: np.ndarray, mask: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the regions of a mask that other views see, [M] bool, and r_m [M] f64, zero for others."""
-    confirmed, totals = torch.from_numpy(np.ascontiguousarray(sums))
-    has_sum = (totals > 0) & mask
-    return has_sum, torch.where(has_sum, confirmed / totals, 0.0)
+def _reliabilities(sums: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the regions of a mask that other views see, [n] i64, and their r_m [n] f64."""
+    confirmed, totals = sums[:, : mask.size]
+    seen = np.flatnonzero((totals > 0) & mask)
+    return seen, confirmed[seen] / totals[seen]
 
 
-def median_reliability(sums: np.ndarray, mask: Tensor | None) -> float | None:
-    """Return r, the median over the regions [M] of a mask that other views see; None if there is none."""
-    if mask is None:
-        return None
-    has_sum, reliable = _reliabilities(sums, mask)
-    return float(reliable[has_sum].median()) if has_sum.any() else None
+def median_reliability(sums: np.ndarray, mask: np.ndarray) -> float | None:
+    """Return r, the lower median over the regions [M] of a mask that other views see; None if there is none."""
+    reliable = np.sort(_reliabilities(sums, mask)[1])
+    return float(reliable[(reliable.size - 1) // 2]) if reliable.size else None
 
 
 class BlockReweighter:
@@ -150,11 +140,12 @@ class BlockReweighter:
 
     Args:
         W: of all views by rows of codebooks, on the CPU; a row for each splat of the block.
+        group: [M] i8, from 0 on; regions are compared with those of their group alone.
         means: [n, 3] of these splats; neighbours, which read the same directions, are processed together.
     """
 
-    def __init__(self, W: RegionWeights, means: Tensor | None, threads: int | None) -> None:
-        self.W, self.threads = W, threads
+    def __init__(self, W: RegionWeights, group: np.ndarray, means: Tensor | None, threads: int | None) -> None:
+        self.W, self.group, self.threads = W, group, threads
         self.view = torch.repeat_interleave(W.offsets.diff())
         self.rows = torch.nonzero(W.indptr.diff())[:, 0]
         if means is not None:
@@ -163,8 +154,13 @@ class BlockReweighter:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """The shape of the sums of `cosines`, [2, M + 1]."""
-        return 2, int(self.W.offsets[-1]) + 1
+        """The shape of the sums of `cosines`, [2, M + G]."""
+        return 2, self.group.size + self.groups
+
+    @property
+    def groups(self) -> int:
+        """The number of groups, G."""
+        return int(self.group.max(initial=0)) + 1
 
     def cosines(self, directions: RegionDirections, by_region: bool) -> tuple[Tensor, Iterator[PieceSums]]:
         """Return ``c_jm`` of each entry, [nnz] f32, complete once the sums are read.
@@ -173,19 +169,21 @@ class BlockReweighter:
             by_region: True to compute the sums of reliability.
 
         Returns:
-            The cosines and the sums of each piece: ``W (1 - p) c`` and ``W (1 - p)`` of each region and, at place M,
-            ``W c`` and ``W``.
+            The cosines and the sums of each piece: ``W (1 - p) c`` and ``W (1 - p)`` of each region and, from place M
+            on, ``W c`` and ``W`` of each group.
         """
         products, squares = self._entries(), self._entries()
         for columns in directions.slices():
             table, width = flat_table(directions.table(columns)), columns.stop - columns.start
-            arrays = [*self._arrays(), table, width, products.numpy(), squares.numpy()]
-            blocks = [(self.rows[first:last].numpy(), *arrays) for first, last in self.blocks]
-            run_each(compare_rows, blocks, self.threads)
-        arrays = [*self._arrays(), products.numpy(), squares.numpy()]
+            outputs = [table, width, products.numpy(), squares.numpy()]
+            for turn in range(self.groups):
+                arrays = [*self._arrays(), turn, *outputs]
+                blocks = [(self.rows[first:last].numpy(), *arrays) for first, last in self.blocks]
+                run_each(compare_rows, blocks, self.threads)
 
         def add_rows(first: int, last: int, table: np.ndarray) -> None:
-            tally(*[first, last, *arrays, by_region, table])
+            for turn in range(self.groups):
+                tally(first, last, *self._arrays(), turn, products.numpy(), squares.numpy(), by_region, table)
 
         return products, piece_sums(add_rows, self.W.indptr.shape[0] - 1, self.shape, self.threads)
 
@@ -198,12 +196,13 @@ class BlockReweighter:
             scores: [2, n] f64, to which ``sum W' c_jm`` and ``sum W`` of each splat are added.
         """
         consensus = torch.zeros(0, dtype=torch.float32) if consensus is None else consensus  # as the kernel reads it
-        powers = ((np.arange(POWERS + 2) / POWERS) ** scene.power).astype(np.float32)
-        parts = [part.numpy() for part in (cosines, scene.regions, consensus)]
-        arrays = [*self._arrays(), *parts, scores, scene.mean_cosine, scene.power, powers]
-        # In the order of memory: nothing is shared by neighbours, unlike in `cosines`.
-        blocks = [(first, last, *arrays) for first, last in self.W.blocks(BLOCK_ROWS, BLOCK_ENTRIES)]
-        run_each(weigh_rows, blocks, self.threads)
+        parts = [cosines.numpy(), scene.regions, consensus.numpy(), scores]
+        for turn, (mean_cosine, power) in enumerate(zip(scene.mean_cosines, scene.powers, strict=True)):
+            powers = ((np.arange(POWERS + 2) / POWERS) ** power).astype(np.float32)
+            arrays = [*self._arrays(), turn, *parts, mean_cosine, power, powers]
+            # In the order of memory: nothing is shared by neighbours, unlike in `cosines`.
+            blocks = [(first, last, *arrays) for first, last in self.W.blocks(BLOCK_ROWS, BLOCK_ENTRIES)]
+            run_each(weigh_rows, blocks, self.threads)
 
     def _entries(self) -> Tensor:
         """Return zeros for the entries of W, [nnz] f32."""
@@ -211,8 +210,8 @@ class BlockReweighter:
         return zeros(tuple(self.W.weight.shape), torch.float32, name="weights", in_file=2 * size > MEMORY_LIMIT)
 
     def _arrays(self) -> list[np.ndarray]:
-        """Return the arrays of W, and the view of each region."""
-        return [part.numpy() for part in (self.W.indptr, self.W.region, self.W.weight, self.view)]
+        """Return the arrays of W, and the view and the group of each region."""
+        return [*(part.numpy() for part in (self.W.indptr, self.W.region, self.W.weight, self.view)), self.group]
 
 
 def confidence_of(scores: np.ndarray) -> Tensor:
@@ -223,21 +222,10 @@ def confidence_of(scores: np.ndarray) -> Tensor:
 
 @kernel
 def weigh_rows(
-    first_row,
-    last_row,
-    indptr,
-    region,
-    weight,
-    view,
-    cosines,
-    reliable,
-    consensus,
-    scores,
-    mean_cosine,
-    power,
-    powers,
-):
-    """Compute `BlockReweighter.weigh` of rows ``first_row..last_row``.
+    first_row, last_row, indptr, region, weight, view, group, turn, cosines, reliable, consensus, scores,
+    mean_cosine, power, powers,
+):  # fmt: skip
+    """Compute `BlockReweighter.weigh` of the regions of a group in rows ``first_row..last_row``.
 
     Powers of consensus are interpolated in a table [n].
     """
@@ -245,16 +233,20 @@ def weigh_rows(
         first, last = indptr[row], indptr[row + 1]
         before = after = cosine_sum = 0.0
         for k in range(first, last):
-            before += weight[k]
+            if group[region[k]] == turn:
+                before += weight[k]
         inverse = 1.0 / before if before > 0.0 else 0.0
         k = first
         while k < last:
             begin, v, view_share = k, view[region[k]], 0.0
             while k < last and view[region[k]] == v:
-                view_share += weight[k] * inverse
+                if group[region[k]] == turn:
+                    view_share += weight[k] * inverse
                 k += 1
             share = min(view_share, 1.0)
             for n in range(begin, k):
+                if group[region[n]] != turn:
+                    continue
                 scaled = ((1.0 - share) * cosines[n] + share * mean_cosine) * reliable[region[n]]
                 if consensus.size > 0:
                     if consensus[n] > STEEP:
@@ -270,51 +262,34 @@ def weigh_rows(
         scores[0, row] += gain * cosine_sum
         scores[1, row] += before
         for n in range(first, last):
-            cosines[n] = cosines[n] * gain if gain > 0.0 else 1.0
+            if group[region[n]] == turn:
+                cosines[n] = cosines[n] * gain if gain > 0.0 else 1.0
 
 
 @kernel
-def tally(first, last, indptr, region, weight, view, cosines, squares, by_region, sums):
-    """Replace products of the entries of some rows by cosines, and add these to the sums [2, M + 1] f64."""
-    places = sums.shape[1] - 1
+def tally(first, last, indptr, region, weight, view, group, turn, cosines, squares, by_region, sums):
+    """Replace products of the entries of a group in some rows by cosines; add these to the sums [2, M + G] f64."""
+    place = group.size + turn
     for row in range(first, last):
         total = 0.0
         for k in range(indptr[row], indptr[row + 1]):
-            total += weight[k]
+            if group[region[k]] == turn:
+                total += weight[k]
         inverse = 1.0 / total if total > 0.0 else 0.0
         k = indptr[row]
         while k < indptr[row + 1]:
             begin, v, view_share = k, view[region[k]], 0.0
             while k < indptr[row + 1] and view[region[k]] == v:
-                length = np.sqrt(squares[k])
-                cosine = cosines[k] / length if length > NO_CONSENSUS else np.float32(0.0)
-                cosines[k] = min(max(cosine, np.float32(0.0)), np.float32(1.0))
-                sums[0, places] += weight[k] * np.float64(cosines[k])
-                sums[1, places] += weight[k]
-                view_share += weight[k] * inverse
+                if group[region[k]] == turn:
+                    length = np.sqrt(squares[k])
+                    cosine = cosines[k] / length if length > NO_CONSENSUS else np.float32(0.0)
+                    cosines[k] = min(max(cosine, np.float32(0.0)), np.float32(1.0))
+                    sums[0, place] += weight[k] * np.float64(cosines[k])
+                    sums[1, place] += weight[k]
+                    view_share += weight[k] * inverse
                 k += 1
             other_share = max(1.0 - view_share, 0.0)
             for n in range(begin, k if by_region else begin):
-                sums[0, region[n]] += weight[n] * other_share * cosines[n]
-                sums[1, region[n]] += weight[n] * other_share
-
-
-def of_regions(W: RegionWeights, regions: np.ndarray) -> tuple[RegionWeights, Tensor]:
-    """Return W with the entries of some regions [M] bool alone, and the indices of these entries [n] i64."""
-    indptr, region = W.indptr.numpy(), W.region.numpy()
-    starts, entries = np.zeros_like(indptr), np.empty(np.count_nonzero(regions[region]), np.int64)
-    list_entries(indptr, region, regions, starts, entries)
-    index = torch.from_numpy(entries)
-    return replace(W, indptr=torch.from_numpy(starts), region=W.region[index], weight=W.weight[index]), index
-
-
-@kernel
-def list_entries(indptr, region, regions, starts, entries):
-    """List the entries of some regions [M] bool, and where those of each row begin."""
-    at = 0
-    for row in range(indptr.size - 1):
-        for k in range(indptr[row], indptr[row + 1]):
-            if regions[region[k]]:
-                entries[at] = k
-                at += 1
-        starts[row + 1] = at
+                if group[region[n]] == turn:
+                    sums[0, region[n]] += weight[n] * other_share * cosines[n]
+                    sums[1, region[n]] += weight[n] * other_share

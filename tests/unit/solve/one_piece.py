@@ -18,7 +18,7 @@ from liftcore.runtime.progress import silent
 from liftcore.solve.codebook import Codebook
 from liftcore.solve.directions import RegionDirections
 from liftcore.solve.objects import RegionObjects
-from liftcore.solve.reweight import BlockReweighter, SceneConsistency, confidence_of, median_reliability, of_regions
+from liftcore.solve.reweight import BlockReweighter, SceneConsistency, confidence_of, median_reliability
 from liftcore.solve.sums import sum_pieces
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import DIRECTIONS, LiftSettings
@@ -85,18 +85,13 @@ def reweighting_of(
     totals = np.bincount(W.region.numpy(), W.weight.numpy(), minlength=codebook.regions).astype(np.float64)
     directions = RegionDirections.of(codebook, torch.from_numpy(totals), W.region.shape[0], principal)
     level_of = np.zeros(codebook.regions) if levels is None else levels
-    factors = torch.zeros(W.region.shape[0])
-    scores, sums = (np.zeros((2, count)) for count in (W.splats.shape[0], codebook.regions))
-    for level in np.unique(level_of):
-        part, entries = of_regions(W, level_of == level)
-        block = BlockReweighter(part, means, threads)
-        cosines, parts = block.cosines(directions, masks is not None)
-        table = sum_pieces(parts, block.shape)
-        sums += table[:, :-1]
-        scene = SceneConsistency.of(table, None if masks is None else masks & torch.from_numpy(level_of == level))
-        block.weigh(cosines, scene, None if consensus is None else consensus[entries], scores)
-        factors[entries] = cosines
-    return Reweighting(factors, confidence_of(scores), median_reliability(sums, masks))
+    groups = np.unique(level_of, return_inverse=True)[1].astype(np.int8)
+    scores, mask = np.zeros((2, W.splats.shape[0])), np.zeros(groups.size, bool) if masks is None else masks.numpy()
+    block = BlockReweighter(W, groups, means, threads)
+    factors, parts = block.cosines(directions, masks is not None)
+    sums = sum_pieces(parts, block.shape)
+    block.weigh(factors, SceneConsistency.of(sums, groups, mask), consensus, scores)
+    return Reweighting(factors, confidence_of(scores), median_reliability(sums, mask))
 
 
 def solve(W: RegionWeights, codebook: Codebook, dtype: torch.dtype, **options: Any) -> Tensor:
