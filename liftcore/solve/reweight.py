@@ -183,7 +183,7 @@ class BlockReweighter:
 
         def add_rows(first: int, last: int, table: np.ndarray) -> None:
             for turn in range(self.groups):
-                tally(first, last, *self._arrays(), turn, products.numpy(), squares.numpy(), by_region, table)
+                tally(*[first, last, *self._arrays(), turn, products.numpy(), squares.numpy(), by_region, table])
 
         return products, piece_sums(add_rows, self.W.indptr.shape[0] - 1, self.shape, self.threads)
 
