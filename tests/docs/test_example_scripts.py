@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import json
 import runpy
 import sys
 from pathlib import Path
@@ -66,32 +65,6 @@ def test_sam_masks_become_things_that_are_exported(tiny: Path) -> None:
     assert sorted(np.unique(lc.read_splats(tiny / "things.ply").extras["instance_id"])) == [1, 2, 3]  # 0 is none
 
 
-def test_where_is_it_tells_places_before_the_camera_that_asks(tiny: Path) -> None:
-    arguments = (tiny / "lift.safetensors", "lamp", "--view", "middle", "--table", tiny / "table.safetensors")
-    x, y, z = (float(word) for word in run("where_is_it.py", *arguments).split() if word[0] in "+-")
-    assert np.allclose([x, y, z], [1.2, 0.0, tiny_scene.DISTANCE], atol=0.25)
-
-
-def test_things_are_exported_with_the_words_nearest_to_them(tiny: Path) -> None:
-    output = run("exports.py", tiny / "lift.safetensors", tiny / "table.safetensors", tiny / "out")
-    assert sorted(output.splitlines()[-3:]) == [f"{word}: 20 splats" for word in tiny_scene.WORDS]
-    assert {file.suffix for file in (tiny / "out").iterdir()} == {".glb", ".ply", ".json"}
-
-
-def test_shared_folder_opens_wherever_it_is_put(tiny: Path, tmp_path: Path) -> None:
-    output = run(
-        "share_folder.py", tiny / "splats.ply", tiny / "cameras.json", tiny / "features.safetensors", tiny / "shared"
-    )
-    assert [line.partition(":")[0] for line in output.splitlines()[:3]] == [
-        "cameras.json",
-        "lift.safetensors",
-        "splats.ply",
-    ]
-    (tiny / "shared").rename(tiny / "elsewhere")
-    scene = lc.Scene(tiny / "elsewhere" / "lift.safetensors")
-    assert len(scene.tree().objects) == 3 and scene.render("middle", "rgb").max() > 0
-
-
 def test_training_loop_finds_the_red_blob_alone() -> None:
     assert run("training_loop.py") == "200 of 200 red splats, 0 others\n"
 
@@ -107,24 +80,6 @@ def test_lift_and_mask_writes_masks_of_all_views_and_the_scores(tmp_path: Path) 
         assert mask.shape == (camera.height, camera.width) and set(np.unique(mask)) <= {0, 255}
     columns = lc.read_splats(tmp_path / "out" / "scores.ply").extras
     assert set(columns["selected"].tolist()) <= {0, 1} and columns["score"].shape == (50,)
-
-
-def test_nerfstudio_cameras_move_to_the_frame_of_its_splats(tiny: Path) -> None:
-    document, move, scale = tiny_scene.cameras_document(), np.array([1.0, 2.0, 3.0]), 0.5
-    for frame in document["frames"]:  # where the photos were taken, before the run centred and scaled them
-        pose = np.array(frame["transform_matrix"])
-        pose[:3, 3] = pose[:3, 3] / scale - move
-        frame["transform_matrix"] = pose.tolist()
-    for folder in ("data", "run"):
-        (tiny / folder).mkdir()
-    (tiny / "data" / "transforms.json").write_text(json.dumps(document), encoding="utf-8")
-    frame = {"transform": np.column_stack([np.eye(3), move]).tolist(), "scale": scale}
-    (tiny / "run" / "dataparser_transforms.json").write_text(json.dumps(frame), encoding="utf-8")
-    inputs = (tiny / "splats.ply", tiny / "data", tiny / "run", tiny / "features.safetensors")
-    output = run("nerfstudio_scene.py", *inputs, tiny / "out")
-    assert output == "3 cameras moved to the frame of the splats; 60 of 60 splats have a feature\n"
-    features, expected = (lc.load_lift(folder / "lift.safetensors").features for folder in (tiny / "out", tiny))
-    assert np.allclose(np.asarray(features.float()), np.asarray(expected.float()), atol=1e-3)
 
 
 def test_written_pack_has_the_labels_and_vectors_of_its_folders(tiny: Path) -> None:
