@@ -57,22 +57,16 @@ class Scene:
 
 
 @settings(max_examples=20, deadline=None)
-@given(seed=SEEDS, count=st.integers(1, 120), smoothness=st.sampled_from([0.01, 0.3, 1.0, 4.0, 100.0]))
-def test_features_are_those_of_the_least_sum(seed: int, count: int, smoothness: float) -> None:
-    scene = Scene(seed, count)
+@given(
+    seed=SEEDS, count=st.integers(1, 120), smoothness=st.sampled_from([0.01, 0.3, 1.0, 4.0, 100.0]),
+    channels=st.sampled_from([5, 31, 130]),  # fewer and more than are solved at a time
+)  # fmt: skip
+def test_features_are_those_of_the_least_sum(seed: int, count: int, smoothness: float, channels: int) -> None:
+    scene = Scene(seed, count, channels)
     X, weights = scene.minimum(smoothness)
     residual = np.sqrt(weights[:, None]) * (scene.smooth(smoothness).double().numpy() - X)
     change = np.sqrt(weights[:, None]) * (scene.X.double().numpy() - X)
     assert np.linalg.norm(residual) <= 1e-2 * np.linalg.norm(change) + 1e-6 * np.sqrt(weights.sum())
-
-
-@pytest.mark.parametrize("channels", [31, 65, 130])
-def test_features_of_more_channels_than_are_solved_at_a_time_are_those_of_the_least_sum(channels: int) -> None:
-    scene = Scene(5, 90, channels=channels)
-    X, weights = scene.minimum(1.0)
-    roots = np.sqrt(weights[:, None])
-    residual, change = (roots * (Y.double().numpy() - X) for Y in (scene.smooth(1.0), scene.X))
-    assert (np.linalg.norm(residual, axis=0) <= 2e-2 * np.linalg.norm(change, axis=0)).all()
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float32])
