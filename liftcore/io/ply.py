@@ -11,9 +11,10 @@ Torch is imported where splats are made, so that processes without it can look a
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
 
 MAX_HEADER_BYTES = 256 * 1024
+MAX_HEADER_LINES = 4096
 BLOCK_ROWS = 16_384  # rows converted at a time: a few MB, so that memory stays near the file's size
 MAX_SH_DEGREE = 4
 LOBE_CHANNELS = 6  # of a spherical beta lobe: r g b theta phi beta
@@ -57,11 +59,6 @@ SCAFFOLD = ("f_anchor_feat_0", "f_offset_0")  # of Scaffold-GS, whose networks t
 MODEL = re.compile(r"[xyz]|opacity|beta|filter_3D|(scale|rot|f_dc|f_rest|sh0|shN|sb_params)_\d+|packed_\w+")
 SPELLING = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"}
 SPELLING |= {"f4": "float", "f8": "double"}
-CODES = {name: code for code, name in SPELLING.items()} | {
-    **{f"{'u' * (code[0] == 'u')}int{8 * int(code[1])}": code for code in SPELLING if code[0] != "f"},
-    "float32": "f4",
-    "float64": "f8",
-}  # of a property's type
 WRITTEN_MODE = {RenderModel.ANTIALIASED: "mip", RenderModel.DISCS: "2dgs"}  # as editors read it
 EXPORT = "export the splats again as binary little-endian PLY"
 REWRITE = (
@@ -73,7 +70,7 @@ _REMARKS = ("comment", "obj_info")  # lines that are kept, and not parsed
 PADDING = b"\0 \t\r\n"  # bytes that some programs end a file with
 MAX_PADDING_BYTES = 4096  # that are read
 FLOAT_BYTES = 4  # of a column that a header may lack
-_COUNT = re.compile("[0-9]{1,18}")
+_ELEMENT = re.compile(r"\s*element\s+(\S+)\s+([0-9]{1,18})\s*")
 
 # ---- splats
 
@@ -501,44 +498,48 @@ def parse_header(head: bytes) -> PlyHeader:
     return PlyHeader((*lines[: ends[0]], lines[-1]), first.count, first.dtype, offset, after)
 
 
-@dataclass
+@dataclass(frozen=True)
 class Element:
     """An element of a header."""
 
     name: str
     count: int  # rows
-    columns: dict[str, str] = field(default_factory=dict)  # name -> type, little-endian; without its lists
-    list_column: str | None = None  # one of its columns that is a list
-
-    @property
-    def dtype(self) -> np.dtype:
-        """The type of a row, a field a column."""
-        return np.dtype([*self.columns.items()])
+    dtype: np.dtype  # of a row, little-endian, a field a column; without its lists
+    list_column: str | None  # the first of its columns that is a list
 
 
 def parse_elements(head: bytes) -> tuple[tuple[str, ...], list[Element], int]:
     """Return the lines of a binary little-endian header, its elements, at least one, and its length in bytes."""
+    from plyfile import (
+        PlyData,
+        PlyListProperty,
+        PlyParseError,
+    )  # imported here: processes that read no PLY start faster
+
     lines, offset = _header_lines(head)
-    elements: list[Element] = []
-    storage = "none"
-    for line in lines[1:-1]:
-        match line.split():
-            case [] | ["comment" | "obj_info", *_]:
-                pass
-            case ["format", storage, "1.0"]:
-                pass
-            case ["element", name, count] if _COUNT.fullmatch(count):
-                elements.append(Element(name, int(count)))
-            case ["property", "list", length, item, name] if elements and {length, item} <= CODES.keys():
-                elements[-1].list_column = name
-            case ["property", kind, name] if elements and kind in CODES and name not in elements[-1].columns:
-                elements[-1].columns[name] = f"<{CODES[kind]}"
-            case _:
-                expected = "lines of PLY 1.0, counts of zero or more and no property twice"
-                raise _header_error(expected, repr(line[:60]))
-    if storage != "binary_little_endian":
-        raise _header_error("'format binary_little_endian 1.0'", f"'format {storage} 1.0'", REWRITE)
-    if not elements or not (elements[0].columns or elements[0].list_column):
+    counts: list[int] = []
+    empty: list[str] = []  # the same header of no rows, which plyfile reads without any data
+    for line in lines:
+        words, element = line.split(), _ELEMENT.fullmatch(line)
+        if words[:1] == ["element"] and element is None:
+            expected = "the name of an element and a count of zero or more"
+            raise _header_error(expected, repr(" ".join(words)[:60]))
+        counts += [int(element[2])] if element else []
+        if words and not line.startswith(_REMARKS):
+            empty.append(f"element {element[1]} 0" if element else " ".join(words))
+    try:
+        ply = PlyData.read(io.BytesIO(header_bytes(empty)))
+    except (PlyParseError, ValueError) as error:
+        raise _header_error("a header of PLY 1.0", f"one that does not parse ({str(error)[:120]})") from None
+    if ply.text or ply.byte_order != "<":
+        kind = "ascii" if ply.text else "binary_big_endian"
+        raise _header_error("'format binary_little_endian 1.0'", f"'format {kind} 1.0'", REWRITE)
+    elements = []
+    for element, count in zip(ply.elements, counts, strict=True):
+        lists = [column.name for column in element.properties if isinstance(column, PlyListProperty)]
+        scalars = [(column.name, "<" + column.val_dtype) for column in element.properties if column.name not in lists]
+        elements.append(Element(element.name, count, np.dtype(scalars), lists[0] if lists else None))
+    if not elements or not (elements[0].dtype.names or elements[0].list_column):
         raise _header_error("an element 'vertex' with properties", "a header without one")
     return lines, elements, offset
 
@@ -564,6 +565,9 @@ def _header_lines(head: bytes) -> tuple[tuple[str, ...], int]:
     if not all(line.isascii() or line.startswith(_REMARKS) for line in lines):
         expected, got = "ASCII characters in all lines but comments", "other characters in it"
         raise _header_error(expected, got)
+    if len(lines) > MAX_HEADER_LINES:
+        limit, hint = f"at most {MAX_HEADER_LINES} header lines", "leave out properties that are no splat's"
+        raise ValueError(f"{limit}, got {len(lines)}; {hint}")
     if cloud := cloud_without_splats(lines):
         expected = "splats (properties such as 'opacity', 'scale_0', 'rot_0')"
         raise ValueError(f"{expected}, got {cloud[0]} without any of them; {cloud[1]}")

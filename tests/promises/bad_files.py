@@ -215,7 +215,7 @@ SPLAT_FILES = [
     ("list property", head("element vertex 1", "property list uchar int a") + bytes(8), "scalar"),
     ("count of 5,000 digits", head("element vertex " + "9" * 5000), "zero or more"),
     ("no element", head(), "without one"),
-    ("property twice", head("element vertex 1", "property float x", "property float x"), "twice"),
+    ("property twice", head("element vertex 1", "property float x", "property float x"), "same name"),
     ("other element first", head("element camera 1", "property float x"), "'vertex'"),
     ("foreign characters", HEADER + b"element vertex 1\nproperty float \xff\nend_header\n", "ASCII"),
     ("no opacity", without("opacity"), "'opacity'"),
