@@ -93,6 +93,37 @@ def test_lift_equals_its_dense_definition(name: str, kernel: str, grids: bool) -
 
 
 @pytest.mark.parametrize("grids", [False, True])
+@pytest.mark.parametrize(("preset", "gain"), [("row-sum", 1.0), ("tikhonov", GAIN)])
+def test_diagnostics_over_all_rays_are_the_papers_definitions(preset: str, gain: float, grids: bool) -> None:
+    scene, sums = random_scene(11, count=60, grids=grids), list[np.ndarray]()
+    residuals, surrogates, betas = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
+    settings: dict[str, Any] = {"preset": preset, "dtype": "float32", "progress": False}
+    result = lc.lift(*scene.arguments(), diagnostic_rays=1_000_000, **settings)
+    X = result.features.double().numpy()
+    for name, view in scene.views.items():
+        sums.append(weights_of(scene, name, gain).sum(axis=1))
+        for A, B in rows_of(view, weights_of(scene, name, gain)):
+            squares = np.square(X[None] - B[:, None]).sum(axis=2)
+            residuals.append(np.square(A @ X - B).sum(axis=1))
+            surrogates.append((A * squares).sum(axis=1))
+            hit = A.sum(axis=1) > 0
+            share = A[hit] / A[hit].sum(axis=1, keepdims=True)
+            mu = (share * np.sqrt(squares[hit])).sum(axis=1)
+            betas.append((share * squares[hit]).sum(axis=1) / mu**2 - 1)
+    row_sums, beta = np.concatenate(sums), np.concatenate(betas)
+    expected = {
+        "row_sum_mean": row_sums.mean(), "row_sum_std": row_sums.std(), "residual": np.concatenate(residuals).mean(),
+        "surrogate": np.concatenate(surrogates).mean(), "bound": 1 + beta.max(), "median": np.median(beta),
+        "p99": np.quantile(beta, 0.99),
+    }  # fmt: skip
+    figures = result.diagnostics | result.diagnostics["beta"]
+    for name, value in expected.items():
+        assert figures[name] == pytest.approx(value, rel=2e-3, abs=1e-6), name
+    unmeasured = lc.lift(*scene.arguments(), diagnostic_rays=0, **settings).diagnostics
+    assert (unmeasured["rays"], unmeasured["residual"], unmeasured["bound"]) == (0, None, None)
+
+
+@pytest.mark.parametrize("grids", [False, True])
 def test_reference_is_the_least_loss_that_any_features_have(grids: bool) -> None:
     scene = random_scene(11, count=25, views=3, grids=grids)
     parts = [part for name, view in scene.views.items() for part in rows_of(view, weights_of(scene, name))]
