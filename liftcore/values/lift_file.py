@@ -16,6 +16,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import unicodedata
 from contextlib import suppress
 from pathlib import Path
@@ -41,6 +42,8 @@ FORMAT = "splatlift-lift/2"
 EXPECTED, AGAIN = "a lift file (.safetensors)", "copy the file again, or lift again"
 TENSORS = ("features", "total_weight", "has_feature")
 CONFIDENCE = "confidence"  # in lifts that were reweighted
+MOST_BESIDE = 16  # files of one kind beside a lift, that are read to know one of them
+DIGEST = re.compile("[0-9a-f]{64}")  # SHA-256, as `sha256_of` has it
 NEAR = 3  # folders of an input's path, and above a lift, among which it is looked for
 CLUSTER_TENSORS = ("cluster", "cluster_features")  # in lifts with aggregation only
 OBJECT_TENSORS = ("object", "object_views")  # in lifts that looked for objects
@@ -209,7 +212,7 @@ def _digest_of_several(files: Sequence[Path], folder: Path) -> str:
 
 
 def found_input(role: str, recorded: InputFile, metadata: LiftMetadata, lift: Path | None) -> Path | None:
-    """Find an input of a lift: at its recorded path, or near the lift; else None.
+    """Find an input of a lift: at its recorded path, near the lift, or in the lift's store; else None.
 
     Cameras match if those of the lifted views are unchanged, whatever other views there are.
 
@@ -220,6 +223,11 @@ def found_input(role: str, recorded: InputFile, metadata: LiftMetadata, lift: Pa
     places, parts = [path], path.parts[1:]
     for above in () if lift is None else Path(os.path.abspath(lift)).parents[: NEAR + 1]:
         places += [above.joinpath(*parts[-count:]) for count in range(1, min(len(parts), NEAR) + 1)]
+    if lift is not None and path.suffix:
+        folder = Path(os.path.abspath(lift)).parent
+        places += sorted(folder.glob(f"[!.]*{path.suffix}"))[:MOST_BESIDE]  # under another name
+        if DIGEST.fullmatch(recorded.sha256):  # the stored value of another lift may be a pattern, not a digest
+            places += folder.parent.glob(f"blobs/{recorded.sha256}.*")  # of the service
     for place in places:
         if place.exists():
             with suppress(InvalidInput, OSError):

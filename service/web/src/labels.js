@@ -5,7 +5,7 @@ import { fetchBytes, readNpy, post, problemText } from "./service.js";
 const COVER = 0.78; // opacity of a word's colour over the splats' colours
 const NEUTRAL = [38, 42, 50]; // colour of splats without a word, or with a word that is hidden
 const MAX_LABELS = 14; // words with a label in the scene
-const DISTINCT_COLOURS = 216; // number of distinct colours
+const DISTINCT_COLOURS = 216; // words at most that a map tells by their colours
 
 export class LabelPanel {
   // onChange(): colours, labels or the link must be updated. centresOf(values, maxValue): the centre of the splats of each

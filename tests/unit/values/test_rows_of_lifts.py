@@ -1,5 +1,6 @@
 """Subsets of a lift, a lift in another frame, and lifts queried with other splats."""
 
+import hashlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import torch
 
 import liftcore as lc
 from liftcore.values.lift import InputFile
-from liftcore.values.lift_file import found_input, input_file
+from liftcore.values.lift_file import found_input
 from tests.scenes import random_camera, random_splats, write_scene
 
 MATRIX = np.array([[0.0, -2, 0, 1], [2, 0, 0, 2], [0, 0, 2, 3]])
@@ -100,12 +101,11 @@ def test_lift_of_files_knows_its_splats_in_memory(tmp_path: Path) -> None:
         copy.query(np.eye(1, 6), splats=loaded[1:])
 
 
-def test_an_input_of_a_store_is_found_by_its_digest(scene, tmp_path: Path) -> None:
-    blob = tmp_path / "blobs" / "x.ply"
-    blob.parent.mkdir()
-    blob.write_bytes(b"splats")
-    digest = input_file(blob).sha256
-    (blob.parent / digest[:2]).mkdir()
-    stored = blob.rename(blob.parent / digest[:2] / f"{digest}.ply")
+@pytest.mark.parametrize("place", ["blobs/{digest}.ply", "lifts/renamed.ply"])
+def test_an_input_is_found_by_its_digest_in_a_store_and_beside(scene, place: str, tmp_path: Path) -> None:
+    digest = hashlib.sha256(b"splats").hexdigest()
+    stored = tmp_path / place.format(digest=digest)
+    stored.parent.mkdir()
+    stored.write_bytes(b"splats")
     absent = InputFile(path="/nowhere/splats.ply", sha256=digest)
     assert found_input("splats", absent, scene[2].metadata, tmp_path / "lifts" / "x.safetensors") == stored
