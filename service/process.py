@@ -21,12 +21,13 @@ import sys
 import tempfile
 import threading
 import time
+import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any, BinaryIO, NamedTuple
 
 from liftcore.errors import SplatliftError
-from service.errors import FULL, Busy, Fault, InvalidRequest, NoSpace, fault_of
+from service.errors import FULL, Busy, Fault, InvalidRequest, NoSpace, ProcessDied, fault_of
 
 TASKS = "service.tasks"  # what a spare child has imported
 TICK_SECONDS = 0.2  # until a cancel, a stop or a limit is noticed
@@ -370,6 +371,11 @@ def run(tasks: Any, order: Message, report: Reporter) -> Message:
         raise
     except MemoryError:
         return {"fault": fault_of(InvalidRequest(order["kind"], expected="one that fits the memory", got="more"))}
+    except Exception:
+        if order["kind"] != "query":
+            raise
+        traceback.print_exc()  # to the server's log; what is open stays for other questions
+        return {"fault": fault_of(ProcessDied("query", expected="an answer", got="an error of the server"))}
 
 
 def do_orders(open_tasks: Callable[[], Any]) -> None:

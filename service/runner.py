@@ -99,9 +99,10 @@ class Runner:
 
     def _attempt(self, job: Job, scratch: Path, draft: Path) -> Callable[[], None]:
         """Run the child to the end of its process group; return what is to be stored."""
-        store, pace = self._store, StagePace()
+        store, pace, messages = self._store, StagePace(), list[Message]()
 
         def take(message: Message) -> None:
+            messages[:] = [message]
             try:
                 for kind, data in message.items():
                     store.note(job.id, kind, pace.progress(data) if kind == "progress" else data)
@@ -125,7 +126,9 @@ class Runner:
             "task": job.kind, "kind": job.kind, "scratch": str(scratch), "output": str(draft), "work": work,
             "parameters": job.parameters, "threads": settings.job_threads,
         }  # fmt: skip
-        last, reason, _ = self._children.run(order, self._settings.job_seconds, take, why_end)
+        last, reason, was_killed = self._children.run(order, settings.job_seconds, take, why_end)
+        if was_killed and not messages:  # it died as a spare, with the child before it: that is no attempt
+            last, reason, _ = self._children.run(order, settings.job_seconds, take, why_end)
         if last is not None and "result" in last:
             return lambda: store.finish(job, last["result"], draft)
         if last is not None:

@@ -145,8 +145,9 @@ def _box_mask(box: Any, size: tuple[int, int] | None) -> StoredMask:
 def _add_data_set(document: MaskDocument, content: Mapping[str, Any], *, unannotated_negative: bool) -> None:
     """Add the images of a COCO data set."""
     entries = {entry["id"]: entry for entry in content["images"]}
-    categories = {entry["id"]: str(entry["name"]) for entry in content.get("categories") or ()}
-    names = {number: str(entry["file_name"]) for number, entry in entries.items()}
+    named = [(entry["id"], _text_of(entry, "name")) for entry in content.get("categories") or ()]
+    categories = {number: name for number, name in named if name is not None}
+    names = {number: _file_name(entry) for number, entry in entries.items()}
     images = {number: ImageMasks(ROBOFLOW.sub("", name), file=name) for number, name in names.items()}
     _drop_upload_prefixes([*images.values()])
     for number, record in enumerate(mask_records(content)):
@@ -162,6 +163,13 @@ def _add_data_set(document: MaskDocument, content: Mapping[str, Any], *, unannot
         image.annotated = bool(image.phrases) or unannotated_negative
 
 
+def _file_name(entry: Mapping[str, Any]) -> str:
+    name = _text_of(entry, "file_name")
+    if name is None:
+        raise ValueError(f"a file_name of each image, got {repr(entry.get('file_name'))[:80]}")
+    return name
+
+
 def _drop_upload_prefixes(images: Sequence[ImageMasks]) -> None:
     """Remove Label Studio's prefixes from the names if all images have one and not all are digits, as of dates."""
     paths = [PurePosixPath((image.image or "").replace("\\", "/")) for image in images]
@@ -173,10 +181,14 @@ def _drop_upload_prefixes(images: Sequence[ImageMasks]) -> None:
 
 def _tracked(content: Mapping[str, Any]) -> ImageMasks:
     """Read the objects of Grounded SAM 2's tracking in a frame."""
-    phrases: dict[int, str | None] = {
-        int(number): record["class_name"] for number, record in content["labels"].items()
-    }
-    return ImageMasks(None, phrases=[*map(str, phrases.values())], ids=str(content["mask_name"]), id_phrases=phrases)
+    phrases: dict[int, str | None] = {}
+    for number, record in content["labels"].items():
+        phrases[int(number)] = phrase = _text_of(record, *PHRASE_KEYS)
+        if phrase is None:
+            raise ValueError(f"labels of an id and a class_name, got {number}: {repr(record)[:80]}")
+    return ImageMasks(
+        None, phrases=[*filter(None, phrases.values())], ids=str(content["mask_name"]), id_phrases=phrases
+    )
 
 
 def views_of_images(names: Sequence[str]) -> dict[str, str]:

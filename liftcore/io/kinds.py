@@ -95,11 +95,6 @@ class FileKind:
     recognised: bool = True  # False: only its first bytes are known
 
     @property
-    def accepted_over_http(self) -> tuple[str, ...]:
-        """Those of ``splats`` that HTTP accepts, where no pickle is opened."""
-        return tuple(name for name in self.splats if name.lower().endswith(SPLATS_SENT))
-
-    @property
     def suffix(self) -> str:
         """Of splats, the usual suffix of their format; empty of others."""
         return "" if self.format is None else SUFFIX.get(self.format, self.format)

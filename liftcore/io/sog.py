@@ -73,7 +73,8 @@ def sog_files(path: Path) -> list[Path]:
     except (ValueError, RecursionError):
         document = None
     parts = document.values() if document and is_sog_document(document) else ()
-    names = {name for part in parts if isinstance(part, dict) for name in part.get("files") or () if _is_beside(name)}
+    lists = [part["files"] for part in parts if isinstance(part, dict) and isinstance(part.get("files"), list)]
+    names = {name for files in lists for name in files if _is_beside(name)}
     return sorted([meta, *(meta.parent / name for name in names if (meta.parent / name).is_file())])
 
 

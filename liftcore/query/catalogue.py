@@ -27,6 +27,7 @@ from liftcore.text import check_texts
 
 MOST_WORDS = 65_536  # of a vocabulary: their vectors take 130 MB at 512 channels
 NONE_FOUND = "no object: masks of three views never keep the same splats together"
+NO_TREE = "this lift's objects have no tree: lift again"
 
 
 def tree(scene: Scene, words: Sequence[str] = (), vectors: Any = None) -> SceneTree:
@@ -44,7 +45,7 @@ def tree(scene: Scene, words: Sequence[str] = (), vectors: Any = None) -> SceneT
     """
     parents = scene.node_parents
     if scene.object_views is None or scene.node is None or parents is None:
-        return _tree_of(scene, (), scene.lack_of_objects())
+        return _tree_of(scene, (), scene.lack_of_objects() if scene.object is None else NO_TREE)
     assert scene.node_views is not None and scene.node_confidence is not None and scene.node_features is not None
     of_parts = scene.node_features[len(scene.object_views) :].astype(np.float32)
     naming = _names(np.concatenate([scene.object_means, of_parts]), words, vectors)

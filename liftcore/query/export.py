@@ -65,8 +65,8 @@ def blocks_of(
 
     Arguments and errors are those of `Scene.blocks_of`; ``content`` is one of FILES.
     """
-    kinds = {int: "object", type(None): "scene", np.ndarray: "array"}
-    kind = "answers" if isinstance(source, Mapping) else kinds.get(type(source), type(source).__name__.lower())
+    kinds = {Mapping: "answers", np.ndarray: "array", int: "object", type(None): "scene"}
+    kind = next((kinds[base] for base in kinds if isinstance(source, base)), type(source).__name__.lower())
     files = FILES[kind]
     if kind in ("segmentation", "scenetree", "answers"):
         by_suffix = BY_SUFFIX | ({".ply": "labelled"} if kind == "scenetree" else {})

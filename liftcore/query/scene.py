@@ -310,7 +310,9 @@ class Scene:
         reader = self.encoder(encoder)
         words = self.words(reader) if words is None else words
         fields: dict[str, Any] = {"like": [example]}
-        return best_words(self, Query(**fields), words, reader.encode(words), top)
+        query = Query(**fields)
+        vars(query)["places"] = ["example"]  # for errors
+        return best_words(self, query, words, reader.encode(words), top)
 
     def words(self, encoder: AnyEncoder = None) -> list[str]:
         """Return all words of an encoder that is a table, each once; another encoder is an InvalidQuery."""

@@ -226,7 +226,8 @@ def _planes(masks: Array | Sequence[Array], count: int) -> np.ndarray:
     planes = planes[:, 0] if planes.ndim == 4 and planes.shape[1] == 1 else without_unit_axes(planes, 3)
     if planes.ndim != 3 or planes.dtype != torch.bool or not planes.numel():
         expected = "booleans [M, H, W], at least one mask and no side empty"
-        raise ValueError(f"{expected}, got {_kind(planes)}; masks of numbers are booleans by masks > 0.5")
+        hint = "; masks of numbers are booleans by masks > 0.5" if planes.dtype != torch.bool else ""
+        raise ValueError(f"{expected}, got {_kind(planes)}{hint}")
     if len(planes) != count:
         got = f"{len(planes)} of shape {list(planes.shape[1:])}"
         raise ValueError(f"{count} masks, one a vector, got {got}; row k of the vectors is of mask k")

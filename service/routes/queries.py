@@ -352,7 +352,7 @@ def render(question: RenderRequest, request: Request, deps: Deps, owner: Caller)
     """
     lift = deps.store.lift(owner, question.lift)
     work = scene_request("render", lift, deps) | seen_from(question) | {"channel": question.channel}
-    hide = question.hide
+    hide = question.hide and [item for item in question.hide if item]  # `hide=` of an address: none
     if hide is None:
         hide = [f"object:{label.id}" for label in object_labels(deps.store, lift.id) if label.hidden]
     work |= {"hide": hide} | with_selections(hide, lift, deps)
