@@ -386,6 +386,7 @@ def do_orders(open_tasks: Callable[[], Any]) -> None:
         Path("/proc/self/oom_score_adj").write_text("500")
     tasks = open_tasks()
     for line in sys.stdin.buffer:
+        report.say({})  # it began: what dies before this died as a spare
         report.say(run(tasks, json.loads(line), report))
     os._exit(0)  # skip the exit handlers of libraries
 

@@ -62,12 +62,11 @@ def gate(options: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
 
 
 def kill_each_attempt(service: Service, body: dict, verdicts: Verdicts) -> None:
-    """SIGKILL to the children in each attempt at one job."""
+    """SIGKILL to the children in each attempt at one job, once it has begun: before, it is no attempt."""
     job = service.order(body)
     for number in range(1, ATTEMPTS + 1):
-        while service.job(job)["attempt"] < number or service.job(job)["state"] == "queued":
+        while service.job(job)["attempt"] < number or service.job(job)["progress"] is None:
             time.sleep(0.02)
-        time.sleep(0.5)
         send_signal(service.children(), signal.SIGKILL)
     record = service.wait_for(job)
     is_failed = record["state"] == "failed" and record["attempt"] == ATTEMPTS and record["problem"]
