@@ -1,7 +1,6 @@
 """The names of liftcore.files, and where they live."""
 
 from liftcore.features.encoders.encode import read_image as read_image
-from liftcore.io.cameras import camera_files as camera_files
 from liftcore.io.files import check_output as check_output
 from liftcore.io.files import is_zip as is_zip
 from liftcore.io.files import visible_files as visible_files

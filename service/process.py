@@ -361,17 +361,15 @@ def run(tasks: Any, order: Message, report: Reporter) -> Message:
     try:
         limit_memory(order.get("memory"))
         return {"result": getattr(tasks, order["task"])(order, report)}
-    except (SplatliftError, OSError) as error:
+    except MemoryError:
+        return {"fault": fault_of(InvalidRequest(order["kind"], expected="one that fits the memory", got="more"))}
+    except Exception as error:
         cause = error.__cause__ or error  # a lift in blocks wraps the error of a full folder
         if isinstance(cause, OSError) and cause.errno in FULL:
             hint = "delete assets or lifts, or ask the operator for room; then send it again"
             return {"fault": fault_of(NoSpace("data", expected="room on the disk", got="a full disk", hint=hint))}
         if isinstance(error, SplatliftError):
             return {"fault": fault_of(error, names)}
-        raise
-    except MemoryError:
-        return {"fault": fault_of(InvalidRequest(order["kind"], expected="one that fits the memory", got="more"))}
-    except Exception:
         if order["kind"] != "query":
             raise
         traceback.print_exc()  # to the server's log; what is open stays for other questions

@@ -152,11 +152,6 @@ def camera_source(path: Path) -> CameraSource:
     return _of_model(path.parent) if path.name in MODEL_FILES and has_model(path.parent) else _of_document(path)
 
 
-def camera_files(path: Path | str) -> list[Path]:
-    """Return the files that `read_cameras` reads of a path, also those that do not exist."""
-    return camera_source(Path(path)).files
-
-
 def _source_in_folder(path: Path, frame: Path | None) -> CameraSource:
     documents = [path / name for name in JSON_FILES if (path / name).is_file()]
     export = path / TRAINED_ON

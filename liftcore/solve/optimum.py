@@ -13,7 +13,7 @@ have many directions). A is in memory, 12 bytes for each splat on a ray: take a 
 
 mu_i^2 is the row's part of L(x^), hence ``L(x') <= J(x^) = sum_i (1 + beta_i) mu_i^2 <= (1 + max_i beta_i) L(x^)``.
 The paper writes ``mu_i = sum_j A_ij |x^_j - B_i|``, lengths before the sum. That mu_i^2 is at least the row's part of
-L, not at most, so its last step does not follow; two rays suffice for a counterexample (tests/unit/solve). The chain
+L, not at most, so its last step does not follow; two rays suffice for a counterexample. The chain
 holds for any x in place of x^, converged or not, and in projected channels.
 """
 
