@@ -12,7 +12,14 @@ import numpy as np
 from liftcore.errors import InvalidQuery
 from liftcore.io.json_file import finite
 from liftcore.query.candidates import candidates, parts_of
-from liftcore.query.directions import directions, part_phrase, read_query, unknown_part, wordings
+from liftcore.query.directions import (
+    directions,
+    object_words,
+    part_phrase,
+    read_query,
+    unknown_part,
+    wordings,
+)
 from liftcore.query.objects import point_of
 from liftcore.query.presence import (
     NOT_IN_WORDS,
@@ -55,7 +62,7 @@ from liftcore.query.threshold import explain_no_selection, find_threshold, has_o
 from liftcore.runtime.one_thread import one_thread
 from liftcore.text import TextEncoder
 from liftcore.text.phrases import PartPhrase
-from liftcore.text.wording import Wording, base_of, normalize_text
+from liftcore.text.wording import Wording, base_of, members_of, normalize_text
 
 MOST_RIVALS = 3  # competing words in an answer
 LEAST_RIVAL = 0.1  # least share of the selected total weight to which such a word is the nearest
@@ -290,6 +297,11 @@ def _answer(scene: Scene, request: ResolvedQuery, similarities: np.ndarray) -> A
     least = LEAST_RIVAL_OF_CLEAR if clear and presence.present is not None else LEAST_RIVAL
     is_selected = scene.features.with_splats(selected)
     competitors = _nearer_words(rows, request, scores, is_selected, least)
+    if presence.present is False and (members := _of_kind(scene, request)):
+        competitors = members
+        presence = presence.model_copy(
+            update={"reason": f"{presence.reason} Of its kind in this scene: {', '.join(map(repr, members))}."}
+        )
     counts = None if rows.row_counts is None else rows.row_counts[rows.has_feature]
     statistics = finite(_statistics(scores[rows.has_feature], counts))
     if rows is not scene:
@@ -317,6 +329,15 @@ def _without_word(phrase: PartPhrase, parts: int) -> str:
         f"No word stands for {phrase.part!r}, so this is all of {phrase.object_phrase!r}. To have the part, {ask}, "
         "or take an encoder that reads any text."
     )
+
+
+def _of_kind(scene: Scene, request: ResolvedQuery) -> tuple[str, ...]:
+    """Return the words of the scene's objects that are of a kind that a text names, such as "penguin" for "bird"."""
+    members = frozenset[str]().union(*(members_of(wording.word) for wording in request.asked_as.values()))
+    if not members or isinstance(request.references, str):
+        return ()
+    words = object_words(scene, request.references.words, request.references.vectors)
+    return tuple(word for word in words if base_of(word) in members)
 
 
 def _nearer_words(

@@ -406,7 +406,8 @@ class Answer(SelectionSummary):
     )
     rivals: tuple[str, ...] = Field(
         default=(),
-        description="other words that are nearer to what was found, or most like it; of a clear answer to most of it",
+        description="words that are nearer to what was found, or most like it; of a clear answer to most of it; "
+        "of a kind that is not there, its members that are",
     )
     statistics: Mapping[str, Any] = Field(description="least, largest and mean score of the splats with a feature")
     top: tuple[TopSplat, ...] = ()

@@ -294,6 +294,12 @@ def _table() -> dict[str, dict[str, Any]]:
     return json.loads(SYNONYMS.read_text("utf-8"))
 
 
+def members_of(kind: str) -> frozenset[str]:
+    """Return the names of what is of a kind, such as "penguin" for "birds"; empty if a text names no kind."""
+    forms, groups = set(_forms(kind)), _table()["groups"]
+    return frozenset(base_of(member) for group in forms & groups.keys() for member in groups[group])
+
+
 @cache
 def _typed_synonyms() -> dict[str, list[str]]:
     """Return each synonym, normalized, with and without its qualifier, and the words that it matches."""

@@ -8,6 +8,7 @@ from typing import Any
 import liftcore as lc
 import numpy as np
 import pytest
+import torch
 
 from tests.promises.tiny_files import photo_vectors, scene_with, write_table
 
@@ -69,6 +70,17 @@ def test_an_answer_says_how_a_phrase_was_read(scene: lc.Scene) -> None:
     matches = [(match.text, match.word, match.match) for match in answer.wording]
     assert matches == [(phrase, "mug", "list"), (phrase, "bowl", "list"), (phrase, "lamp", "negation")]
     assert answer.text == ["red mugs", "bowls"]
+
+
+@pytest.mark.parametrize(("kind", "members"), [("bird", ("penguin",)), ("pet", ("cat",)), ("sofa", ())])
+def test_a_kind_that_is_not_there_names_its_members_that_are(kind: str, members: tuple[str, ...]) -> None:
+    things = ["penguin"] * 30 + ["violin"] * 30 + ["cat"] * 30
+    objects = torch.from_numpy(np.repeat(np.arange(3, dtype=np.int32), 30))
+    scene = scene_with(photo_vectors(things), object=objects, object_views=torch.zeros(3, 5, dtype=torch.int32))
+    answer = scene.ask(kind, encoder="lvis", places=False)
+    assert answer.present is False and not answer.count
+    assert not members or answer.rivals == members
+    assert ("Of its kind in this scene: " + ", ".join(map(repr, members)) in answer.reason) is bool(members)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1, 0.25])

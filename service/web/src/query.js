@@ -421,7 +421,7 @@ function adviceLines(question, panel) {
       ...suggestions.map(word => button(plainWord(word), () => panel.askWord(word, question)))));
   }
   const rivals = (answer?.rivals || []).filter(word => !panel.negatives.includes(word));
-  if (answer?.present === false && rivals.length) paragraphs.push(paragraph(`\u201c${text.join(", ")}\u201d is not in this scene. The nearest word is `, ...rivals.map(word => button(plainWord(word), () => panel.askWord(word, question)))));
+  if (answer?.present === false && rivals.length) paragraphs.push(paragraph(`\u201c${text.join(", ")}\u201d is not in this scene. Try `, ...rivals.map(word => button(plainWord(word), () => panel.askWord(word, question)))));
   if (isUncertain(question) && rivals.length) {
     paragraphs.push(paragraph(`Not sure: ${rivals.length > 1 ? "these words are" : "this word is"} nearer. `, ...rivals.flatMap(word => [button(plainWord(word), () => panel.askWord(word, question)), button(`but not ${plainWord(word)}`, () => panel.excludeWord(word))])));
   } else if (isUncertain(question)) paragraphs.push(paragraph("Not sure: the selected splats hardly stand out."));
