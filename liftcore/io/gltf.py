@@ -107,9 +107,6 @@ class _Asset:
             if name not in SUPPORTED_EXTENSIONS:
                 hint = _hint_of(str(name))
                 raise ValueError(f"a file without other required extensions, got {str(name)[:80]!r}; {hint}")
-        if len(self.json["buffers"]) > 1 or "uri" in self.json["buffers"][0]:
-            got = f"others ({str(self.json['buffers'])[:60]})"
-            raise ValueError(f"a buffer within the file, got {got}; make one .glb of it, with its buffers")
         extras = self.json["asset"].get("extras", {})
         self.world = world_of(extras[WORLD]) if WORLD in extras else METRES
 
@@ -222,13 +219,15 @@ class _Asset:
             content = self.binary[view.get("byteOffset", 0) :][: view["byteLength"]]
             size, first = width * dtype.itemsize, accessor.get("byteOffset", 0)
             stride = view.get("byteStride", size)
+            is_within = view["buffer"] == 0 and "uri" not in self.json["buffers"][0]
             fits = accessor["count"] == count and WIDTHS[accessor["type"]] == width and "sparse" not in accessor
-            if not fits or stride < size or first + (count - 1) * stride + size > len(content):
+            if not (fits and is_within) or stride < size or first + (count - 1) * stride + size > len(content):
                 raise ValueError(name)
             rows = np.ndarray((count, width), dtype, content, first, (stride, dtype.itemsize))
         except (AttributeError, LookupError, TypeError, ValueError, OverflowError):
-            expected = f"{count} rows of {width} plain numbers in the file as {name}"
-            raise ValueError(f"{expected}, got {repr(accessor)[:80]}") from None
+            expected = f"{count} rows of {width} plain numbers within the file as {name}"
+            got = repr(accessor)[:80]
+            raise ValueError(f"{expected}, got {got}; make one .glb of it, with its buffers") from None
         if accessor.get("normalized") and dtype.kind in "iu":
             return np.maximum(rows.astype(np.float32) / np.iinfo(dtype).max, -1)
         return rows.copy()

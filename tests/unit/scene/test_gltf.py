@@ -102,6 +102,16 @@ def test_nodes_move_what_they_hold(tmp_path: Path) -> None:
     assert_same(scene[P:], splats.transformed(np.column_stack([in_our_frame, shift])))
 
 
+def test_buffers_of_other_things_in_the_model_do_not_matter(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.glb", splats := some_splats())
+    document, binary = parts_of(path)
+    document["buffers"].append({"uri": "mesh.bin", "byteLength": 8})
+    assert_same(read_splats(join(path, document, binary)), splats)
+    document["bufferViews"][0]["buffer"] = 1
+    with pytest.raises(InvalidSplats, match=r"within the file as POSITION.*; make one \.glb of it, with its buffers"):
+        read_splats(join(path, document, binary))
+
+
 def labels() -> Labels:
     box = {"low": [-1.0, -2.0, -3.0], "high": [1.0, 2.0, 4.0]}
     oriented_box = {
