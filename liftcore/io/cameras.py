@@ -253,6 +253,10 @@ def _scene_of(model: PurePosixPath) -> PurePosixPath:
 def _parse_inria(document: list[Any], source: str) -> Cameras:
     """Parse the cameras.json of Inria's trainer, which puts the principal point at the image's centre."""
     with reading(source, InvalidCameras, JSON_FORMATS):
+        foreign = [record for record in document if not isinstance(record, dict) or "img_name" not in record]
+        if foreign:
+            hint = "a COLMAP model, or poses as a transforms.json, are read too"
+            raise ValueError(f"{JSON_FORMATS}, got a list with {repr(foreign[0])[:60]}; {hint}")
         names = view_names([str(record["img_name"]) for record in document])
         check_count(len(names), source)
 

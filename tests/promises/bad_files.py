@@ -298,6 +298,7 @@ CAMERA_FILES = [
     ("no frames", with_camera(frames=None), "'frames'"),
     ("empty list", b"[]", "at least one view"),
     ("list of nothing", b"[{}]", "'img_name'"),
+    ("list of annotations", b'[{"bbox": [1, 2]}]', "a list with {'bbox'"),
     ("frames of numbers", with_camera(frames=[1]), "objects"),
     ("frame without a name", with_camera(frames=[{}]), "'file_path'"),
     ("views twice", with_camera(frames=TWICE), "one view a name"),
