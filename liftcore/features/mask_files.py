@@ -36,7 +36,6 @@ CONTINUATION, SIGN, VALUE = 32, 16, 31
 LOWEST, HIGHEST = ord("0"), ord("0") + 63  # the characters of a group
 MAX_GROUPS = 7  # 35 bits: differences of lengths in an image of MAX_SIDE squared, and their sign
 MAX_PIXELS = 178_956_970  # as many as Pillow opens
-MAX_CROSSINGS = 1 << 24  # of columns of pixels by the edges of a polygon
 MAX_COORDINATE = 1e6  # pixels
 
 
@@ -193,23 +192,15 @@ def fill_polygons(size: tuple[int, int], parts: Iterable[np.ndarray]) -> np.ndar
     height, width = size
     inside = np.zeros(size, bool)
     for part in parts:
-        ends = np.roll(part, -1, axis=0)
-        low, high = np.minimum(part, ends)[:, 0], np.maximum(part, ends)[:, 0]
-        first, last = (np.clip(np.ceil(side - 0.5), 0, width).astype(np.int64) for side in (low, high))
-        if (crossed := int((last - first).sum())) > MAX_CROSSINGS:
-            expected = f"a polygon whose edges cross at most {MAX_CROSSINGS} columns of pixels"
-            raise ValueError(f"{expected}, got {crossed} by {len(part)} corners; write run lengths")
-        edges = np.repeat(np.arange(len(part)), last - first)  # an entry for each column whose centre an edge crosses
-        if not len(edges):
-            continue
-        columns = np.arange(len(edges)) - np.repeat(np.cumsum(last - first) - last, last - first)
-        (x, y), (dx, dy) = part[edges].T, (ends - part)[edges].T
-        rows = np.clip(np.ceil(y + (columns + 0.5 - x) * dy / dx - 0.5), 0, height).astype(np.int64)
-        left, top = int(columns.min()), int(rows.min())
-        box = int(rows.max()) - top, int(columns.max()) + 1 - left
-        places = (rows - top) * box[1] + columns - left
-        crossings = np.bincount(places, minlength=(box[0] + 1) * box[1]).reshape(-1, box[1])[: box[0]] % 2 == 1
-        inside[top : top + box[0], left : left + box[1]] |= np.logical_xor.accumulate(crossings, axis=0)
+        ends = np.clip(np.ceil(part[:, 0] - 0.5), 0, width).astype(np.int64)  # columns whose centres edges begin at
+        left = ends.min(initial=width)
+        crossings = np.zeros((height + 1, max(0, ends.max(initial=0) - left)), bool)
+        edges = zip(part, np.roll(part, -1, axis=0), ends, np.roll(ends, -1), strict=True)
+        for (x, y), (next_x, next_y), end, next_end in edges:
+            columns = np.arange(min(end, next_end), max(end, next_end))
+            rows = np.ceil(y + (columns + 0.5 - x) * (next_y - y) / (next_x - x) - 0.5).clip(0, height)
+            crossings[rows.astype(np.int64), columns - left] ^= True
+        inside[:, left : left + crossings.shape[1]] |= np.logical_xor.accumulate(crossings[:height], axis=0)
     return inside
 
 
