@@ -15,9 +15,10 @@ from liftcore.errors import InvalidInput, InvalidSplats, InvalidTable
 from liftcore.evaluate.class_masks import describe_masks
 from liftcore.features.smoothness import some_grids, unlike_maps
 from liftcore.io.cameras import camera_source, read_cameras
-from liftcore.io.kinds import EXPORT_PLY, SplatFormat, identify
+from liftcore.io.formats import SplatFormat
+from liftcore.io.kinds import identify
 from liftcore.io.photo_zip import describe_photos
-from liftcore.io.ply import dialect_of
+from liftcore.io.ply import EXPORT_PLY, dialect_of
 from liftcore.io.splats import format_of, read_splats, splat_files
 from liftcore.runtime.arguments import as_path, check_choice
 from liftcore.scene.cameras import Cameras, distortion_warning
@@ -112,7 +113,7 @@ def describe_splat_file(path: Path) -> dict[str, Any]:
         InvalidSplats: the file is malformed.
     """
     file_format, splats = format_of(path), read_splats(path)
-    return describe_splats(splats) | ({} if file_format is SplatFormat.PLY else {"dialect": file_format.value})
+    return describe_splats(splats) | ({} if file_format is SplatFormat.PLY else {"dialect": file_format.label})
 
 
 def describe_splats(splats: Splats) -> dict[str, Any]:

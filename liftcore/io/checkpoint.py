@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from liftcore.io.kinds import EXPORT_PLY, TRAINED
+from liftcore.io.ply import EXPORT_PLY, TRAINED
 from liftcore.io.quantised import Fields
 from liftcore.runtime.one_line import join_names
 from liftcore.scene.render_mode import mode_beside

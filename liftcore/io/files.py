@@ -30,7 +30,7 @@ SYSTEM_FILES = frozenset((
 ))  # fmt: skip
 LFS_HINT = "run 'git lfs pull' in the repository where it lies"
 OUTPUT_TYPES = {  # name, suffixes, and a word of the kind or name of a file that is replaced; "": of no known kind
-    "splats": ("splats", (".ply", ".splat", ".spz", ".glb", ".usdc", ".usdz"), "splats"),
+    "splats": ("splats", (), "splats"),  # of `liftcore.io.formats`
     "ply": ("a PLY", (".ply",), "splats"),
     "png": ("a picture", (".png",), "a picture"),
     "npy": ("an array", (".npy",), "a NumPy array"),
@@ -138,11 +138,13 @@ def check_output(path: Path | str, inputs: Path | str | Iterable[Path | str], ki
         path: as the user gave it. inputs: files, and folders of cameras, that are read for it. kind: what goes there,
             one of OUTPUT_TYPES.
     """
+    from liftcore.io.formats import WRITERS
     from liftcore.io.kinds import identify
 
     check_choice("kind", kind, OUTPUT_TYPES)
     path = as_path(path, "output")
     label, suffixes, word = OUTPUT_TYPES[kind]
+    suffixes = suffixes or (*WRITERS,)
     with reading("output", InvalidInput, "a file to write"), writing(path):
         if path.is_dir():
             raise ValueError(f"a file to write, got the folder {path}")

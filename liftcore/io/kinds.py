@@ -14,7 +14,6 @@ import stat
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import IO, Any, TypeVar
@@ -31,7 +30,8 @@ from liftcore.io.files import (
     open_regular,
     open_zip,
 )
-from liftcore.io.ply import MAX_HEADER_BYTES, cloud_without_splats
+from liftcore.io.formats import HTTP_SUFFIXES, SplatFormat
+from liftcore.io.ply import EXPORT_PLY, MAX_HEADER_BYTES, TRAINED, cloud_without_splats
 from liftcore.io.sog import META, is_sog_document, sog_folder
 from liftcore.io.splat import looks_like_splat
 from liftcore.io.spz import begins_like_spz
@@ -56,31 +56,10 @@ CONVERT = "convert it with PlayCanvas's splat-transform: npx @playcanvas/splat-t
 NOT_CONVERTED = (
     "splat-transform does not read it: export the splats as .ply, .spz or .sog from the program that has them"
 )
-EXPORT_PLY = (
-    "export the splats as PLY from the program that trained them (nerfstudio: ns-export gaussian-splat; gsplat's "
-    "simple_trainer: --save-ply)"
-)
 UNPACK = "unpack it and give the splats in it"
 DOWNLOAD = "the download went wrong: fetch the file itself"
-TRAINED = "give the trained splats; the 3DGS trainers keep them in point_cloud/iteration_N/point_cloud.ply"
-
-
-class SplatFormat(StrEnum):
-    """A format of splats that is read, by its usual name."""
-
-    PLY = "PLY"  # of every dialect
-    COMPRESSED_PLY = "compressed PLY"
-    SPLAT = ".splat"
-    SPZ = ".spz"
-    SOG = ".sog"
-    GLTF = ".glb"  # with KHR_gaussian_splatting
-    CHECKPOINT = "checkpoint"  # of gsplat or nerfstudio: a pickle, if only of tensors
-
-
-SUFFIX = {SplatFormat.PLY: ".ply", SplatFormat.COMPRESSED_PLY: ".ply", SplatFormat.CHECKPOINT: ".pt"}  # of odd names
 PICKLED = (".pt", ".pth", ".ckpt", ".pkl")
 LOD_META = "lod-meta.json"  # of a streamed SOG
-SPLATS_SENT = (".ply", ".splat", ".spz", ".sog", ".glb")  # over HTTP, where no pickle is opened
 
 
 @dataclass(frozen=True)
@@ -97,7 +76,7 @@ class FileKind:
     @property
     def suffix(self) -> str:
         """Of splats, the usual suffix of their format; empty of others."""
-        return "" if self.format is None else SUFFIX.get(self.format, self.format)
+        return self.format.suffix if self.format else ""
 
 
 _WEB_PAGE = FileKind(
@@ -439,7 +418,7 @@ def _of_names_in_zip(names: list[str], splats: tuple[str, ...]) -> FileKind:  # 
 def _zip_with(names: Sequence[str]) -> FileKind:
     """Return a zip with files of interest, the first of which is the one to give."""
     several = f" and {len(names) - 1} more" if len(names) > 1 else ""
-    splats = tuple(name for name in names if name.lower().endswith((*SPLATS_SENT, *PICKLED)))
+    splats = tuple(name for name in names if name.lower().endswith((*HTTP_SUFFIXES, *PICKLED)))
     return FileKind(None, f"a zip with {names[0]}{several} in it", f"unzip it and give {names[0]}", splats=splats)
 
 
@@ -460,7 +439,7 @@ def _splat_files(names: Iterable[str], has_splats: Callable[[str], bool]) -> tup
     likely = [
         name
         for name in names
-        if name.lower().endswith(SPLATS_SENT) or (_CHECKPOINT.search(name) and not _OF_FEATURES.search(name))
+        if name.lower().endswith(HTTP_SUFFIXES) or (_CHECKPOINT.search(name) and not _OF_FEATURES.search(name))
     ]
     likely.sort(key=order)
     plys = [name for name in likely if name.lower().endswith(".ply")]
@@ -531,7 +510,8 @@ def page_table() -> dict[str, Any]:
     """Return the suffixes of files that the page sends, and those that it refuses, with the hints above."""
     return {
         "kinds": {
-            **dict.fromkeys(SPLATS_SENT, "splats"), ".json": "cameras", ".safetensors": "features", ".zip": "cameras",
+            **dict.fromkeys(HTTP_SUFFIXES, "splats"),
+            ".json": "cameras", ".safetensors": "features", ".zip": "cameras",
         },
         "images": sorted(IMAGE_SUFFIXES),
         "cameras": CAMERA_FILES.pattern,

@@ -61,6 +61,11 @@ SPELLING = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "i
 SPELLING |= {"f4": "float", "f8": "double"}
 WRITTEN_MODE = {RenderModel.ANTIALIASED: "mip", RenderModel.DISCS: "2dgs"}  # as editors read it
 EXPORT = "export the splats again as binary little-endian PLY"
+EXPORT_PLY = (
+    "export the splats as PLY from the program that trained them (nerfstudio: ns-export gaussian-splat; gsplat's "
+    "simple_trainer: --save-ply)"
+)
+TRAINED = "give the trained splats; the 3DGS trainers keep them in point_cloud/iteration_N/point_cloud.ply"
 REWRITE = (
     "rewrite it with Python: from plyfile import PlyData; p = PlyData.read('IN.ply'); p.text = False; "
     "p.byte_order = '<'; p.write('OUT.ply')"
@@ -583,7 +588,7 @@ def cloud_without_splats(lines: Sequence[str]) -> tuple[str, str] | None:
     names = {line[-1] for line in words if line[:1] == ["property"]}
     if not names.issuperset("xyz") or names.intersection(SPLAT_PROPERTIES):
         return None
-    hint = "give the trained splats; the 3DGS trainers keep them in point_cloud/iteration_N/point_cloud.ply"
+    hint = TRAINED
     if any(name.startswith("scalar_") for name in names):
         hint = "CloudCompare renames properties (scalar_opacity): give the file that it was opened from"
     return ("a mesh" if any(line[:2] == ["element", "face"] for line in words) else "a point cloud"), hint

@@ -6,10 +6,9 @@ names its kind and what to do.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,18 +16,13 @@ import numpy as np
 
 from liftcore.errors import InvalidSplats, reading
 from liftcore.io import ply
-from liftcore.io.checkpoint import read_checkpoint
-from liftcore.io.compressed_ply import read_compressed_ply
 from liftcore.io.files import CONVERT_PLY, whole_file
-from liftcore.io.gltf import gltf_blocks, read_gltf
-from liftcore.io.kinds import CONVERT, SplatFormat, identify, wrong_kind
+from liftcore.io.formats import WRITERS, SplatFormat
+from liftcore.io.kinds import CONVERT, identify, wrong_kind
 from liftcore.io.labels import COLUMN, Labels
-from liftcore.io.quantised import Fields
-from liftcore.io.sog import is_bundled, read_sog, sog_files
-from liftcore.io.splat import ROW, read_splat, splat_blocks
-from liftcore.io.spz import read_spz, spz_blocks
-from liftcore.io.usd import usd_blocks
-from liftcore.runtime.arguments import as_path
+from liftcore.io.sog import is_bundled, sog_files
+from liftcore.io.splat import ROW
+from liftcore.runtime.arguments import as_path, one_of
 from liftcore.scene.harmonics import constant_terms
 from liftcore.scene.kernel import Kernel, kernel_named
 from liftcore.scene.origin import lies_apart
@@ -38,29 +32,13 @@ from liftcore.scene.world import world_of
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from liftcore.io.formats import Writer
     from liftcore.scene.splats import Splats
     from liftcore.scene.world import WorldFrame
 
 
 EXPECTED = "splats as PLY, compressed PLY, .splat, .spz, .sog, .glb or a checkpoint"
-_READERS: dict[SplatFormat, Callable[..., Fields]] = {
-    SplatFormat.COMPRESSED_PLY: read_compressed_ply,
-    SplatFormat.SPLAT: read_splat,
-    SplatFormat.SPZ: read_spz,
-    SplatFormat.SOG: read_sog,
-    SplatFormat.CHECKPOINT: read_checkpoint,
-    SplatFormat.GLTF: read_gltf,
-}
-Document = Mapping[str, Any]  # of `liftcore.io.labels`
-_WRITERS: dict[str, Callable[[Splats, Document | None], Iterator[bytes]]] = {
-    ".ply": lambda splats, _: ply.ply_blocks(splats),
-    ".splat": lambda splats, _: splat_blocks(splats),
-    ".spz": lambda splats, _: spz_blocks(splats),
-    ".glb": gltf_blocks,
-    ".usdc": usd_blocks,
-    ".usdz": partial(usd_blocks, suffix=".usdz"),
-}
-WITH_COLUMNS = (".ply", ".glb", ".usdc", ".usdz")  # formats that hold further numbers a splat
+WITH_COLUMNS = [suffix for suffix, row in WRITERS.items() if row.has_columns]
 
 
 def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool = True) -> Splats:
@@ -82,13 +60,13 @@ def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool
     path = as_path(path)
     splat_format = format_of(path)
     with _naming(path):
-        if splat_format is SplatFormat.PLY:
+        if splat_format.read is None:
             return ply.read_ply(path, kernel, colour=colour)
         if kernel != "auto" and kernel_named(kernel) is Kernel.BETA:
-            raise ValueError(f"the property 'beta' of a dbs splat, got {splat_format}, which has none")
+            raise ValueError(f"the property 'beta' of a dbs splat, got {splat_format.label}, which has none")
         from liftcore.scene.splats import Splats
 
-        fields = _READERS[splat_format](path, colour=colour)
+        fields = splat_format.read(path, colour=colour)
         used_kernel = kernel_of_mode(fields.get("render_mode")) if kernel == "auto" else kernel_named(kernel)
         if used_kernel is Kernel.GAUSSIAN_2D:
             fields["log_scales"] = np.ascontiguousarray(fields["log_scales"][:, :2])
@@ -170,12 +148,12 @@ def blocks_as(splats: Splats, suffix: str) -> Iterator[bytes]:
     return _writer_of(suffix, "suffix")(splats, None)
 
 
-def _writer_of(suffix: str, argument: str) -> Callable[[Splats, Document | None], Iterator[bytes]]:
+def _writer_of(suffix: str, argument: str) -> Writer:
     """Return the writer of files with this suffix."""
-    if suffix not in _WRITERS:
-        expected = f"one of {', '.join(_WRITERS)}"
-        raise InvalidSplats(argument, expected=expected, got=repr(suffix)[:40], hint=CONVERT_PLY)
-    return _WRITERS[suffix]
+    write = WRITERS[suffix].write if suffix in WRITERS else None
+    if write is None:
+        raise InvalidSplats(argument, expected=one_of(WRITERS), got=repr(suffix)[:40], hint=CONVERT_PLY)
+    return write
 
 
 def read_places(path: Path, kernel: Kernel | str = "auto") -> np.ndarray:
@@ -186,8 +164,8 @@ def read_places(path: Path, kernel: Kernel | str = "auto") -> np.ndarray:
     """
     splat_format = format_of(path)
     with _naming(path):
-        is_ply = splat_format is SplatFormat.PLY
-        places = ply.read_places(path) if is_ply else _READERS[splat_format](path, colour=False)["means"]
+        read = splat_format.read
+        places = read(path, colour=False)["means"] if read else ply.read_places(path)
     if lies_apart(places):
         return read_splats(path, kernel, colour=False).positions()
     with np.errstate(over="ignore"):
@@ -213,11 +191,9 @@ def quick_count(path: Path) -> int | None:
     """P of a file by its header or size alone; None where it must be read to be counted, or does not open."""
     with suppress(InvalidSplats, OSError, ValueError):
         splat_format = format_of(path)
-        if splat_format is SplatFormat.PLY:
-            return ply.read_header(path).count
         if splat_format is SplatFormat.SPLAT:
             return path.stat().st_size // ROW.itemsize
-        if splat_format is SplatFormat.COMPRESSED_PLY:
+        if splat_format.suffix == SplatFormat.PLY.suffix:
             elements = ply.parse_elements(ply.read_head(path)[0])[1]
             return next((element.count for element in elements if element.name == "vertex"), None)
     return None

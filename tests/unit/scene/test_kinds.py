@@ -17,7 +17,8 @@ from safetensors.numpy import save
 from liftcore.errors import InvalidCameras, InvalidInput, InvalidSplats
 from liftcore.evaluate.inspect import inspect_file
 from liftcore.io.cameras import read_cameras
-from liftcore.io.kinds import SplatFormat, identify, wrong_kind
+from liftcore.io.formats import SplatFormat
+from liftcore.io.kinds import identify, wrong_kind
 from liftcore.io.splats import read_splats, splat_files, write_splats
 from liftcore.query.result import load_lift
 from liftcore.text import open_encoder

@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.kinds import SplatFormat
+from liftcore.io.formats import SplatFormat
 from liftcore.io.splats import (
     read_splats,
     recoloured,
