@@ -15,7 +15,7 @@ from __future__ import annotations
 import sys
 from contextlib import contextmanager
 from threading import Lock, Thread
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from threadpoolctl import ThreadpoolController
 
@@ -23,72 +23,15 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 
-class _Torch:
-    """Torch's thread counts, while any thread is in `one_thread`."""
+class _Counts:
+    """Thread counts of the process, while any thread is in `one_thread`."""
 
-    def __init__(self) -> None:
-        self._lock, self._within, self._previous = Lock(), 0, 1
-
-    def enter(self) -> int | None:
-        """Set one thread for the calling thread and threads that start later; return its previous count.
-
-        None if torch is not loaded: queries do without it, and it takes a second to load.
-        """
-        if "torch" not in sys.modules:
-            return None
-        import torch
-
-        with self._lock:
-            threads = torch.get_num_threads()
-            self._previous = self._previous if self._within else threads
-            self._within += 1
-            torch.set_num_threads(1)
-            return threads
-
-    def leave(self, threads: int | None) -> None:
-        """Restore the calling thread's count, and set that of threads that start later: 1 while others are within."""
-        if threads is None:
-            return
-        import torch
-
-        with self._lock:
-            self._within -= 1
-            later_threads = 1 if self._within else self._previous
-            torch.set_num_threads(threads)
-            if later_threads != threads:
-                setter = Thread(target=torch.set_num_threads, args=(later_threads,))
-                setter.start()
-                setter.join()
-
-
-class _LinearAlgebra:
-    """The thread counts of linear algebra libraries, while any thread is in `one_thread`."""
-
-    def __init__(self) -> None:
-        self._lock, self._within = Lock(), 0
-        self._modules, self._libraries = 0, list[Any]()  # number at the last search for libraries, and its result
-        self._previous: dict[str, int] = {}  # counts by library file
-
-    def enter(self) -> None:
-        """Set one thread for all libraries that are loaded."""
-        with self._lock:
-            if self._modules != len(sys.modules):  # an import may have loaded another; a search takes 1 ms
-                self._libraries = ThreadpoolController().select(user_api="blas").lib_controllers
-                self._modules = len(sys.modules)
-            for library in self._libraries:
-                if library.filepath not in self._previous:
-                    self._previous[library.filepath] = library.num_threads
-                    _set_threads(library, 1)
-            self._within += 1
-
-    def leave(self) -> None:
-        """Restore the counts when the last thread leaves."""
-        with self._lock:
-            self._within -= 1
-            if not self._within:
-                for library in self._libraries:
-                    _set_threads(library, self._previous[library.filepath])
-                self._previous.clear()
+    within = 0  # threads
+    within_torch = 0  # threads that entered when torch was loaded
+    later = 1  # torch's count for threads that start when all have left
+    modules = 0  # that were loaded at the last search for libraries
+    libraries: ClassVar[list[Any]] = []
+    previous: ClassVar[dict[str, int]] = {}  # counts by library file
 
 
 def _set_threads(library: Any, number: int) -> None:
@@ -103,7 +46,7 @@ def _set_threads(library: Any, number: int) -> None:
     clear(force=True)
 
 
-_torch, _linear_algebra = _Torch(), _LinearAlgebra()
+_lock = Lock()
 
 
 @contextmanager
@@ -112,10 +55,46 @@ def one_thread() -> Iterator[None]:
 
     Threads that start within also have one torch thread, for their lifetime.
     """
-    _linear_algebra.enter()
-    threads = _torch.enter()
+    torch = sys.modules.get("torch")  # queries do without it, and it takes a second to load
+    with _lock:
+        threads = _enter(torch)
     try:
         yield
     finally:
-        _torch.leave(threads)
-        _linear_algebra.leave()
+        with _lock:
+            _leave(torch, threads)
+
+
+def _enter(torch: Any) -> int:
+    """Set one thread for the calling thread, those that start later, and all libraries; return torch's count."""
+    if _Counts.modules != len(sys.modules):  # an import may have loaded another library; a search takes 1 ms
+        _Counts.libraries = ThreadpoolController().select(user_api="blas").lib_controllers
+        _Counts.modules = len(sys.modules)
+    for library in _Counts.libraries:
+        if library.filepath not in _Counts.previous:
+            _Counts.previous[library.filepath] = library.num_threads
+            _set_threads(library, 1)
+    _Counts.within += 1
+    threads = torch.get_num_threads() if torch else 0
+    if torch:
+        _Counts.later = _Counts.later if _Counts.within_torch else threads
+        _Counts.within_torch += 1
+        torch.set_num_threads(1)
+    return threads
+
+
+def _leave(torch: Any, threads: int) -> None:
+    """Restore the calling thread's count, and that of the process when the last thread leaves."""
+    _Counts.within -= 1
+    if not _Counts.within:
+        for library in _Counts.libraries:
+            _set_threads(library, _Counts.previous[library.filepath])
+        _Counts.previous.clear()
+    if torch:
+        _Counts.within_torch -= 1
+        torch.set_num_threads(threads)
+        later = 1 if _Counts.within_torch else _Counts.later
+        if later != threads:
+            setter = Thread(target=torch.set_num_threads, args=(later,))
+            setter.start()
+            setter.join()
