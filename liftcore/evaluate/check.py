@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from liftcore.features.encoders.encode import TURNS, find_images, read_image, readings_of
+from liftcore.features.encoders.encode import find_images, read_image, readings_of
 from liftcore.features.smoothness import smoothness, unlike_maps
 from liftcore.io.cameras import read_cameras
 from liftcore.io.photos import PhotoHeader, orientation_warnings, read_header
@@ -67,10 +67,15 @@ LEAST_BORDERS = 0.75  # of the photo's mean edge, under masks' borders or mirror
 LEAST_EDGES = 1.1  # of the photo's edges under masks, over those under mirrored ones
 
 
-TURN_NAMES = {  # by EXIF's orientation
-    2: "mirrored left to right", 3: "turned by 180 degrees", 4: "mirrored upside down", 5: "transposed",
-    6: "turned by 90 degrees clockwise", 7: "transposed across", 8: "turned by 90 degrees counterclockwise",
-}  # fmt: skip
+TURNS = {  # by EXIF's orientation: what it does to a picture [H, W, 3], in words and by NumPy
+    2: ("mirrored left to right", lambda picture: picture[:, ::-1]),
+    3: ("turned by 180 degrees", lambda picture: picture[::-1, ::-1]),
+    4: ("mirrored upside down", lambda picture: picture[::-1]),
+    5: ("transposed", lambda picture: picture.swapaxes(0, 1)),
+    6: ("turned by 90 degrees clockwise", lambda picture: np.rot90(picture, 3)),
+    7: ("transposed across", lambda picture: picture[::-1, ::-1].swapaxes(0, 1)),
+    8: ("turned by 90 degrees counterclockwise", np.rot90),
+}
 
 
 @dataclass(frozen=True)
@@ -384,7 +389,7 @@ def _some_turned(
     for name, (own_psnr, other) in psnrs.items():
         if own_psnr - other >= LEAST_GAIN:
             continue
-        ways = {tag: np.asarray(_turn(pictures[name], way)) for tag, way in TURNS.items()}
+        ways = {tag: turn(pictures[name]) for tag, (_, turn) in TURNS.items()}
         gains = {
             tag: _psnr(renders[name], picture) - max(own_psnr, other)
             for tag, picture in ways.items()
@@ -394,7 +399,7 @@ def _some_turned(
         if gains[best] >= LEAST_GAIN:
             names_by_turn.setdefault(best, []).append(name)
     return [
-        f"photos: {len(names)} of the {len(psnrs)} compared ({first_names(names)}) are {TURN_NAMES[tag]}: "
+        f"photos: {len(names)} of the {len(psnrs)} compared ({first_names(names)}) are {TURNS[tag][0]}: "
         "take the photos that cameras were made of"
         for tag, names in sorted(names_by_turn.items())
     ]
@@ -408,8 +413,8 @@ def _turned_photos(
 ) -> str:
     """Report the turn of all photos that makes renders match; empty if none does."""
     best, turn = 0.0, 0
-    for tag, way in TURNS.items():
-        turned_pictures = {name: np.asarray(_turn(pictures[name], way)) for name in floor}
+    for tag, (_, way) in TURNS.items():
+        turned_pictures = {name: way(pictures[name]) for name in floor}
         gains = [
             _psnr(renders[name], turned_pictures[name]) - floor[name]
             for name in floor
@@ -419,24 +424,10 @@ def _turned_photos(
             best, turn = _median(gains), tag
     if best < LEAST_GAIN:
         return ""
-    finding = f"with the photos {TURN_NAMES[turn]} they are {best:.1f} dB more so"
+    finding = f"with the photos {TURNS[turn][0]} they are {best:.1f} dB more so"
     if _median([float(headers[name].orientation == turn) for name in floor]) > 0:
         return f"{finding}: cameras are of the photos as their EXIF turns them; save them turned, without the tag"
     return f"{finding}: photos and cameras are turned to each other; take the photos that cameras were made of"
-
-
-def _turn(picture: np.ndarray, way: Image.Transpose) -> np.ndarray:
-    """Turn a picture [H, W, 3] as Pillow does."""
-    flips = {
-        Image.Transpose.FLIP_LEFT_RIGHT: lambda image: image[:, ::-1],
-        Image.Transpose.FLIP_TOP_BOTTOM: lambda image: image[::-1],
-        Image.Transpose.ROTATE_180: lambda image: image[::-1, ::-1],
-        Image.Transpose.TRANSPOSE: lambda image: image.swapaxes(0, 1),
-        Image.Transpose.TRANSVERSE: lambda image: image[::-1, ::-1].swapaxes(0, 1),
-        Image.Transpose.ROTATE_90: np.rot90,
-        Image.Transpose.ROTATE_270: lambda image: np.rot90(image, 3),
-    }
-    return flips[way](picture)
 
 
 def _controls(name: str, pictures: Mapping[str, np.ndarray]) -> list[np.ndarray]:
@@ -499,7 +490,7 @@ def _check_features(
             control = f"{mirrored:.2f} under mirrored ones"
             cause = "masks must be of these photos, upright, whole, not transposed"
             if mirrored >= LEAST_EDGES * edges:
-                cause = f"the masks are {TURN_NAMES[2 if mirrored == flipped[0] else 4]}"
+                cause = f"the masks are {TURNS[2 if mirrored == flipped[0] else 4][0]}"
             wrong.append(f"features: {finding}, {control}: {cause}")
     return figures, wrong
 

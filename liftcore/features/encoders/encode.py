@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, ImageOps
 from torch import Tensor
 
 from liftcore.errors import InvalidFeatures, InvalidInput, reading
@@ -17,7 +17,7 @@ from liftcore.features.encoders import ImageEncoder, Pixels, open_image_encoder
 from liftcore.features.folders import files_below, folders_of, grids_of
 from liftcore.io.cameras import read_cameras
 from liftcore.io.files import check_output, writing
-from liftcore.io.photos import ORIENTATION, UPRIGHT, PhotoHeader, Reading, header_of, open_photo, orientation_warnings
+from liftcore.io.photos import UPRIGHT, PhotoHeader, Reading, header_of, open_photo, orientation_warnings
 from liftcore.runtime.arguments import as_path, as_paths
 from liftcore.runtime.folders import scratch_folder
 from liftcore.runtime.progress import Progress, shown_progress
@@ -29,18 +29,6 @@ from liftcore.values.views import check_finite
 LARGEST_F16 = 65_504.0
 MAX_CELLS = 65_536  # of a grid: attention over more patches needs too much memory
 PAPER = (255, 255, 255)  # the colour behind transparent pixels: white, as in captures without a background
-_TURN = Image.Transpose
-TURNS = {  # by EXIF's orientation
-    2: _TURN.FLIP_LEFT_RIGHT, 3: _TURN.ROTATE_180, 4: _TURN.FLIP_TOP_BOTTOM, 5: _TURN.TRANSPOSE,
-    6: _TURN.ROTATE_270, 7: _TURN.TRANSVERSE, 8: _TURN.ROTATE_90,
-}  # fmt: skip
-BACK = {_TURN.ROTATE_90: _TURN.ROTATE_270, _TURN.ROTATE_270: _TURN.ROTATE_90}  # the others are their own inverse
-_FILTERS = {
-    "bicubic": Image.Resampling.BICUBIC,
-    "bilinear": Image.Resampling.BILINEAR,
-    "lanczos": Image.Resampling.LANCZOS,
-    "nearest": Image.Resampling.NEAREST,
-}
 
 
 def _batches(
@@ -195,8 +183,11 @@ def read_image(path: Path | str, size: tuple[int, int] | None = None) -> tuple[I
     """
     with open_photo(Path(path)) as image:
         header = header_of(image)
+        orientation = _reading(header, size)
+        if image.format == "TIFF" and orientation is Reading.STORED:
+            raise ValueError("a TIFF as it is stored, got one that Pillow turns as its EXIF asks; convert it to PNG")
         image.load()
-        return _colours(_apply_orientation(image, header, size)), _reading(header, size)
+        return _colours(ImageOps.exif_transpose(image) if orientation is Reading.ORIENTED else image), orientation
 
 
 def readings_of(headers: Mapping[str, PhotoHeader], sizes: Mapping[str, tuple[int, int]]) -> dict[str, Reading]:
@@ -208,18 +199,6 @@ def _reading(header: PhotoHeader, size: tuple[int, int] | None) -> Reading:
     if header.orientation == UPRIGHT:
         return Reading.UPRIGHT
     return Reading.ORIENTED if header.turns_for(size) else Reading.STORED
-
-
-def _apply_orientation(image: Image.Image, header: PhotoHeader, size: tuple[int, int] | None) -> Image.Image:
-    """Rotate a loaded image if needed for a camera of this size."""
-    if header.orientation == UPRIGHT:
-        return image
-    # Pillow rotates TIFFs itself when it loads them, and then removes the tag.
-    is_turned = image.getexif().get(ORIENTATION, UPRIGHT) == UPRIGHT
-    if is_turned == header.turns_for(size):
-        return image
-    turn = TURNS[header.orientation]
-    return image.transpose(BACK.get(turn, turn) if is_turned else turn)
 
 
 def _colours(image: Image.Image) -> Image.Image:
@@ -253,6 +232,7 @@ def prepare(image: Image.Image, pixels: Pixels, shorter: int) -> Tensor:
     columns, rows = grid_size(*image.size, shorter, pixels.patch)
     size = (columns * pixels.patch, rows * pixels.patch)
     if size != image.size:
-        image = image.resize(size, _FILTERS.get(pixels.interpolation, Image.Resampling.BICUBIC))
+        resampling = getattr(Image.Resampling, pixels.interpolation.upper(), Image.Resampling.BICUBIC)
+        image = image.resize(size, resampling)
     colours = torch.from_numpy(np.asarray(image, dtype=np.float32) / 255).permute(2, 0, 1)
     return (colours - torch.tensor(pixels.mean)[:, None, None]) / torch.tensor(pixels.std)[:, None, None]
