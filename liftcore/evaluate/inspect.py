@@ -241,7 +241,6 @@ def describe_packs(packs: Views) -> dict[str, Any]:
         "normalised": packs.normalised,
         "sizes": sorted({view.size for view in facts}),
         "map_fit": ", ".join(sorted({fit for view in packs if (fit := packs.fit(view))})),
-        "level_names": list(packs.level_names),
         "codebook_rows": sum(view.rows for view in facts),
         "norms": {"min": low, "max": high},
         "unlabelled": sum(view.unlabelled for view in regions) / len(regions) if regions else 0.0,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack, get_args
@@ -36,7 +35,6 @@ CHOICES = {
     "map_fit": FITS,
     "unannotated": get_args(Unannotated),
 }
-LANGSPLAT_LEVELS = ("default", "s", "m", "l")  # SAM's masks, then subparts, parts and wholes
 NAMES = ("encoder", "text_space")  # of a pack
 
 
@@ -112,8 +110,6 @@ def pack_folder(
         check_output(out, views.inputs, "pack")
         texts = {name: value if isinstance(value, str) else str(value).lower() for name, value in names.items()}
         metadata = {"source": kind} | {name: text for name, text in texts.items() if names[name] is not None}
-        if kind == "langsplat" and len(views[next(iter(views))].labels) == len(LANGSPLAT_LEVELS):
-            metadata["levels"] = json.dumps(LANGSPLAT_LEVELS)
         with writing(out):
             file = as_path(out, "output")
             write_pack(file, views, metadata, reporter, table)

@@ -81,7 +81,6 @@ class Views(Mapping[str, ViewFeatures]):
     paths: tuple[Path, ...] = ()  # of the packs that it reads; () where views come from elsewhere
     _cameras: Mapping[str, Camera] = field(default_factory=dict, repr=False)
     _fit: str = ""  # of all grids, in place of those that are recorded
-    level_names: tuple[str, ...] = ()  # of region maps' levels, in their order; () where the packs name none
 
     @property
     def views(self) -> tuple[str, ...]:
@@ -227,7 +226,7 @@ def read_features(*paths: str | Path) -> Views:
     encoder, text_space = _shared_metadata(packs, "encoder"), _shared_metadata(packs, "text_space")
     table = _table(packs, next(iter(channels)))
     arguments = (encoder, text_space, normalised, sources, table, tuple(pack.path for pack in packs))
-    return Views(next(iter(channels)), *arguments, level_names=_level_names(packs))
+    return Views(next(iter(channels)), *arguments)
 
 
 def pair(views: Views, cameras: Mapping[str, Camera]) -> tuple[Views, list[str]]:
@@ -252,8 +251,8 @@ def write_pack(
     Args:
         path: the file to write.
         views: view name -> what it observes.
-        metadata: ``encoder``, ``text_space``, ``normalised`` ("true" or "false"), ``levels`` (a JSON list of their
-            names) and what else to keep.
+        metadata: ``encoder``, ``text_space``, ``normalised`` ("true" or "false") and what else to
+            keep.
         progress: called in the stages "check" and "pack", in views.
         table: words of the pack's own, of as many channels.
     """
@@ -326,9 +325,16 @@ def _check_channels(views: Iterable[tuple[str, ViewFeatures]]) -> None:
 
 
 def _spooled(pairs: Iterable[tuple[str, ViewFeatures]], scratch: Path | None) -> Views:
+    with callers_modes():
+        rest, end = iter(pairs), object()
+
+    def next_pair() -> Any:
+        with callers_modes():
+            return next(rest, end)
+
     with scratch_folder("splatlift-views-", scratch) as folder:
         files: dict[str, Path] = {}
-        for pair in _in_callers_modes(pairs):
+        for pair in iter(next_pair, end):
             if not (isinstance(pair, tuple | list) and len(pair) == 2):
                 got = type(pair).__name__
                 raise InvalidFeatures("features", expected="pairs of a name and a view", got=got)
@@ -363,19 +369,6 @@ def _composed_names(names: Iterable[Any]) -> dict[str, str]:
             got = f"{name!a} and {originals[composed(name)]!a}, which are one name in other forms of Unicode"
             raise InvalidFeatures("features", expected="each view once", got=got[:200])
     return originals
-
-
-def _in_callers_modes(values: Iterable[Any]) -> Iterator[Any]:
-    """Yield the values, each made as if there were no library around the iterator."""
-    with callers_modes():
-        rest = iter(values)
-    end = object()
-    while True:
-        with callers_modes():
-            value = next(rest, end)
-        if value is end:
-            return
-        yield value
 
 
 @dataclass(frozen=True)
@@ -527,19 +520,6 @@ def _table(packs: Sequence[_PackFile], channels: int) -> TableEncoder | None:
             hint = "write the masks of all views into one pack"
             raise ValueError(f"one table in all packs, got two in {first} and {pack.path}; {hint}")
     return next(iter(tables.values()), None)
-
-
-def _level_names(packs: Sequence[_PackFile]) -> tuple[str, ...]:
-    """Return the names of levels that all packs have; () if they have none, differ, or are no printable texts."""
-    texts = {pack.metadata.get("levels", "") for pack in packs}
-    text = texts.pop() if len(texts) == 1 else ""
-    try:
-        names = json.loads(text) if text else []
-    except (ValueError, RecursionError):
-        return ()
-    # Control characters move a terminal, and no UTF-8 carries half of a surrogate pair.
-    are_texts = isinstance(names, list) and all(isinstance(name, str) and name.isprintable() for name in names)
-    return tuple(names) if are_texts else ()
 
 
 def _shared_metadata(packs: Sequence[_PackFile], key: str) -> str:

@@ -73,20 +73,6 @@ def test_all_types_of_labels_and_floats_mean_the_same(tmp_path: Path) -> None:
         assert view.codebook.dtype == torch.float32 and torch.equal(view.codebook, CODEBOOK)
 
 
-@pytest.mark.parametrize(
-    ("text", "names"),
-    [
-        ('["whole", "Türgriff"]', ("whole", "Türgriff")),
-        ('["whole", 2]', ()),
-        ("[" * 100_000, ()),
-        (r'["\u001b[2J"]', ()),
-    ],
-    ids=["texts", "one is none", "too deep", "a terminal's command"],
-)
-def test_names_of_levels_are_texts_that_print_or_none(text: str, names: tuple[str, ...], tmp_path: Path) -> None:
-    assert read_features(saved(tmp_path / "p", regions(0), levels=text)).level_names == names
-
-
 def test_packs_that_do_not_fit_together_are_refused(tmp_path: Path) -> None:
     clip = saved(tmp_path / "one", regions(0), encoder="clip")
     wide = saved(tmp_path / "wide", {"b/grid": torch.ones(1, 1, 4)})
