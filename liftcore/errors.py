@@ -99,6 +99,17 @@ def reading(source: object, error: type[SplatliftError], expected: str, hint: st
         ) from None
 
 
+@contextmanager
+def naming(source: object) -> Iterator[None]:
+    """Name a file in errors about its content that do not name it."""
+    try:
+        yield
+    except SplatliftError as error:
+        if str(source) not in error.argument:
+            error.argument = f"{source} {error.argument}"
+        raise
+
+
 class InvalidInput(SplatliftError):
     """A file or a value is malformed."""
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from liftcore.errors import InvalidCameras, Unavailable, reading
+from liftcore.errors import InvalidCameras, Unavailable, naming, reading
 from liftcore.io.colmap import MODEL_FILES, has_model, is_whole, model_files, read_colmap, read_image_names
 from liftcore.io.files import BROKEN_ZIP, first_bytes, is_system_file, is_zip, open_regular, open_zip
 from liftcore.io.json_file import FORMATS as JSON_FORMATS
@@ -32,7 +32,6 @@ from liftcore.scene.cameras import (
     Camera,
     Cameras,
     InvalidPose,
-    cameras_from,
     check_count,
     read_views,
     viewmat_of,
@@ -90,13 +89,13 @@ class CameraSource:
             hint = f"remove {source} or {FRAME_FILE}, whichever is of another run"
             raise InvalidCameras(str(self.frame), expected=expected, got=got, hint=hint)
         matrix = read_frame(self.frame, document, source)
-        with cameras_from(str(self.frame)):
+        with naming(self.frame):
             return cameras_in_frame(cameras, matrix)
 
     def _parse(self, document: object, source: str) -> Cameras:
         assert self.file is not None
         photos = PhotosBeside(self.photos or Path(os.path.abspath(self.file)).parent)
-        with cameras_from(source):
+        with naming(source):
             if is_export(document):
                 return parse_export(document, source, read_json(self.data) if self.data else None, photos)
             if isinstance(document, list):

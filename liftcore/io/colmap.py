@@ -10,14 +10,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from liftcore.errors import InvalidCameras, reading
+from liftcore.errors import InvalidCameras, naming, reading
 from liftcore.io.files import refuse_pointer
 from liftcore.scene.cameras import (
     Camera,
     Cameras,
     InvalidPose,
     behind_lens,
-    cameras_from,
     check_count,
     read_views,
 )
@@ -124,7 +123,7 @@ def read_colmap(folder: Path) -> Cameras:
     with _reading(camera_file):
         sensors = dict((_binary_sensors if camera_file.suffix == ".bin" else _text_sensors)(camera_file))
     images = _read_images(image_file)
-    with cameras_from(str(folder)):
+    with naming(folder):
         names = view_names([image.name for image in images])
         files = camera_file, image_file
         pairs = zip(names, images, strict=True)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liftcore.errors import InvalidSplats, reading
+from liftcore.errors import InvalidSplats, naming, reading
 from liftcore.io import ply
 from liftcore.io.files import CONVERT_PLY, whole_file
 from liftcore.io.formats import WRITERS, SplatFormat
@@ -59,7 +59,7 @@ def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool
     """
     path = as_path(path)
     splat_format = format_of(path)
-    with _naming(path):
+    with _reading(path):
         if splat_format.read is None:
             return ply.read_ply(path, kernel, colour=colour)
         if kernel != "auto" and kernel_named(kernel) is Kernel.BETA:
@@ -104,13 +104,15 @@ def write_splats(path: Path | str, splats: Splats, columns: Mapping[str, Any] | 
         for name, values in columns.items():
             with reading(f"columns[{name!r}]"[:80], InvalidSplats, f"numbers [{splats.count}]"):
                 new_columns[str(name)] = _column(name, values, splats.count)
-        layout = (
-            (*splats.layout, *(name for name in new_columns if name not in splats.layout)) if splats.layout else ()
-        )
-        splats = replace(splats, extras={**splats.extras, **new_columns}, layout=layout)
+        splats = _with_columns(splats, new_columns)
     with whole_file(as_path(path)) as handle:
         for block in write(splats, None):
             handle.write(block)
+
+
+def _with_columns(splats: Splats, columns: Mapping[str, Tensor]) -> Splats:
+    layout = tuple(dict.fromkeys((*splats.layout, *columns))) if splats.layout else ()
+    return replace(splats, extras={**splats.extras, **columns}, layout=layout)
 
 
 def _column(name: Any, values: Any, count: int) -> Tensor:
@@ -163,7 +165,7 @@ def read_places(path: Path, kernel: Kernel | str = "auto") -> np.ndarray:
     are not finite become the first finite one.
     """
     splat_format = format_of(path)
-    with _naming(path):
+    with _reading(path):
         read = splat_format.read
         places = read(path, colour=False)["means"] if read else ply.read_places(path)
     if lies_apart(places):
@@ -243,10 +245,8 @@ def labelled(path: Path, labels: Labels, suffix: str = ".ply", mask: np.ndarray 
     if mask is not None:
         splats, labels = splats[mask], labels.subset(mask)
     columns = {name: torch.from_numpy(values) for name, values in labels.columns.items()}
-    layout = (*splats.layout, *(name for name in columns if name not in splats.layout)) if splats.layout else ()
     world = world_of(labels.document["world"]) if "world" in labels.document else splats.world
-    splats = replace(splats, extras={**splats.extras, **columns}, layout=layout, world=world)
-    return write(splats, labels.document)
+    return write(replace(_with_columns(splats, columns), world=world), labels.document)
 
 
 def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
@@ -271,18 +271,13 @@ def _of_count(path: Path, count: int, *, colour: bool = True) -> Splats:
 
 
 def _named(path: Path, blocks: Iterator[bytes]) -> Iterator[bytes]:
-    with _naming(path):
+    with _reading(path):
         yield from blocks
 
 
 @contextmanager
-def _naming(path: Path) -> Iterator[None]:
+def _reading(path: Path) -> Iterator[None]:
     """Name the file in what its reader, or the splats themselves, find wrong."""
-    try:
-        with reading(path, InvalidSplats, EXPECTED, "the file is truncated or damaged: export it again, or as PLY"):
-            yield
-    except InvalidSplats as error:
-        if str(path) in error.argument:
-            raise
-        argument = f"{path} {error.argument}"
-        raise InvalidSplats(argument, expected=error.expected, got=error.got, hint=error.hint) from None
+    hint = "the file is truncated or damaged: export it again, or as PLY"
+    with naming(path), reading(path, InvalidSplats, EXPECTED, hint):
+        yield

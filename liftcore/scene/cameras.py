@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
@@ -433,18 +432,6 @@ def viewmat_of(camera_to_world: np.ndarray, centre: np.ndarray) -> np.ndarray:
     with np.errstate(over="ignore", invalid="ignore"):  # an overflow is not finite, and is refused as such
         pose[:3, 3] = -camera_to_world.T @ centre
     return pose
-
-
-@contextmanager
-def cameras_from(source: str) -> Iterator[None]:
-    """Name the file in errors of its cameras that do not name it."""
-    try:
-        yield
-    except InvalidCameras as error:
-        if source in error.argument:
-            raise
-        argument = f"{source} {error.argument}"
-        raise type(error)(argument, expected=error.expected, got=error.got, hint=error.hint) from None
 
 
 def read_views(
