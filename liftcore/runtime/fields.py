@@ -18,10 +18,11 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from liftcore.errors import SplatliftError
-from liftcore.runtime.arguments import one_of
+from liftcore.runtime.arguments import nearest, one_of
 from liftcore.runtime.one_line import one_line, value_text
 
 NAME_CHARACTERS = 80  # of an invalid name or value, in an error
+NEAREST = 3  # fields that are named where one is unknown
 
 
 def takes(expected: str) -> WrapValidator:
@@ -62,6 +63,7 @@ class Body(PlainModel):
     """The body of a request, or a part of one. An unknown field is an error that lists the known ones."""
 
     model_config = ConfigDict(extra="forbid", defer_build=True)  # help lists fields, and checks none
+    noun: ClassVar[str] = "field"  # of a field, in errors
 
     @model_validator(mode="before")
     @classmethod
@@ -82,22 +84,26 @@ class Body(PlainModel):
         try:
             return handler(values)
         except ValidationError as error:
-            raise _error_of(cls, error, cls.error_type) from None
+            raise _error_of(cls, error, cls.error_type, cls.noun) from None
 
 
-def _error_of(model: type[BaseModel], error: ValidationError, error_type: type[SplatliftError]) -> SplatliftError:
+def _error_of(
+    model: type[BaseModel], error: ValidationError, error_type: type[SplatliftError], noun: str
+) -> SplatliftError:
     """Return the error of the first invalid field, with the values that it may have."""
     first = error.errors(include_url=False)[0]
     context, place = first.get("ctx", {}), [str(part) for part in first["loc"]]
     place = [context["field"]] if first["type"] == "unknown_field" else place
-    got = repr(first["input"])[:NAME_CHARACTERS] if first["type"] != "unknown_field" else "a field that is not there"
+    got, hint = repr(first["input"])[:NAME_CHARACTERS], ""
+    if first["type"] == "unknown_field":
+        got, hint = f"an unknown {noun}", nearest(place[0], model.model_fields, NEAREST)
     expected = context.get("expected") or re.sub(r"^\w+ should (be|have) ", "", first["msg"])
     if first["type"] == "literal_error":
         expected = one_of(re.findall(r"'([^']*)'", expected))
     elif place and place[0] in model.model_fields and first["type"] in ("greater_than_equal", "less_than_equal"):
         low, high = bounds_of(model.model_json_schema()["properties"][place[0]])
         expected = f"{low} to {high}" if None not in (low, high) else expected
-    return error_type(".".join(place) or model.__name__.lower(), expected=expected, got=got)
+    return error_type(".".join(place) or model.__name__.lower(), expected=expected, got=got, hint=hint)
 
 
 def bounds_of(schema: dict[str, Any]) -> tuple[Any, Any]:

@@ -6,15 +6,15 @@ Importing this module loads neither torch nor numba: the service validates reque
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
+from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, model_validator
 
 from liftcore.errors import InvalidSettings
-from liftcore.runtime.arguments import device_name, nearest
-from liftcore.runtime.fields import PlainModel
+from liftcore.runtime.arguments import device_name
+from liftcore.runtime.fields import Body, takes
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.compositing import (
     LARGEST_ALPHA,
@@ -29,9 +29,7 @@ if TYPE_CHECKING:  # it loads torch
 
 TIKHONOV_GAIN = 1.2  # lambda of the paper's Tikhonov Guidance (App. Tikhonov, lambda sweep)
 NO_MASKS = "grids, or maps without a label"
-_MAX_TEXT = 80  # characters of a wrong value in an error
 DIRECTIONS = 256  # no loss with masks; 128 lower the mask IoU by .0025 with few views (docs/results.md)
-NEAREST = 3  # settings that are named where one is unknown
 
 
 class Preset(StrEnum):
@@ -103,10 +101,12 @@ GROUPS = {  # of the settings, for people who read all of them
 }  # fmt: skip
 
 
-class LiftSettings(PlainModel):
+class LiftSettings(Body):
     """All that decides the result of a lift, and where it runs. Knobs left out take the preset's values."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True)
+    error_type: ClassVar = InvalidSettings
+    noun: ClassVar = "setting"
 
     preset: Preset = Field(
         Preset.DEFAULT,
@@ -132,7 +132,7 @@ class LiftSettings(PlainModel):
     transmittance_stop: float = Field(
         1e-4, ge=0, lt=1, description="a ray ends before its transmittance falls to this"
     )
-    antialiased: bool | Literal["auto"] = Field(
+    antialiased: Annotated[bool | Literal["auto"], takes("a valid boolean or 'auto'")] = Field(
         "auto",
         description="true: `alpha~ = sigmoid(gain theta) sqrt(det(cov) / det(cov + low-pass))`, for 3DGS scenes "
         "that were trained so; refused for 2DGS and DBS. `auto`: true if the file's metadata has it, else "
@@ -158,7 +158,9 @@ class LiftSettings(PlainModel):
         description="choose the fewest views from which features are expected to have this mean cosine to those "
         "from all views (before reweighting); for 33 views and more. 0 takes all",
     )
-    levels: Literal["rows"] | Annotated[int, Field(strict=True, ge=0)] = Field(
+    levels: Annotated[
+        Literal["rows"] | Annotated[int, Field(strict=True, ge=0)], takes("'rows' or the number of a level")
+    ] = Field(
         "rows",
         description="levels of a region map: `rows` are those of all, a number is the one to take",
     )
@@ -174,7 +176,7 @@ class LiftSettings(PlainModel):
         description="principal directions of the features in which a robust step compares regions, where channels "
         "are more and regions have many splats each; fewer are faster",
     )
-    objects: bool | Literal["auto"] = Field(
+    objects: Annotated[bool | Literal["auto"], takes("a valid boolean or 'auto'")] = Field(
         "auto",
         description="find objects without words: `auto` where there are masks (with several levels only beside a "
         "robust step), `true` always (region weights of several levels then take twice as long), "
@@ -317,7 +319,7 @@ class LiftSettings(PlainModel):
         Raises:
             InvalidSettings: an unknown name or a value out of range.
         """
-        return cls._build_checked(lambda: cls(**values))
+        return cls(**values)
 
     @classmethod
     def or_default(cls, settings: Self | None) -> Self:
@@ -359,30 +361,7 @@ class LiftSettings(PlainModel):
         normalised = {name: int(value) if _is_whole(value) else value for name, value in values.items()}
         # A lone surrogate cannot be encoded: it becomes "?", which is refused as an unknown value.
         text = json.dumps(normalised, ensure_ascii=False).encode("utf-8", "replace")
-        return cls._build_checked(lambda: cls.model_validate_json(text, strict=True))
-
-    @classmethod
-    def _build_checked(cls, build: Callable[[], Self]) -> Self:
-        """Build and check settings; an error of pydantic becomes an `InvalidSettings`."""
-        try:
-            return build()
-        except ValidationError as error:
-            raise _settings_error(error, cls.model_fields) from None
-
-
-def _settings_error(error: ValidationError, known_names: Iterable[str]) -> InvalidSettings:
-    """Return the error of the first invalid setting, with the values that it may have."""
-    first, *remaining = error.errors()
-    name, branches = "settings", [first]
-    if first["loc"]:
-        name = str(first["loc"][0])[:_MAX_TEXT]
-        branches += [other for other in remaining if other["loc"][:1] == first["loc"][:1]]
-    if first["type"] == "extra_forbidden":
-        names = list(known_names)
-        expected, hint = f"one of {', '.join(names)}", nearest(name, names, NEAREST)
-        return InvalidSettings(name, expected=expected, got="an unknown setting", hint=hint)
-    expected = " or ".join(branch["msg"].removeprefix("Input should be ") for branch in branches)
-    return InvalidSettings(name, expected=expected, got=repr(first["input"])[:_MAX_TEXT])
+        return cls.model_validate_json(text, strict=True)
 
 
 def _is_whole(value: Any) -> bool:
