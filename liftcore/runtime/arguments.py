@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Iterable
-from difflib import SequenceMatcher
+from difflib import get_close_matches
 from itertools import islice
 from numbers import Integral
 from os import PathLike
@@ -91,11 +91,5 @@ def nearest(text: str, names: Iterable[str], count: int) -> str:
     text, cut = text[:_CHARACTERS], [name[:_CHARACTERS] for name in islice(names, _MAX_NAMES)]
     begin = [name for name in cut if text and name.startswith(f"{text} ")]
     limit = _MAX_CHARACTERS // max(1, *map(len, cut), 1)
-    matcher = SequenceMatcher(b=text)
-
-    def likeness(name: str) -> float:
-        matcher.set_seq1(name)
-        return matcher.ratio()
-
-    ranked = sorted(cut[:limit], key=likeness, reverse=True)  # stable: equally near names keep their order
+    ranked = get_close_matches(text, cut[:limit], count, cutoff=0.0)
     return f"nearest: {', '.join(list(dict.fromkeys([*begin, *ranked]))[:count])}"
