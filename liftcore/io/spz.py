@@ -217,29 +217,19 @@ def _streams(content: bytes, table: int, streams: int, sizes: list[int]) -> list
     return sections + [np.empty(0, np.uint8)] * (len(sizes) - len(stream_sizes))
 
 
-def _records(extensions: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield number and payload of each extension; of a truncated one the rest."""
+def _declared_frame(extensions: bytes) -> int:
+    """Return the frame that one of these extensions declares; RUB if none does."""
     at = 0
     while at + 8 <= len(extensions):
         kind, size = struct.unpack_from("<II", extensions, at)
-        yield kind, extensions[at + 8 : at + 8 + size]
-        at += 8 + size
-
-
-def _declared_frame(extensions: bytes) -> int:
-    """Return the frame that one of these extensions declares; RUB if none does."""
-    for kind, payload in _records(extensions):
+        payload = extensions[at + 8 : at + 8 + size]
         if kind == FRAME_EXTENSION and len(payload) == 4:
             (frame,) = struct.unpack("<I", payload)
             if frame > len(FRAMES):
                 raise ValueError(f"one of the {len(FRAMES)} frames of the format, got frame {frame}")
             return frame or RUB
+        at += 8 + size
     return RUB
-
-
-def _signs_to_rdf(frame: int) -> np.ndarray:
-    """Return the signs [3] of a frame's axes that make it RDF: 1 where one points right, down or to the front."""
-    return np.array([1.0 if letter in "RDF" else -1.0 for letter in FRAMES[frame - 1]])
 
 
 def _decode(
@@ -247,8 +237,8 @@ def _decode(
 ) -> Fields:
     means, opacities, colours, scales, quats, harmonics = sections
     count, higher = len(opacities), (degree + 1) ** 2 - 1
-    flips = _signs_to_rdf(frame)
-    x, y, z = flips
+    # 1 where an axis points right, down or to the front, as those of PLYs and cameras
+    x, y, z = flips = np.array([1.0 if letter in "RDF" else -1.0 for letter in FRAMES[frame - 1]])
     signs = {"x": x, "y": y, "z": z}
     sh_signs = np.array([np.prod([signs[axis] for axis in axes]) for axes in SH_AXES[:higher]])
     stored = harmonics.reshape(count, -1, 3)
