@@ -45,7 +45,7 @@ class Geometry:
     def total_weight(self) -> Tensor:
         """Return [P] f32 on the CPU: sums of unweighted A over all views, each ray once."""
         sums = torch.zeros(self.weights.splats.shape[0], dtype=torch.float32)
-        sums[self.weights.total_weight_splats.cpu().long()] = self.weights.total_weight.cpu()
+        sums[self.weights.total_weight_splats.cpu().long()] = self.weights.total_weight.cpu().float()
         return sums
 
 
@@ -95,20 +95,23 @@ def weigh_views(
     by_rows: bool,
     checkpoint: Checkpoint | None = None,
     threads: int | None = None,
+    numbers: range | None = None,
     first: Sequence[int] = (),
     on_first: Callable[[Geometry], None] | None = None,
 ) -> Geometry:
-    """Compute W of all views, and sampled rows of A.
+    """Compute W of views, and sampled rows of A.
 
     Args:
         splats: P. views: in the order of the sums.
         by_rows: True if each region must be a row of a codebook, False if it may be a tuple of labels (`as_regions`).
         checkpoint: the raster's stored answers, to which new ones are added.
+        numbers: of the views; None: all of them.
         first: numbers of the views to begin with. The result is bitwise identical for any.
         on_first: called with the geometry of these views alone, as soon as they are done. An exception from it stops
             the work.
     """
-    order = [*first, *sorted({*range(len(views))} - {*first})]
+    numbers = range(len(views)) if numbers is None else numbers
+    order = [*first, *sorted({*numbers} - {*first})]
     by_number = dict[int, _ViewBlock]()
     waiting = deque[WeightRequest]()
 
@@ -128,10 +131,10 @@ def weigh_views(
             sample = SampledRays(answer.rows, request.readout)
             by_number[number] = _ViewBlock(part, sample, request.codebook, request.levels)
             del answer, part, request  # frees their memory before the raster computes the next one
-            progress("geometry", len(by_number), len(views), "views")
+            progress("geometry", len(by_number), len(numbers), "views")
             if on_first and len(by_number) == len(first):
                 on_first(_stacked_views([by_number[view] for view in first], splats, threads))
-    return _stacked_views([by_number.pop(number) for number in range(len(views))], splats, threads)
+    return _stacked_views([by_number.pop(number) for number in numbers], splats, threads)
 
 
 class _ViewBlock(NamedTuple):

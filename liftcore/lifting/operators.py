@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -183,4 +184,5 @@ def region_weights(
     raster = open_raster(inputs.splats, choose_device(inputs.settings.device), threads)
     arguments = raster, inputs.splats.count, inputs.views, inputs.settings
     with shown_progress(progress) as reporter, one_thread():
-        return weigh_views(*arguments, reporter, by_rows=True, threads=threads).weights.cpu()
+        W = weigh_views(*arguments, reporter, by_rows=True, threads=threads).weights.cpu()
+    return replace(W, total_weight=W.total_weight.float())

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from liftcore.solve.rays import SampledRays
     from liftcore.values.settings import LiftSettings
 
+PIECE_VIEWS = 8  # of a piece of a lift in blocks: some seconds of work, which is what is lost with a worker
 Shape = tuple[int, int]  # of a table of sums
 
 
@@ -212,10 +213,13 @@ def region_offsets(counts: Iterable[int]) -> np.ndarray:
 
 
 def stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None = None) -> RegionWeights:
-    """W of all views, with a row for each of ``splats``, from the W of each; total weight is added up."""
+    """W of all views, with a row for each of ``splats``, from the W of each; total weight is added up, in f64."""
     offsets, total_weight = region_offsets(int(part.offsets[-1]) for part in parts), np.zeros(splats)
-    for part in parts:
-        total_weight[part.total_weight_splats.numpy()] += part.total_weight.numpy()
+    for first in range(0, len(parts), PIECE_VIEWS):  # sums of pieces are added, as in blocks
+        sums = np.zeros(splats)
+        for part in parts[first : first + PIECE_VIEWS]:
+            sums[part.total_weight_splats.numpy()] += part.total_weight.numpy()
+        total_weight += sums
     starts = row_starts((SomeRows(part.splats.numpy(), part.indptr.numpy(), ()) for part in parts), splats)
     region, weight = (values_of(int(starts[-1]), dtype) for dtype in (torch.int32, torch.float32))
 
@@ -240,7 +244,7 @@ def stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None = N
     )
     rows, begins, hits, sums, bases = map(torch.from_numpy, tensors)
     names = tuple(name for part in parts for name in part.views)
-    return RegionWeights(rows, begins, region, weight, hits, sums.float(), bases, names)
+    return RegionWeights(rows, begins, region, weight, hits, sums, bases, names)
 
 
 def take_rows(starts: np.ndarray, rows: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

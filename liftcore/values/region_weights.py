@@ -49,7 +49,7 @@ class RegionWeights:
     total_weight_splats: Tensor
     """[m] i32 ascending, the splats that any ray met, labelled or not"""
     total_weight: Tensor
-    """[m] f32, sum of plain weights w (opacity_logit_scale 1, power 1), each ray once"""
+    """[m] f32, sum of plain weights w (opacity_logit_scale 1, power 1), each ray once; f64 while views are added"""
     offsets: Tensor
     """[V + 1] i64, on the CPU: the first region of each view, and their number"""
     views: tuple[str, ...] = ()

@@ -11,27 +11,25 @@ can see.
 from __future__ import annotations
 
 import os
-from collections import deque
 from collections.abc import Iterable, Iterator
-from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from liftcore.io.safetensors_file import map_tensors, tensor_bytes, write_tensors
-from liftcore.lifting.geometry import WeightRequest, weight_request
-from liftcore.lifting.pieces import Pieces, Shape, SomeRows, gather_rows, part_of, values_of
+from liftcore.lifting.geometry import weigh_views
+from liftcore.lifting.pieces import PIECE_VIEWS, Pieces, Shape, SomeRows, gather_rows, part_of, values_of
 from liftcore.lifting.steps import Saved, row_arrays, saved_as, weights_of
-from liftcore.lifting.warm_up import warm_up_lift
 from liftcore.raster import open_raster
-from liftcore.raster.base import RayRows, ViewWeights
+from liftcore.raster.base import RayRows
 from liftcore.runtime.device import choose_device
 from liftcore.runtime.one_thread import one_thread
+from liftcore.runtime.progress import silent
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
@@ -40,9 +38,7 @@ from liftcore.solve.rays import Readout, SampledRays
 from liftcore.solve.sums import PieceSums, pack_sums, unpack_sums
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.pack import Views, pair, read_features
-from liftcore.values.region_weights import MEMORY_LIMIT, RegionWeights
 
-PIECE_VIEWS = 8  # some seconds of work, which is what is lost with a worker
 ROWS = 1 << 17  # splats of a block: with 512 channels of float16, 128 MiB
 SELECTED = 1 << 22  # splats beyond which a worker loads only those that its views see: 1 GB in the raster
 STEP = 1 << 18  # splats that are tested together for it
@@ -131,7 +127,7 @@ class Job(Pieces):
         return torch.from_file(str(self.features_file), size=size, dtype=self.dtype).view(self.splats, self.channels)
 
     def samples(self) -> list[SampledRays]:
-        return [read_view(self.view_file(number)).sample for number in range(len(self.names))]
+        return [read_view(self.view_file(number))[1] for number in range(len(self.names))]
 
 
 @lru_cache(maxsize=4)
@@ -141,23 +137,13 @@ def _table(path: Path, _version: tuple[int, int]) -> dict[str, np.ndarray]:
 
 @lru_cache(maxsize=1)
 def _codebook(paths: tuple[Path, ...], _version: tuple[int, int]) -> Codebook:
-    return Codebook([read_view(path).codebook for path in paths])
+    return Codebook([read_view(path)[0] for path in paths])
 
 
 def forget_files() -> None:
     """Unmap the files of a lift: the disk frees the space of a deleted file only when nothing maps it."""
     for cache in (_table, _codebook, mapped_scene, packs_at):
         cache.cache_clear()
-
-
-class ViewFiles(NamedTuple):
-    """The file of a view: its codebook and sampled rays; W is in the file of its piece."""
-
-    codebook: ViewCodebook
-    sample: SampledRays
-    levels: np.ndarray  # [M] i8, as `Geometry` has them
-    entries: int  # of its W
-    blind: bool  # True if its rays hit no splat
 
 
 # ---- weighing
@@ -170,34 +156,31 @@ def weigh(job: Job, piece: int, threads: int | None) -> None:
     Raises:
         InvalidFeatures: a view is malformed.
     """
-    if not job.has("weights", piece):
-        _write_weights(job, piece, _weigh_views(job, job.views_of(piece), threads))
-
-
-def _weigh_views(job: Job, numbers: range, threads: int | None) -> list[RegionWeights]:
-    """Write the files of some views, and return their W."""
-    device = choose_device(job.settings.device)
-    packs = packs_at(job.packs, tuple(map(file_version, job.packs)))
+    if job.has("weights", piece):
+        return
+    packs, numbers = packs_at(job.packs, tuple(map(file_version, job.packs))), job.views_of(piece)
     views = LiftViews(job.cameras, pair(packs, job.cameras)[0], job.names, [])
     splats, ids = visible_splats(job, [views.camera(number) for number in numbers], threads)
-    warm_up_lift(job.kernel, device, job.settings)
-    raster = open_raster(splats, device, threads)
-    waiting, parts, in_memory = deque[WeightRequest](), list[RegionWeights](), 0
-
-    def requests():
-        for number in numbers:
-            waiting.append(weight_request(views, number, job.settings, by_rows=job.settings.weighs_rows))
-            yield waiting[-1].request
-
-    with closing(raster.iterate_views(requests())) as answers:
-        for number, view in zip(numbers, answers, strict=True):
-            request = waiting.popleft()
-            W = request.weights(_renumbered(view, ids)).cpu()
-            in_memory += W.nbytes
-            parts.append(W if in_memory <= MEMORY_LIMIT else W.in_files())
-            rows = replace(view.rows, splats=ids[view.rows.splats.long()])
-            _write_view(job.view_file(number), W, request, rows)
-    return parts
+    arguments = open_raster(splats, choose_device(job.settings.device), threads), splats.count, views, job.settings
+    by_rows = job.settings.weighs_rows
+    geometry = weigh_views(*arguments, silent, by_rows=by_rows, threads=threads, numbers=numbers)
+    for number, view, sample in zip(numbers, geometry.codebook.views, geometry.samples, strict=True):
+        rows = replace(sample.rows, splats=ids[sample.rows.splats.long()])
+        _write_view(job.view_file(number), view, replace(sample, rows=rows))
+    W = geometry.weights
+    has_row = torch.nonzero(W.indptr.diff())[:, 0]
+    arrays = {
+        "splats": ids[has_row],
+        "starts": torch.cat([W.indptr[has_row], W.indptr[-1:]]),
+        "region": W.region,
+        "weight": W.weight,
+        "hit_splats": ids[W.total_weight_splats.long()],
+        "total_weight": W.total_weight,
+        "offsets": W.offsets,
+        "levels": geometry.levels,
+        "blind": np.array([name in geometry.blind for name in W.views]),
+    }
+    job.save("weights", piece, arrays)
 
 
 def visible_splats(job: Job, cameras: list[Camera], threads: int | None) -> tuple[Splats, Tensor]:
@@ -261,68 +244,24 @@ def packs_at(paths: tuple[Path, ...], versions: tuple[tuple[int, int], ...]) -> 
     return read_features(*paths)
 
 
-def _renumbered(view: ViewWeights, ids: Tensor) -> ViewWeights:
-    """Replace the numbers of a view's splats by those of the scene."""
-    weights = view.weights
-    numbers = ids.to(weights.device)
-    scene_numbers = {name: numbers[getattr(weights, name).long()] for name in ("splats", "total_weight_splats")}
-    return replace(view, weights=replace(weights, **scene_numbers))
+# A view's file: the codebook and the sampled rays.
 
 
-# A view's file: the codebook, the sampled rays, and the number of entries of its W.
-
-
-def _write_view(path: Path, weights: RegionWeights, request: WeightRequest, rows: RayRows) -> None:
-    readout, tuples = request.readout, request.codebook.tuples
-    tensors = {f"rays/{name}": getattr(rows, name) for name in ("indptr", "splats", "weights")}
+def _write_view(path: Path, view: ViewCodebook, sample: SampledRays) -> None:
+    readout = sample.readout
+    tensors = {f"rays/{name}": getattr(sample.rows, name) for name in ("indptr", "splats", "weights")}
     tensors |= {f"read/{name}": torch.from_numpy(getattr(readout, name)) for name in ("rays", "columns", "shares")}
-    tensors |= {"codebook": request.codebook.rows, "levels": torch.from_numpy(request.levels)}
-    tensors["counts"] = torch.tensor([weights.region.shape[0], weights.total_weight.shape[0]])
-    write_tensors(path, tensors | ({} if tuples is None else {"tuples": tuples}), {})
+    tensors |= {"codebook": view.rows} | ({} if view.tuples is None else {"tuples": view.tuples})
+    write_tensors(path, tensors, {})
 
 
-def read_view(path: Path) -> ViewFiles:
+def read_view(path: Path) -> tuple[ViewCodebook, SampledRays]:
     """Map the file of a view."""
     arrays = map_tensors(path)[0]
     tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
     rows = RayRows(**{name: tensors[f"rays/{name}"] for name in ("indptr", "splats", "weights")})
     readout = Readout(**{name: arrays[f"read/{name}"] for name in ("rays", "columns", "shares")})
-    codebook, sample = ViewCodebook(tensors["codebook"], tensors.get("tuples")), SampledRays(rows, readout)
-    entries, hits = arrays["counts"].tolist()
-    return ViewFiles(codebook, sample, arrays["levels"], entries, blind=not hits)
-
-
-# The file of a piece of views: their W, gathered by splats.
-
-
-def _write_weights(job: Job, piece: int, parts: list[RegionWeights]) -> None:
-    bases = np.cumsum([0, *(int(part.offsets[-1]) for part in parts[:-1])]).astype(np.int32)
-    splats = _union([part.splats for part in parts], job.splats)
-    hit_splats = _union([part.total_weight_splats for part in parts], job.splats)
-
-    def entries() -> Iterator[SomeRows]:
-        for part, base in zip(parts, bases, strict=True):
-            values = part.region.numpy() + base, part.weight.numpy()
-            yield SomeRows(np.searchsorted(splats, part.splats.numpy()), part.indptr.numpy(), values)
-
-    def total_weight() -> Iterator[SomeRows]:
-        for part in parts:
-            rows = np.searchsorted(hit_splats, part.total_weight_splats.numpy())
-            yield SomeRows(rows, np.arange(rows.size + 1), [part.total_weight.numpy()])
-
-    starts, (region, weight) = gather_rows(entries, splats.size, [torch.int32, torch.float32])
-    total_weight_starts, (sums,) = gather_rows(total_weight, hit_splats.size, [torch.float32])
-    arrays = {"splats": splats, "starts": starts, "region": region, "weight": weight}
-    arrays |= {"hit_splats": hit_splats, "hit_starts": total_weight_starts, "total_weight": sums}
-    job.save("weights", piece, arrays)
-
-
-def _union(parts: list[Tensor], count: int) -> np.ndarray:
-    """Return [n] i32 ascending: the splats, of ``count``, that any of the parts has."""
-    present = np.zeros(count, np.bool_)
-    for part in parts:
-        present[part.numpy()] = True
-    return np.flatnonzero(present).astype(np.int32)
+    return ViewCodebook(tensors["codebook"], tensors.get("tuples")), SampledRays(rows, readout)
 
 
 # ---- W of blocks of splats
@@ -338,12 +277,12 @@ def _weight_rows(job: Job, ends: tuple[int, int]) -> Iterator[SomeRows]:
 
 
 def _total_weight(job: Job, ends: tuple[int, int]) -> Tensor:
-    """Sum the total weight of a block [n] f32 over views, in their order."""
+    """Sum the total weight of a block [n] f32 over pieces of views, in their order."""
     sums = np.zeros(ends[1] - ends[0])
     for piece in range(job.view_pieces):
         arrays = job.load("weights", piece)
-        part = part_of(arrays["hit_splats"], arrays["hit_starts"], (arrays["total_weight"],), ends)
-        np.add.at(sums, np.repeat(part.rows, np.diff(part.starts)), part.values[0].astype(np.float64))
+        part = slice(*np.searchsorted(arrays["hit_splats"], ends))
+        sums[arrays["hit_splats"][part] - ends[0]] += arrays["total_weight"][part]
     return torch.from_numpy(sums).float()
 
 

@@ -23,19 +23,17 @@ from liftcore.lifting.algebra import WeightStatistics
 from liftcore.lifting.checkpoint import Checkpoint
 from liftcore.lifting.engines import Engine, LocalEngine
 from liftcore.lifting.engines.blocks import (
-    PIECE_VIEWS,
     ROWS,
     SCENE,
     SELECTED,
     Job,
     forget_files,
     gather,
-    read_view,
     weigh,
     write_scene,
 )
 from liftcore.lifting.inputs import LiftInputs
-from liftcore.lifting.pieces import region_offsets
+from liftcore.lifting.pieces import PIECE_VIEWS, region_offsets
 from liftcore.lifting.planning.plan import Plan, plan_lift
 from liftcore.runtime.device import CPU, Device, choose_device
 from liftcore.runtime.folders import scratch_folder
@@ -225,14 +223,9 @@ def block_folder(
 
 def _share_regions(job: Job, plan: Plan) -> WeightStatistics:
     """Write the numbers of the regions of all views."""
-    counts, levels, blind, entries = list[int](), list[np.ndarray](), list[str](), 0
-    for number, name in enumerate(job.names):
-        view = read_view(job.view_file(number))
-        counts.append(view.codebook.regions)
-        levels.append(view.levels.copy())
-        entries += view.entries
-        if view.blind:
-            blind.append(name)
-    arrays = {"offsets": region_offsets(counts), "levels": np.concatenate(levels)}
-    job.save("regions", None, arrays)
-    return WeightStatistics(plan, arrays["levels"], entries, tuple(blind))
+    pieces = [job.load("weights", piece) for piece in range(job.view_pieces)]
+    levels, blind = (np.concatenate([piece[name] for piece in pieces]) for name in ("levels", "blind"))
+    counts = np.concatenate([np.diff(piece["offsets"]) for piece in pieces])
+    job.save("regions", None, {"offsets": region_offsets(counts), "levels": levels})
+    blind_views = tuple(name for name, is_blind in zip(job.names, blind, strict=True) if is_blind)
+    return WeightStatistics(plan, levels, sum(piece["region"].size for piece in pieces), blind_views)
