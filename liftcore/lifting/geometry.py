@@ -37,11 +37,6 @@ class Geometry:
     blind: tuple[str, ...]  # views whose rays hit no splat
     levels: np.ndarray  # [M] i8, of each region in its view; -1: a cell of a grid, or regions that are tuples
 
-    @property
-    def books(self) -> list[Tensor]:
-        """The codebook E [M, F] of every view."""
-        return [view.rows for view in self.codebook.views]
-
     def total_weight(self) -> Tensor:
         """Return [P] f32 on the CPU: sums of unweighted A over all views, each ray once."""
         sums = torch.zeros(self.weights.splats.shape[0], dtype=torch.float32)
