@@ -236,11 +236,15 @@ class Children:
         return Ending(None, "".join(reasons) or f"its process ended with {ending}", was_killed)
 
     def check(self, order: Message, seconds: float, argument: str) -> Message:
-        """Return the result of an order that a request waits for. After a kill from outside it is sent again."""
+        """Return the result of an order that a request waits for. After a kill from outside it is sent again.
+
+        All tries together have the seconds.
+        """
+        deadline = time.monotonic() + seconds
         ending = self.run(order, seconds, reusable=True)
         for _ in range(TRIES - 1):
-            if ending.was_killed:
-                ending = self.run(order, seconds, reusable=True)
+            if ending.was_killed and (left := deadline - time.monotonic()) > 0:
+                ending = self.run(order, left, reusable=True)
         if ending.last is not None:
             if "fault" in ending.last:
                 raise Fault(ending.last["fault"])

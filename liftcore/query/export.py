@@ -219,5 +219,5 @@ FILES: dict[str, Files] = {  # kind of a source -> the files that are made of it
     "array": {"npy": lambda export: [npy(export.source)]},
 }
 BY_SUFFIX = {  # suffix of a name -> file of sources with several classes
-    **dict.fromkeys((".glb", ".spz", ".usdc", ".usdz"), "labelled"), ".json": "masks",
+    **dict.fromkeys((".glb", ".spz", ".splat", ".usdc", ".usdz"), "labelled"), ".json": "masks",
 }  # fmt: skip

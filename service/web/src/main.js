@@ -426,7 +426,7 @@ async function showWarnings(target) {
 // Describe the scene in the panel of layers.
 function describeScene() {
   const drawn = viewer?.mesh && viewer.count < lift.count ? `${formatCount(viewer.count)} of ${formatCount(lift.count)} splats shown (1 in ${Math.ceil(lift.count / MAX_SPLATS)})` : `${formatCount(lift.count)} splats`;
-  byId("about").textContent = `${drawn} \u00b7 ${lift.channels} channels \u00b7 ${lift.views.length} views lifted`;
+  byId("about").textContent = `${drawn} \u00b7 ${lift.channels} channels \u00b7 ${lift.view_count} views lifted`;
 }
 
 function listenToPointer(canvas, target) {

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from liftcore.cli import main
-from liftcore.errors import InvalidQuery
+from liftcore.errors import InvalidQuery, InvalidSplats
 from liftcore.io.labels import Labels
 from liftcore.io.splats import read_splats
 from liftcore.query.coco import run_lengths
@@ -111,3 +111,11 @@ def test_run_lengths_are_columns_and_begin_with_zeros() -> None:
     mask = np.array([[1, 0], [1, 0], [0, 1]], np.bool_)
     assert run_lengths(mask) == [0, 2, 3, 1] and run_lengths(~mask) == [2, 3, 1]
     assert run_lengths(np.zeros((2, 2), np.bool_)) == [4]
+
+
+@pytest.mark.parametrize("suffix", [".splat", ".spz"])
+def test_a_format_without_labels_is_refused_for_a_tree(tree_scene: Scene, tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"tree{suffix}"
+    with pytest.raises(InvalidSplats, match="which hold labels"):
+        tree_scene.export(path, tree_scene.tree())
+    assert not path.exists()
