@@ -16,7 +16,7 @@ from fastapi.routing import APIRoute
 
 import liftcore
 import service.routes
-from liftcore.values.settings import Preset, Quality
+from liftcore.values.settings import Preset
 
 ROOT = Path(__file__).parents[1]
 
@@ -122,17 +122,6 @@ def table_of_routes() -> str:
     return table(("route", "answer"), *(rows[key] for key in sorted(rows)))
 
 
-def table_of_quality() -> str:
-    """Return the settings that each level of quality sets, beside those of `exact`."""
-    levels = {level.value: liftcore.LiftSettings.of(quality=level).model_dump(mode="json") for level in Quality}
-    exact = levels[Quality.EXACT]
-    names = [
-        name for name in exact if name != "quality" and any(values[name] != exact[name] for values in levels.values())
-    ]
-    rows = ((f"`{level}`", *(f"`{code(values[name])}`" for name in names)) for level, values in levels.items())
-    return table(("`quality`", *(f"`{name}`" for name in names)), *rows)
-
-
 def code(value: Any) -> str:
     """Return a value as people type it after `--set NAME=`."""
     return json.dumps(value).strip('"')
@@ -140,7 +129,6 @@ def code(value: Any) -> str:
 
 TABLES = {
     "settings": table_of_settings,
-    "quality": table_of_quality,
     "fields of a question": table_of_question,
     "public names": table_of_names,
     "routes": table_of_routes,

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import shlex
 
 import pytest
 
+from liftcore import LiftSettings
 from liftcore.cli import build_parser
+from liftcore.values.settings import Quality
 from service.settings import ServiceSettings
 
 from .readme import (
@@ -64,6 +67,17 @@ def test_documented_settings_of_the_service_exist_and_have_that_default() -> Non
         )
     documented = {name.lower() for page in PAGES for name in re.findall(r"SPLATLIFT_([A-Z_]+)", text(page))}
     assert documented - {"key"} <= ServiceSettings.model_fields.keys()
+
+
+def test_documented_levels_of_quality_set_what_the_table_says() -> None:
+    lines = text("docs/results.md").partition("\nquality | ")[2].split("\n\n")[0].splitlines()
+    head, *rows = ([cell.strip("` ") for cell in line.split("|")] for line in lines if "---" not in line)
+    levels = {level.value: LiftSettings.of(quality=level).model_dump(mode="json") for level in Quality}
+    exact = levels["exact"]
+    differing = {name for values in levels.values() for name in values if values[name] != exact[name]}
+    assert set(head) == differing - {"quality"} and len(rows) == len(levels)
+    for level, *cells in rows:
+        assert cells == [json.dumps(levels[level][name]).strip('"') for name in head]
 
 
 def _commands() -> dict[str, argparse.ArgumentParser]:
