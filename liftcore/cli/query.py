@@ -25,7 +25,7 @@ FIELD_OVERRIDES: dict[str, dict[str, Any]] = {  # keywords of options besides th
     },
     "like": {"metavar": "EXAMPLE", "help": "VIEW:x,y, splat:J, object:N or a vector.npy"},
     "unlike": {"metavar": "EXAMPLE", "help": "a negative example, likewise"},
-    "sets": {"metavar": "SET", "help": "object:N or selection:NAME, as they are"},
+    "sets": {"metavar": "SET", "help": "object:N, as it is"},
     "negatives": {
         "flag": "--negative", "nargs": "+", "action": "extend", "metavar": "WORD",
         "help": "negative texts, up to the next option",

@@ -336,7 +336,9 @@ class Presence(Value):
     """Presence of the target in the scene."""
 
     present: bool | None = Field(description="true if the target is in the scene; null if unknown or uncertain")
-    presence: float | None = Field(description="its probability, 0..1, present from 0.5 on; null if unknown")
+    presence: float | None = Field(
+        description="share of its best splats where few other words are nearer, present from .5 on; null if unknown"
+    )
     reason: str = Field(description="one sentence on how it is known whether it is there, or why it is not")
 
 

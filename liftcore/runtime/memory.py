@@ -78,11 +78,11 @@ def lack_of_disk(size: int) -> str:
     return "" if free >= size else f"{free / 2**30:.1f} GiB of disk"
 
 
-def file_system(folder: Path, mounts: Path = MOUNTS) -> str:
+def file_system(folder: Path) -> str:
     """Return the type of a folder's file system as Linux names it; empty if it is unknown."""
     kinds: dict[Path, str] = {}
     with suppress(OSError):
-        for line in mounts.read_text(encoding="utf-8", errors="replace").splitlines():
+        for line in MOUNTS.read_text(encoding="utf-8", errors="replace").splitlines():
             _, place, kind, *_ = line.split(" ")
             kinds[Path(place)] = kind  # the last mount at a place hides earlier ones
     path = folder.resolve()

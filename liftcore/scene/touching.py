@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 REACH = 2.0  # standard deviations to which a splat touches
 
 
-def touching(splats: Splats, rows: np.ndarray, threads: int | None = None) -> np.ndarray:
+def touching(splats: Splats, rows: np.ndarray) -> np.ndarray:
     """Put splats that touch, directly or through others, into one group.
 
     Two splats touch where ``|m_j - m_k| <= 2 (s_j + s_k)``, with s the standard deviation of each along the line
@@ -25,7 +25,6 @@ def touching(splats: Splats, rows: np.ndarray, threads: int | None = None) -> np
 
     Args:
         splats: the scene. rows: [n] i64, the splats to group; the others do not connect.
-        threads: None takes the cores that this process may use. The number changes no bit.
 
     Returns:
         [n] i32, the number of each row's group, from 0 in the order of their first rows.
@@ -33,12 +32,12 @@ def touching(splats: Splats, rows: np.ndarray, threads: int | None = None) -> np
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
-    count, pairs = len(rows), touching_pairs(splats, rows, threads)
+    count, pairs = len(rows), touching_pairs(splats, rows)
     graph = csr_array((np.ones(len(pairs[0]), np.int8), pairs), shape=(count, count))
     return connected_components(graph, directed=True, connection="weak")[1]
 
 
-def touching_pairs(splats: Splats, rows: np.ndarray, threads: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+def touching_pairs(splats: Splats, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return [m] and [m] i32, indices among rows [n] of pairs that touch, each once or twice."""
     if len(rows) < 2:
         return np.zeros(0, np.int32), np.zeros(0, np.int32)
@@ -49,7 +48,7 @@ def touching_pairs(splats: Splats, rows: np.ndarray, threads: int | None = None)
         touch = _touch(shapes[index], shapes[near])
         return np.repeat(index, touch.sum(axis=1)), near[touch]
 
-    index, near = zip(*map_nearest(means, find_touching, threads), strict=True)
+    index, near = zip(*map_nearest(means, find_touching), strict=True)
     return np.concatenate(index), np.concatenate(near)
 
 

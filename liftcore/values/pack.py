@@ -168,9 +168,7 @@ class Views(Mapping[str, ViewFeatures]):
         return source
 
 
-def as_views(
-    views: Mapping[str, ViewFeatures] | Iterable[tuple[str, ViewFeatures]], scratch: Path | None = None
-) -> Views:
+def as_views(views: Mapping[str, ViewFeatures] | Iterable[tuple[str, ViewFeatures]]) -> Views:
     """Convert any views for `lift`: `Views` as they are, a mapping's read lazily, an iterator's from the disk.
 
     An iterator is consumed once, a view at a time: each is written to a file that has no name any more once this
@@ -178,7 +176,6 @@ def as_views(
 
     Args:
         views: `Views`, a mapping of names, which may read its values lazily, or pairs of a name and a value.
-        scratch: the folder for an iterator's views; None: the system's for temporary files.
     """
     if isinstance(views, Views):
         return views
@@ -186,7 +183,7 @@ def as_views(
         got, hint = f"{type(views).__name__} {views!r}"[:80], "read_features(path) opens a feature pack"
         raise InvalidFeatures("features", expected="views by name, or pairs of a name and a view", got=got, hint=hint)
     if not isinstance(views, Mapping):
-        return _spooled(views, scratch)
+        return _spooled(views)
     mapping = cast("Mapping[str, ViewFeatures]", views)
     sources = {name: _MemoryView(mapping, key) for name, key in _composed_names(mapping).items()}
     if not sources:
@@ -324,7 +321,7 @@ def _check_channels(views: Iterable[tuple[str, ViewFeatures]]) -> None:
         raise InvalidFeatures("features", expected="the same channels in every view", got=got)
 
 
-def _spooled(pairs: Iterable[tuple[str, ViewFeatures]], scratch: Path | None) -> Views:
+def _spooled(pairs: Iterable[tuple[str, ViewFeatures]]) -> Views:
     with callers_modes():
         rest, end = iter(pairs), object()
 
@@ -332,7 +329,7 @@ def _spooled(pairs: Iterable[tuple[str, ViewFeatures]], scratch: Path | None) ->
         with callers_modes():
             return next(rest, end)
 
-    with scratch_folder("splatlift-views-", scratch) as folder:
+    with scratch_folder("splatlift-views-") as folder:
         files: dict[str, Path] = {}
         for pair in iter(next_pair, end):
             if not (isinstance(pair, tuple | list) and len(pair) == 2):
