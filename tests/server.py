@@ -144,7 +144,7 @@ class Server:
         self.data.parent.mkdir(parents=True, exist_ok=True)
         with self.log.open("ab") as stderr:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "service", "--port", "0"],
+                [sys.executable, "-m", "liftcore.cli", "serve", "--port", "0"],
                 stdout=subprocess.PIPE, stderr=stderr, text=True, cwd=ROOT, env=environment,
             )  # fmt: skip
         assert self._process.stdout is not None

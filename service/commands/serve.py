@@ -1,4 +1,4 @@
-"""``splatlift serve`` and ``python -m service``: run the service on this machine."""
+"""``splatlift serve``: run the service on this machine."""
 
 from __future__ import annotations
 
