@@ -390,7 +390,7 @@ def _select(
     selected = row_mask if scene.distinct is scene else scene.has_feature & scene.features.of_splats(row_mask)
     if competitors is None:
         return threshold, selected
-    parts = part_nodes(scene, competitors)
+    (parts,) = part_nodes(scene, [competitors])
     if parts:
         selected = scene.has_feature & np.logical_or.reduce([scene.members(node) for node in parts])
         addition = f"levels differ in meaning, so the named parts are selected: {', '.join(map(str, parts))}"

@@ -206,8 +206,9 @@ def _parts(scene: Scene, unit: np.ndarray, references: References | str | None) 
     """Return the nodes of parts that each of some words [n, F] f32 names, [n, N] bool."""
     mask = np.zeros((len(unit), 0 if scene.node_parents is None else len(scene.node_parents)), np.bool_)
     if isinstance(references, References) and levels_disagree(scene):
-        for row, word in enumerate(unit):
-            mask[row, part_nodes(scene, CompetingWords.among(references, word[None]))] = True
+        queries = (CompetingWords.among(references, word[None]) for word in unit)
+        for row, nodes in enumerate(part_nodes(scene, queries)):
+            mask[row, nodes] = True
     return mask
 
 

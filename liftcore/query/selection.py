@@ -25,6 +25,7 @@ Then the objects of the region graph (`liftcore.solve.objects`) correct the sele
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -203,8 +204,8 @@ def levels_disagree(scene: Scene) -> bool:
     return level_agreement is not None and level_agreement < LEVELS_AGREE
 
 
-def part_nodes(scene: Scene, competitors: CompetingWords) -> list[int]:
-    """Return the parts that a query's words name, in a lift whose levels differ in meaning; [] if levels agree.
+def part_nodes(scene: Scene, queries: Iterable[CompetingWords]) -> Iterator[list[int]]:
+    """Yield the parts that each query's words name, in a lift whose levels differ in meaning; [] if levels agree.
 
     A splat's feature is the sum over all levels, so that words of parts also match their wholes. A node has the
     features of its own masks alone. So the nearest node is taken, or the largest node above it of the same meaning,
@@ -212,12 +213,13 @@ def part_nodes(scene: Scene, competitors: CompetingWords) -> list[int]:
     more than halfway from that whole to that part have the same name.
     """
     nodes = _NodeMeanings.of(scene)
-    if nodes is None:
-        return []
-    scores = (nodes.vectors @ competitors.directions.T).max(axis=1)
-    return nodes.select_parts(
-        scores, competitors.count_nearer_means(scene, nodes.vectors) <= competitors.nearer_limit
-    )
+    for competitors in queries:
+        if nodes is None:
+            yield []
+            continue
+        scores = (nodes.vectors @ competitors.directions.T).max(axis=1)
+        nearer = competitors.count_nearer_means(scene, nodes.vectors)
+        yield nodes.select_parts(scores, nearer <= competitors.nearer_limit)
 
 
 @dataclass(frozen=True)

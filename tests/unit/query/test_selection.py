@@ -194,5 +194,5 @@ def test_word_of_a_part_takes_its_node_where_levels_disagree(
     assert ("the named parts are selected" in answer.threshold.explanation) == by_node
     assert np.flatnonzero(ask(subject, "mug", table).selected)[[0, -1]].tolist() == [0, 299]
     references = References(tuple(table.words), table.embeddings)
-    parts = [part_nodes(subject, CompetingWords.among(references, word[None])) for word in table.embeddings]
+    parts = list(part_nodes(subject, (CompetingWords.among(references, word[None]) for word in table.embeddings)))
     assert any(parts) == by_node
