@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import sys
 from contextlib import contextmanager
+from importlib import import_module
 from threading import Lock, Thread
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -55,7 +56,8 @@ def one_thread() -> Iterator[None]:
 
     Threads that start within also have one torch thread, for their lifetime.
     """
-    torch = sys.modules.get("torch")  # queries do without it, and it takes a second to load
+    # Queries do without torch, which takes a second to load. Where another thread is loading it, this waits for that.
+    torch = import_module("torch") if "torch" in sys.modules else None
     with _lock:
         threads = _enter(torch)
     try:
