@@ -62,7 +62,7 @@ from liftcore.query.threshold import explain_no_selection, find_threshold, has_o
 from liftcore.runtime.one_thread import one_thread
 from liftcore.text import TextEncoder
 from liftcore.text.phrases import PartPhrase
-from liftcore.text.wording import Wording, base_of, members_of, normalize_text
+from liftcore.text.wording import SUGGESTED, Wording, base_of, members_of, normalize_text
 
 MOST_RIVALS = 3  # competing words in an answer
 LEAST_RIVAL = 0.1  # least share of the selected total weight to which such a word is the nearest
@@ -333,11 +333,12 @@ def _without_word(phrase: PartPhrase, parts: int) -> str:
 
 def _of_kind(scene: Scene, request: ResolvedQuery) -> tuple[str, ...]:
     """Return the words of the scene's objects that are of a kind that a text names, such as "penguin" for "bird"."""
-    members = frozenset[str]().union(*(members_of(wording.word) for wording in request.asked_as.values()))
+    positives = (request.asked_as.get(place) for place in range(len(request.query.positives)))
+    members = frozenset[str]().union(*(members_of(wording.word) for wording in positives if wording))
     if not members or isinstance(request.references, str):
         return ()
     words = object_words(scene, request.references.words, request.references.vectors)
-    return tuple(word for word in words if base_of(word) in members)
+    return tuple(word for word in words if base_of(word) in members)[:SUGGESTED]
 
 
 def _nearer_words(

@@ -81,6 +81,8 @@ def test_a_kind_that_is_not_there_names_its_members_that_are(kind: str, members:
     assert answer.present is False and not answer.count
     assert not members or answer.rivals == members
     assert ("Of its kind in this scene: " + ", ".join(map(repr, members)) in answer.reason) is bool(members)
+    unwanted = scene.ask(lc.Query(text=["sofa"], negatives=[kind]), encoder="lvis", places=False)
+    assert unwanted.present is False and "Of its kind" not in unwanted.reason
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1, 0.25])
