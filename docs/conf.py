@@ -5,17 +5,12 @@ site has one of `TABLES`.
 """
 
 import json
-import pkgutil
 import re
 import tomllib
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from fastapi.routing import APIRoute
-
 import liftcore
-import service.routes
 from liftcore.values.settings import Preset
 
 ROOT = Path(__file__).parents[1]
@@ -39,7 +34,6 @@ suppress_warnings = ["ref.python"]  # a value that several public modules offer 
 
 
 NAMES = "(all names of liftcore)"  # in reference.rst: autodoc does not see what is loaded at first use
-PUBLIC_MODULES = ("cli", "errors", "evaluate", "files", "models", "text", "text.table")
 
 
 def list_names() -> str:
@@ -77,51 +71,6 @@ def table_of_settings() -> str:
     )
 
 
-def table_of_question() -> str:
-    """Return each field of `Query` with its default and its meaning."""
-    fields = liftcore.Query.model_fields
-    rows = (
-        (f"`{name}`", "none" if field.default in (None, []) else f"`{field.default}`", field.description or "")
-        for name, field in fields.items()
-    )
-    return table(("field of `Query`", "default", "meaning"), *rows)
-
-
-def table_of_names() -> str:
-    """Return each public module with the first line of its docstring and its names."""
-    modules = [import_module(name) for name in ("liftcore", *(f"liftcore.{module}" for module in PUBLIC_MODULES))]
-    rows = (
-        (
-            f"`{module.__name__}`",
-            (module.__doc__ or "").splitlines()[0].removeprefix("Public: ").rstrip(":.").replace("``", "`"),
-            ", ".join(f"`{name}`" for name in sorted(module.__all__)),
-        )
-        for module in modules
-    )
-    return table(("module", "for", "names"), *rows)
-
-
-def table_of_routes() -> str:
-    """Return each route of the service with the first sentences of its docstring."""
-    modules = [
-        import_module(f"service.routes.{module.name}") for module in pkgutil.iter_modules(service.routes.__path__)
-    ]
-    routers = {id(router): router for module in modules if (router := getattr(module, "router", None))}
-    rows = {
-        (route.path, method): (
-            f"`{method} {route.path}`",
-            " ".join((route.description or "").split("\n\n")[0].split()),
-        )
-        for router in routers.values()
-        for route in router.routes
-        if isinstance(route, APIRoute)
-        and route.description
-        and not route.path.startswith(("/openapi", "/docs", "/web"))
-        for method in route.methods or ()
-    }
-    return table(("route", "answer"), *(rows[key] for key in sorted(rows)))
-
-
 def code(value: Any) -> str:
     """Return a value as people type it after `--set NAME=`."""
     return json.dumps(value).strip('"')
@@ -129,9 +78,6 @@ def code(value: Any) -> str:
 
 TABLES = {
     "settings": table_of_settings,
-    "fields of a question": table_of_question,
-    "public names": table_of_names,
-    "routes": table_of_routes,
 }
 
 

@@ -39,7 +39,7 @@ def test_links_lead_to_files_and_headings(document: str) -> None:
 
 def test_commands_of_the_guide_parse() -> None:
     commands = [shlex.split(command) for page in FOR_USERS for command in shell_commands(page)]
-    assert {"pack", "lift", "query", "serve", "keys", "tradeoff"} <= {command[0] for command in commands}
+    assert {"pack", "lift", "query", "serve", "keys"} <= {command[0] for command in commands}
     for command in commands:
         assert build_parser().parse_args(command).command == command[0]
 
