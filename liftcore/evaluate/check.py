@@ -36,7 +36,7 @@ from liftcore.lifting.planning.contradictions import (
     empty,
     unseen,
 )
-from liftcore.lifting.planning.views import visibility
+from liftcore.lifting.planning.views import evenly_spaced, visibility
 from liftcore.query.splat_colours import view_colours
 from liftcore.raster import open_raster
 from liftcore.raster.base import Raster
@@ -225,12 +225,6 @@ def _paired_photos(
         )
         notes += [f"photos: {len(unpaired)} have no camera: {first_names(unpaired)}"] if unpaired else []
     return files
-
-
-def evenly_spaced(names: Sequence[str], count: int) -> list[str]:
-    """Select ``count`` names, evenly spread."""
-    indices = np.linspace(0, len(names) - 1, min(count, len(names))).round()
-    return [names[int(index)] for index in indices]
 
 
 def _render(
