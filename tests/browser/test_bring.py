@@ -14,8 +14,7 @@ from PIL import Image
 from liftcore.io.cameras import read_cameras
 from liftcore.io.splats import read_splats
 from tests.inria_file import write_inria_cameras
-from tests.still_life import write_still_life
-from tests.tiny_scene import colmap_zip, make_scene
+from tests.tiny_scene import DISTANCE, colmap_zip, make_scene
 
 from .browser import PATIENCE_SECONDS, Browser
 from .conftest import PageServer, serving
@@ -159,37 +158,30 @@ def test_lift_takes_a_name_and_photos(browser: Browser, server: PageServer, tmp_
     assert browser.value("document.querySelector('#over').hidden") is True
 
 
-def test_strangers_files_become_an_object_that_lights_up(browser: Browser, tmp_path: Path) -> None:
-    """The whole way: files are dropped, a lift runs, a phrase lights up the object in 3D, and all is deleted."""
-    scene, page = tmp_path / "still-life", browser
-    write_still_life(scene)
-    with serving(tmp_path / "data", encoder=f"table:{scene}/text_table.safetensors") as address:
-        page.window(1280, 800)
-        page.open(address)
-        page.until("globalThis.splatlift && !document.querySelector('#empty').hidden")
-        (tmp_path / "broken.ply").write_bytes((scene / "point_cloud.ply").read_bytes()[:-40])
-        page.choose_files("#files", [tmp_path / "broken.ply", scene / "cameras.json"])
-        page.until("document.querySelector('.file.bad')")
-        assert "broken.ply" in text_of(page, ".file.bad .name")
-        assert "expected" in text_of(page, ".file.bad .state") and "got" in text_of(page, ".file.bad .state")
-        assert page.value("document.querySelector('#lift-it').disabled") is True
-        page.press(".file.bad .away")
-        page.drop([scene / "point_cloud.ply", scene / "features.safetensors"])
-        page.until("!document.querySelector('#lift-it').disabled")
-        assert "views" in text_of(page, "#sent")
-        page.press("#lift-it")
-        page.until("globalThis.splatlift.lift || document.querySelector('#jobs .failed')", LONG)
-        assert page.value("document.querySelector('#jobs .failed')") is None
-        page.until(READY)
-        ask(page, "mug")
-        lit_columns = columns(page, AMBER)
-        assert len(lit_columns) > 2000 and page.value("splatlift.query.current.objects.length") >= 1
-        low, high = page.value("(({low, high}) => [low, high])(splatlift.query.current.objects[0].box)")
-        assert low[0] < -2.7 < high[0] and low[1] < -1.5 < high[1]  # where the mug stands
-        page.press("#tab-bring")
-        page.until("document.querySelector('#jobs .succeeded')")
-        page.value("splatlift.uploads.refresh()")
-        page.press("#jobs button.danger")  # and away with it
-        page.press("#jobs button.danger")
-        page.until("!document.querySelector('#empty').hidden")
-        page.open("about:blank")
+def test_strangers_files_become_an_object_that_lights_up(
+    empty: Browser, files: dict[str, Path], tmp_path: Path
+) -> None:
+    """The whole way: files are chosen and dropped, a lift runs, a phrase lights up the object, and all is deleted."""
+    (tmp_path / "broken.ply").write_bytes(files["splats"].read_bytes()[:-40])
+    empty.choose_files("#files", [tmp_path / "broken.ply", files["cameras"]])
+    empty.until("document.querySelector('.file.bad')")
+    assert "broken.ply" in text_of(empty, ".file.bad .name")
+    assert "expected" in text_of(empty, ".file.bad .state") and "got" in text_of(empty, ".file.bad .state")
+    assert empty.value("document.querySelector('#lift-it').disabled") is True
+    empty.press(".file.bad .away")
+    empty.drop([files["splats"], files["features"]])
+    empty.until("!document.querySelector('#lift-it').disabled")
+    empty.press("#lift-it")
+    empty.until("splatlift.lift || document.querySelector('#jobs .failed')", LONG)
+    assert empty.value("document.querySelector('#jobs .failed')") is None
+    empty.until(READY)
+    ask(empty, "lamp")
+    assert min(columns(empty, AMBER)) > 50
+    low, high = empty.value("(({low, high}) => [low, high])(splatlift.query.current.objects[0].box)")
+    assert low[0] < 1.2 < high[0] and low[2] < -DISTANCE < high[2]  # where the lamp stands
+    empty.press("#tab-bring")
+    empty.until("document.querySelector('#jobs .succeeded')")
+    empty.value("splatlift.uploads.refresh()")
+    empty.press("#jobs button.danger")  # and away with it
+    empty.press("#jobs button.danger")
+    empty.until("!document.querySelector('#empty').hidden")
