@@ -88,7 +88,6 @@ def run_plan(options: argparse.Namespace) -> int:
     plan = plan_files(options.splats, options.cameras, options.features, settings, threads=options.threads)
     document = {
         **plan.facts(),
-        "seconds": plan.seconds,
         "device": {"kind": plan.device.kind, "name": plan.device.name},
         "views": {"lifted": list(plan.views), "left_out": list(plan.left_out)},
         "warnings": list(plan.warnings),
@@ -140,8 +139,6 @@ def plan_lines(plan: Plan) -> Iterable[str]:
     head, *rest = plan.summary()
     yield f"plan: {head}"
     yield from (f"  {line}" for line in rest)
-    if plan.seconds is not None:
-        yield f"  about {max(plan.seconds, 1):.0f} s to rasterize the views on this machine"
     yield from (f"warning: {warning}" for warning in plan.warnings)
     if not plan.warnings:
         yield "  healthy: no contradictions between the inputs"

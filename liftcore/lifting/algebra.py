@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 class WeightStatistics:
     """Facts about W before any reweighting."""
 
-    plan: Plan  # with the warnings and the time that the first views gave
+    plan: Plan  # with the warnings that the first views gave
     levels: np.ndarray  # [M] i8, of each region in its view; -1: a cell of a grid, or regions that are tuples
     entries: int  # of W
     blind: tuple[str, ...]  # views whose rays hit no splat

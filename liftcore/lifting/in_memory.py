@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -13,7 +12,7 @@ from liftcore.lifting.algebra import WeightStatistics
 from liftcore.lifting.geometry import Geometry, weigh_views
 from liftcore.lifting.pieces import Pieces
 from liftcore.lifting.planning.contradictions import contradictions, probe_views
-from liftcore.lifting.planning.plan import TIMED_VIEWS, Plan
+from liftcore.lifting.planning.plan import Plan
 from liftcore.lifting.steps import row_arrays
 from liftcore.raster import open_raster
 from liftcore.runtime.one_thread import one_thread
@@ -63,16 +62,12 @@ def weigh_in_memory(
     """Compute W of the plan's views; call ``on_plan`` once, as soon as contradictions of the inputs are known."""
     splats, views, settings = inputs.splats, inputs.views, inputs.settings
     raster = open_raster(splats, plan.device, threads)
-    first, begin = probe_views(len(views)), time.perf_counter()
-    plans = [plan]
+    first, plans = probe_views(len(views)), [plan]
 
     def check_first(geometry: Geometry) -> None:
-        seconds = time.perf_counter() - begin
         if views.features.paths:
             warnings = contradictions(raster, views, settings, plan.seen_share, geometry)
             plans.append(replace(plan, input_warnings=(*plan.input_warnings, *warnings)))
-        if len(views) >= TIMED_VIEWS:
-            plans.append(replace(plans[-1], seconds=seconds * len(views) / len(first)))
         on_plan(plans[-1])
 
     geometry = weigh_views(

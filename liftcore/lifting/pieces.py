@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from liftcore.values.settings import LiftSettings
 
 PIECE_VIEWS = 8  # of a piece of a lift in blocks: some seconds of work, which is what is lost with a worker
+ROWS = 1 << 17  # splats of a block: with 512 channels of float16, 128 MiB
+SELECTED = 1 << 22  # splats beyond which a worker loads only those that its views see: 1 GB in the raster
 Shape = tuple[int, int]  # of a table of sums
 
 

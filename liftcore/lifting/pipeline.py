@@ -16,7 +16,7 @@ from liftcore.errors import InvalidSettings
 from liftcore.lifting.algebra import Algebra, SplatSupport, WeightStatistics
 from liftcore.lifting.checkpoint import Checkpoint
 from liftcore.lifting.engines import Engine, LocalEngine
-from liftcore.lifting.engines.lift import BlockFolder, block_folder, plan_of_a_worker
+from liftcore.lifting.engines.lift import BlockFolder, block_folder
 from liftcore.lifting.geometry import strided
 from liftcore.lifting.in_memory import weigh_in_memory
 from liftcore.lifting.inputs import LiftInputs
@@ -108,7 +108,7 @@ def lift(
         if engine is None:
             result = run(inputs, timings, show_plan, threads, checkpoint)
         else:
-            with block_folder(engine, inputs.settings, checkpoint.folder if checkpoint else None) as blocks:
+            with block_folder(engine, checkpoint.folder if checkpoint else None) as blocks:
                 result = run(inputs, timings, show_plan, threads, blocks=blocks)
     log_once(result.diagnostics["warnings"] if on_plan is None else ())
     return result
@@ -285,10 +285,7 @@ def plan(
     """
     inputs = LiftInputs.of(splats, cameras, views, preset, settings, threads)
     device = choose_device(inputs.settings.device)
-    lift_plan = plan_lift(
-        inputs.splats, inputs.views, inputs.settings, device, threads, in_workers=in_blocks, probe=True
-    )
-    return plan_of_a_worker(lift_plan) if in_blocks else lift_plan
+    return plan_lift(inputs.splats, inputs.views, inputs.settings, device, threads, in_blocks=in_blocks, probe=True)
 
 
 class WarningLog:

@@ -69,12 +69,16 @@ def check_disk(size: int, name: str) -> None:
         raise _no_disk(size, name, got)
 
 
-def lack_of_disk(size: int) -> str:
-    """Describe what the temporary folder has instead of ``size`` free bytes on a disk; empty if they are free."""
-    folder = Path(tempfile.gettempdir())
-    if file_system(folder) in IN_MEMORY:
+def lack_of_disk(size: int, folder: Path | None = None) -> str:
+    """Describe what a folder has instead of ``size`` free bytes on a disk; empty if they are free.
+
+    Args:
+        folder: None: the temporary folder, which may lie in memory.
+    """
+    place = folder or Path(tempfile.gettempdir())
+    if folder is None and file_system(place) in IN_MEMORY:
         return "a temporary folder in memory"
-    free = shutil.disk_usage(folder).free
+    free = shutil.disk_usage(place).free
     return "" if free >= size else f"{free / 2**30:.1f} GiB of disk"
 
 

@@ -215,14 +215,14 @@ class LiftSettings(Body):
         description="strength of the smoothing over splats that are near in place and in colour: 0 is off, 4 helps "
         "grids and few views of masks. A large number loses accuracy where features vary within an object; "
         "`splatlift tradeoff` tries it on held-out views. "
-        "It runs on the CPU, also with `device=cuda`. Refused with an `engine`",
+        "It runs on the CPU, also with `device=cuda`",
     )
     reference_channels: int = Field(
         0,
         ge=0,
         le=1_024,
         description="compare the lift with the least-squares optimum in the diagnostics, in this many random "
-        "projections of the channels: 12 bytes of memory for each splat on a ray. Refused with an `engine`",
+        "projections of the channels: 12 bytes of memory for each splat on a ray",
     )
     kernel: Literal["auto", "3dgs", "2dgs", "dbs"] = Field(
         "auto",
@@ -288,24 +288,6 @@ class LiftSettings(Body):
             expected = "views with masks: objects are what masks of several views keep together"
             raise InvalidSettings("objects", expected=expected, got=NO_MASKS, hint="take auto")
         return masks and bool(self.objects)
-
-    def check_blocks(self) -> None:
-        """Refuse what no engine can work on in blocks of views and splats.
-
-        Raises:
-            InvalidSettings: the optimum, smoothness, or an aggregation.
-        """
-        whole = ("reference_channels", "smoothness", "aggregation")
-        requested = {name: getattr(self, name) for name in whole if getattr(self, name)}
-        if requested:
-            changes = (f"{name}={'false' if value is True else 0}" for name, value in requested.items())
-            raise InvalidSettings(
-                "engine",
-                expected="settings that work on blocks of splats: the optimum needs all rays, smoothness and "
-                "clusters all features in one place",
-                got=", ".join(f"{name}={value}" for name, value in requested.items()),
-                hint=f"set {' and '.join(changes)}; or lift without an engine",
-            )
 
     @staticmethod
     def groups() -> Mapping[str, tuple[str, ...]]:

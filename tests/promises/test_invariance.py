@@ -23,8 +23,8 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "fast": {"quality": "fast"},
     "smooth": {"preset": "row-sum", "smoothness": 0.5},
     "clusters": {"preset": "row-sum", "aggregation": True, "aggregation_cluster_size": 5},
+    "optimum": {"preset": "row-sum", "reference_channels": 2},
 }
-WHOLE_SCENE = {"smooth", "clusters"}  # they need all splats in one place: an engine refuses them
 GRIDS = {"row-sum", "default", "smooth"}
 
 
@@ -71,8 +71,7 @@ def test_threads_engines_and_resumption_change_no_bit(name: str, regions: Random
     settings = SETTINGS[name]
     expected = lift(regions, threads=1, **settings)
     assert lift(regions, threads=3, **settings) == expected
-    if name not in WHOLE_SCENE:
-        assert lift(regions, engine=ShuffledEngine(2), **settings) == expected
+    assert lift(regions, engine=ShuffledEngine(2), **settings) == expected
     for stage in ("geometry", "solve"):
         with pytest.raises(Interruption):
             lift(regions, interrupt_at(stage), checkpoint=tmp_path, **settings)

@@ -103,7 +103,7 @@ ROWS: list[Row] = [
       )),
     (lc.lift, LIFT | {"progress": "bar"}, T, "progress"),
     (lc.lift, LIFT | {"on_plan": 3}, T, "on_plan"),
-    (lc.lift, LIFT | {"smoothness": 1, "engine": lc.LocalEngine(1)}, T, "engine"),
+    (lc.lift, LIFT | {"engine": "local"}, T, "engine"),
     (lc.LiftSettings.of, {"no_setting": 1}, T, "no_setting"),
     (lc.LiftSettings.of, {"diagnostic_rays": 5_000_000}, T, "diagnostic_rays"),
     (lc.LocalEngine, {"threads": 0}, T, "threads"),

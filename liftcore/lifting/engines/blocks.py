@@ -23,7 +23,7 @@ from torch import Tensor
 
 from liftcore.io.safetensors_file import map_tensors, tensor_bytes, write_tensors
 from liftcore.lifting.geometry import weigh_views
-from liftcore.lifting.pieces import PIECE_VIEWS, Pieces, Shape, SomeRows, gather_rows, part_of, values_of
+from liftcore.lifting.pieces import PIECE_VIEWS, SELECTED, Pieces, Shape, SomeRows, gather_rows, part_of, values_of
 from liftcore.lifting.steps import Saved, row_arrays, saved_as, weights_of
 from liftcore.raster import open_raster
 from liftcore.raster.base import RayRows
@@ -39,8 +39,6 @@ from liftcore.solve.sums import PieceSums, pack_sums, unpack_sums
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.pack import Views, pair, read_features
 
-ROWS = 1 << 17  # splats of a block: with 512 channels of float16, 128 MiB
-SELECTED = 1 << 22  # splats beyond which a worker loads only those that its views see: 1 GB in the raster
 STEP = 1 << 18  # splats that are tested together for it
 SCENE = "scene.safetensors"
 

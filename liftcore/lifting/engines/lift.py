@@ -23,9 +23,7 @@ from liftcore.lifting.algebra import WeightStatistics
 from liftcore.lifting.checkpoint import Checkpoint
 from liftcore.lifting.engines import Engine, LocalEngine
 from liftcore.lifting.engines.blocks import (
-    ROWS,
     SCENE,
-    SELECTED,
     Job,
     forget_files,
     gather,
@@ -33,7 +31,7 @@ from liftcore.lifting.engines.blocks import (
     write_scene,
 )
 from liftcore.lifting.inputs import LiftInputs
-from liftcore.lifting.pieces import PIECE_VIEWS, region_offsets
+from liftcore.lifting.pieces import PIECE_VIEWS, ROWS, SELECTED, region_offsets
 from liftcore.lifting.planning.plan import Plan, plan_lift
 from liftcore.runtime.device import CPU, Device, choose_device
 from liftcore.runtime.folders import scratch_folder
@@ -41,25 +39,10 @@ from liftcore.runtime.progress import Timings
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
 from liftcore.values.pack import NO_ROOM, Views, write_pack
-from liftcore.values.region_weights import MEMORY_LIMIT
-from liftcore.values.settings import LiftSettings
 
 PACKED = 64  # views of a pack
 PIECES = re.compile("blocks-[0-9a-f]{64}")  # the folder of the pieces of one lift
 PACKAGES = ("lifting", "raster", "scene", "solve", "values")  # whose code computes pieces
-
-
-def plan_of_a_worker(plan: Plan) -> Plan:
-    """Replace the memory of a plan by the estimate for one worker: bytes of each part at its peak."""
-    splats, views = min(1.0, ROWS / plan.splats), min(1.0, PIECE_VIEWS / len(plan.views))
-    splat_share = min(1.0, max(SELECTED, plan.splats_a_view) / plan.splats)
-    shares = {"splats": splat_share, "features": splats, "steps": max(views, splats)}
-    weights = {share: min(int(share * plan.weight_bytes), MEMORY_LIMIT) for share in (views, splats)}
-    phases = dict[str, dict[str, int]]()
-    for phase, parts in plan.memory_phases.items():
-        phases[phase] = {name: int(size * shares.get(name, 1.0)) for name, size in parts.items()}
-        phases[phase]["weights"] = weights[views if phase == "geometry" else splats]
-    return replace(plan, memory_phases=phases, weight_bytes=0)
 
 
 @contextmanager
@@ -71,15 +54,6 @@ def _folder(folder: Path | None, *, permanent: bool) -> Iterator[Path]:
         return
     with scratch_folder("splatlift-blocks-", folder) as scratch:
         yield scratch.resolve()
-
-
-def _lack_of_disk(folder: Path, plan: Plan) -> list[str]:
-    """Return a warning if the disk is too small for W by views, W by splats and X, else none."""
-    size, free = 2 * plan.weight_bytes + plan.memory_phases["solve"]["features"], shutil.disk_usage(folder).free
-    if free >= size:
-        return []
-    shortage = f"blocks of about {size / 2**30:.1f} GiB go to {folder}, and there is {free / 2**30:.1f} GiB of disk"
-    return [f"{shortage}: give a checkpoint folder with more room"]
 
 
 @contextmanager
@@ -153,20 +127,17 @@ class BlockFolder:
     selected: int = SELECTED  # splats of scenes that workers load as a whole
 
     def plan(self, inputs: LiftInputs, device: Device, threads: int | None) -> Plan:
-        """Plan the lift; `weigh` tells callers the part of a worker."""
-        probe = bool(inputs.views.features.paths)
+        """Plan the lift."""
         if inputs.settings.device == "auto" and not isinstance(self.engine, LocalEngine):
             device = CPU  # workers may have other GPUs than this machine, or none
         arguments = inputs.splats, inputs.views, inputs.settings, device, threads
-        return plan_lift(*arguments, in_workers=True, probe=probe)
+        return plan_lift(*arguments, in_blocks=True, folder=self.folder, probe=bool(inputs.views.features.paths))
 
     def weigh(
         self, inputs: LiftInputs, plan: Plan, on_plan: Callable[[Plan], None], timings: Timings
     ) -> tuple[Job, WeightStatistics]:
         """Compute W of the plan's views, by views and by blocks of splats; call ``on_plan`` before."""
-        worker_plan = plan_of_a_worker(plan)
-        lacks = (*worker_plan.machine_warnings, *_lack_of_disk(self.folder, plan))
-        on_plan(replace(worker_plan, machine_warnings=lacks))
+        on_plan(plan)
         with timings.step("share"):
             job = self._share(inputs, plan)
         for completed, _ in enumerate(self.engine.run(weigh, job, job.view_pieces), start=1):
@@ -196,7 +167,7 @@ class BlockFolder:
 
 @contextmanager
 def block_folder(
-    engine: Engine, settings: LiftSettings, folder: Path | None = None, *, rows: int = ROWS, selected: int = SELECTED
+    engine: Engine, folder: Path | None = None, *, rows: int = ROWS, selected: int = SELECTED
 ) -> Iterator[BlockFolder]:
     """Open the folder of a lift by an engine, where each piece is a file.
 
@@ -206,14 +177,12 @@ def block_folder(
         rows, selected: as of `BlockFolder`.
 
     Raises:
-        InvalidSettings: engine is of another type; or a step needs all rays or all features, as in
-            `LiftSettings.check_blocks`.
+        InvalidSettings: engine is of another type.
         Unavailable: the disk of the folder is full, or workers cannot read it.
     """
     if not hasattr(engine, "run"):
         hint = "LocalEngine() or RayEngine(address) makes one"
         raise InvalidSettings("engine", expected="an engine, or None", got=repr(engine)[:80], hint=hint)
-    settings.check_blocks()
     with _folder(folder or engine.scratch, permanent=folder is not None) as place, _in_words(place):
         try:
             yield BlockFolder(engine, place, rows, selected)

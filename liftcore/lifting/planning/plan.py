@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 import tempfile
-import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from liftcore.errors import Unavailable
-from liftcore.lifting.geometry import weigh_views
+from liftcore.lifting.pieces import PIECE_VIEWS, ROWS, SELECTED
 from liftcore.lifting.planning.contradictions import contradictions
 from liftcore.lifting.planning.views import (
     NOISE_VIEWS,
@@ -28,7 +28,6 @@ from liftcore.runtime.device import CPU, Device
 from liftcore.runtime.memory import check_disk, free_memory, lack_of_disk
 from liftcore.runtime.one_line import one_line
 from liftcore.runtime.one_thread import one_thread
-from liftcore.runtime.progress import silent
 from liftcore.scene.cameras import Camera, Cameras, distortion_warning, intrinsics_advice, intrinsics_factor
 from liftcore.scene.compositing import TILE
 from liftcore.scene.render_mode import rendering_reason, rendering_warnings
@@ -43,7 +42,6 @@ from liftcore.values.settings import LiftSettings
 from liftcore.values.views import DENSE_ROWS
 
 FEW_VIEWS = 32  # and fewer are all lifted, whatever view_cosine: estimating the noise would cost what it saves
-TIMED_VIEWS = 32  # and more have one of them timed, which costs little of the lift then
 RAY_SPLATS = 40  # on a ray, about: 29 in the mean of rays of tabletop, 99 of plush (`weights_at`)
 MIB, GIB = 2**20, 2**30
 LIBRARIES = 450_000_000  # of torch, numba, numpy and the compiled kernels, before anything is read
@@ -90,10 +88,9 @@ class Plan:
     channels: int  # F
     dtype: str  # of X, if it can represent the codebooks
     memory_phases: Mapping[str, Mapping[str, int]]  # bytes a part in each phase, about; what a phase frees is gone
-    weight_bytes: int  # of W of all views, about
+    in_files: int  # bytes of W beyond those that stay in memory, about
     device: Device  # of rasterization and solve
     features_room: int | None  # bytes of this machine's memory that X may take today; None for no limit
-    seconds: float | None  # estimate for the geometry of all views on this machine now; None for few views
     machine_warnings: tuple[str, ...]  # of this machine, today
     input_warnings: tuple[str, ...]  # of splats, cameras and features; the diagnostics of the lift have them too
 
@@ -117,11 +114,6 @@ class Plan:
     def memory_bytes(self) -> int:
         """The estimated peak."""
         return sum(self.memory.values())
-
-    @property
-    def in_files(self) -> int:
-        """Bytes of W beyond those that stay in memory, about."""
-        return max(0, self.weight_bytes - MEMORY_LIMIT)
 
     def facts(self) -> dict[str, Any]:
         """Return plain values for the diagnostics, without those that depend on this machine alone."""
@@ -153,16 +145,18 @@ def plan_lift(
     device: Device,
     threads: int | None = None,
     *,
-    in_workers: bool = False,
+    in_blocks: bool = False,
+    folder: Path | None = None,
     probe: bool = False,
 ) -> Plan:
     """Plan the lift of the views; the settings' coverage and view_cosine may choose among them.
 
     Args:
         device: of the lift. With ``auto``, a GPU with too little memory is replaced by the CPU.
-        in_workers: True if workers hold W and X, so that this machine needs no memory for them.
-        probe: True computes W of a few views, to report contradictions of the inputs and to estimate the time. A lift
-            in memory does both with the views that it begins with.
+        in_blocks: True plans the memory of one worker, and asks this machine for none.
+        folder: of the blocks, if it is known.
+        probe: True computes W of a few views, to report contradictions of the inputs. A lift in memory does so with
+            the views that it begins with.
 
     Raises:
         Unavailable: the codebooks do not fit memory, or the features neither memory nor disk; or the GPU that
@@ -172,22 +166,24 @@ def plan_lift(
     names = views.names
     cameras = [views.cameras[name] for name in names]
     visible = visibility(splats, cameras, settings.compositing, threads)
-    short = [] if in_workers else check_device_memory(device, splats.count, settings.device)
+    short = [] if in_blocks else check_device_memory(device, splats.count, settings.device)
     device = CPU if short else device
-    raster, seconds, contradicting = None, None, list[str]()
+    raster, contradicting = None, list[str]()
     if probe or _estimates_noise(settings, len(names)):
         raster = open_raster(splats, device, threads)
     selection, expected = _choose_views(raster, views, settings, visible)
     names, visible, cameras = [names[k] for k in selection], visible.of(selection), [cameras[k] for k in selection]
     if probe and raster is not None:  # of the views that a lift uses
         contradicting = contradictions(raster, views.only(names), settings, visible.seen_share)
-    if probe and raster is not None and device.kind == "cpu":
-        seconds = _seconds(raster, views, names, settings)
     entries = _entries(visible, cameras, features, names, settings)
     weights = weight_bytes(visible, entries, settings)
     phases = memory_phases(splats, visible, cameras, features, names, settings, entries)
-    free = None if in_workers else free_memory()
-    in_files = 0 if in_workers else max(0, weights - MEMORY_LIMIT)
+    free, in_files = None if in_blocks else free_memory(), max(0, weights - MEMORY_LIMIT)
+    if in_blocks:  # W by views, W by splats, and X
+        room = check_room(2 * weights + phases["solve"]["features"], folder) if folder else []
+        phases, in_files = worker_phases(phases, weights, visible, settings), 0
+    else:
+        room = check_room(in_files, None)
     lifted, antialiased = set(names), settings.compositing.antialiased
     return Plan(
         kernel=str(splats.kernel),
@@ -203,11 +199,10 @@ def plan_lift(
         channels=features.channels,
         dtype=settings.dtype,
         memory_phases=phases,
-        weight_bytes=weights,
+        in_files=in_files,
         device=device,
         features_room=features_room(phases, free),
-        seconds=seconds,
-        machine_warnings=(*short, *check_memory(phases, free), *check_weights(in_files)),
+        machine_warnings=(*short, *check_memory(phases, free), *room),
         input_warnings=(
             *scene_warnings(splats, views.cameras, cameras, settings),
             *shape_warnings(features, cameras),
@@ -241,17 +236,6 @@ def _choose_views(
     estimate = estimate_view_noise(raster, views, settings, visible)
     count, expected = estimate.views_for(settings.view_cosine, order, least)
     return sorted(order[:count]), expected
-
-
-def _seconds(raster: Raster, views: LiftViews, names: Sequence[str], settings: LiftSettings) -> float | None:
-    """Estimate the seconds of all views by timing the middle one; None for few views."""
-    if len(names) < TIMED_VIEWS:
-        return None
-    begin = time.perf_counter()
-    middle = views.only([names[len(names) // 2]])
-    probe_settings = settings.model_copy(update={"diagnostic_rays": 0})
-    weigh_views(raster, raster.splats.count, middle, probe_settings, silent, by_rows=False)
-    return len(names) * (time.perf_counter() - begin)
 
 
 def weight_bytes(visible: Visibility, entries: np.ndarray, settings: LiftSettings) -> int:
@@ -328,6 +312,21 @@ def memory_phases(
         "steps": scene | {"steps": steps},
         "solve": scene | {"features": splats.count * channels * size, "work": max(solving)},
     }
+
+
+def worker_phases(
+    phases: Mapping[str, Mapping[str, int]], weights: int, visible: Visibility, settings: LiftSettings
+) -> dict[str, dict[str, int]]:
+    """Estimate the bytes of each part in one worker of a lift in blocks, from those in memory and those of all W."""
+    block, views = min(1.0, ROWS / visible.splats), min(1.0, PIECE_VIEWS / len(visible.areas))
+    shares = {"splats": min(1.0, max(SELECTED, visible.splats_a_view) / visible.splats), "steps": max(views, block)}
+    if not (settings.smoothness or settings.aggregation):  # which the calling process does on all of X
+        shares["features"] = block
+    scaled = dict[str, dict[str, int]]()
+    for phase, parts in phases.items():
+        scaled[phase] = {name: int(size * shares.get(name, 1.0)) for name, size in parts.items()}
+        scaled[phase]["weights"] = min(int((views if phase == "geometry" else block) * weights), MEMORY_LIMIT)
+    return scaled
 
 
 def _tiles(visible: Visibility) -> float:
@@ -410,12 +409,17 @@ def check_memory(phases: Mapping[str, Mapping[str, int]], free: int | None) -> l
     return warnings
 
 
-def check_weights(size: int) -> list[str]:
-    """Return a warning if the temporary folder is too small for ``size`` bytes of region weights, else none."""
-    got = lack_of_disk(size) if size else ""
+def check_room(size: int, folder: Path | None) -> list[str]:
+    """Return a warning if there is no room for ``size`` bytes of W and X in files, else none.
+
+    Args:
+        folder: of a lift in blocks; None: the temporary folder.
+    """
+    got = lack_of_disk(size, folder) if size else ""
     if not got:
         return []
-    message = (
-        f"region weights of about {size / GIB:.1f} GiB go to files in {tempfile.gettempdir()}, and there is {got}"
-    )
-    return [f"{message}: set TMPDIR to a folder with more room on a disk, or try fewer views (coverage)"]
+    remedy = "give a checkpoint folder with more room"
+    if folder is None:
+        remedy = "set TMPDIR to a folder with more room on a disk, or try fewer views (coverage)"
+    place = folder or tempfile.gettempdir()
+    return [f"files of about {size / GIB:.1f} GiB go to {place}, and there is {got}: {remedy}"]

@@ -58,7 +58,7 @@ def scene() -> dict[str, Any]:
 
 def in_blocks(engine: Any, scene: dict[str, Any], settings: LiftSettings, **keywords: Any) -> lc.LiftResult:
     inputs, timings = LiftInputs.of(**scene, preset=settings), Timings(keywords.pop("progress", None))
-    with block_folder(engine, settings, **{"rows": ROWS, "selected": 1000, **keywords}) as folder:
+    with block_folder(engine, **{"rows": ROWS, "selected": 1000, **keywords}) as folder:
         return pipeline.run(inputs, timings, lambda _: None, blocks=folder)
 
 
@@ -74,7 +74,7 @@ def assert_same(left: lc.LiftResult, right: lc.LiftResult) -> None:
 def test_lift_goes_on_from_the_pieces_in_its_folder(scene: dict[str, Any], tmp_path: Path) -> None:
     write_pack(tmp_path / "pack.safetensors", scene["views"], {"text_space": "words"})
     stored = {**scene, "views": lc.read_features(tmp_path / "pack.safetensors")}
-    folder, settings = tmp_path / "work", LiftSettings.of(preset="tikhonov")
+    folder, settings = tmp_path / "work", LiftSettings.of(preset="tikhonov", smoothness=1)
 
     def stop(stage: str, completed: int, total: int, unit: str) -> None:
         if (stage, completed) == ("solve", 1):
@@ -90,6 +90,7 @@ def test_lift_goes_on_from_the_pieces_in_its_folder(scene: dict[str, Any], tmp_p
     assert {path: path.stat().st_mtime_ns for path in write_times} == write_times
     assert result.metadata.text_space == "words" and not draft.exists()
     assert_same(result, in_blocks(LocalEngine(1), scene, settings))
+    assert_same(result, in_blocks(LocalEngine(1), stored, settings, folder=folder))  # smooth once, not twice
     settings = LiftSettings.of(preset="row-sum")
     second = in_blocks(LocalEngine(1), stored, settings, folder=folder)  # pieces of another lift
     assert_same(second, in_blocks(LocalEngine(1), scene, settings))
