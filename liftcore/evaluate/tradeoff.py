@@ -18,6 +18,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -30,7 +31,6 @@ from liftcore.io.cameras import read_cameras
 from liftcore.lifting.files import open_files
 from liftcore.lifting.pipeline import lift
 from liftcore.lifting.planning.views import evenly_spaced
-from liftcore.lifting.warm_up import warm_up_lift
 from liftcore.query.ask import ask
 from liftcore.query.objects import objects
 from liftcore.query.question import Query
@@ -39,18 +39,18 @@ from liftcore.query.result import LiftResult
 from liftcore.query.scene import Scene
 from liftcore.raster import open_raster
 from liftcore.runtime.arguments import as_list, as_path, as_paths
-from liftcore.runtime.device import CPU, choose_device
+from liftcore.runtime.device import CPU
 from liftcore.runtime.folders import scratch_folder
 from liftcore.runtime.progress import Progress, one_step
-from liftcore.scene.cameras import Cameras
+from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.drawing import in_photo
-from liftcore.scene.kernel import Kernel
+from liftcore.scene.kernel import Kernel, scale_count
 from liftcore.scene.splats import Splats
 from liftcore.scene.views import cameras_of_views
 from liftcore.text.table import TableEncoder
 from liftcore.values.pack import Views, pair, read_features
 from liftcore.values.settings import LiftSettings
-from liftcore.values.views import cells_under
+from liftcore.values.views import FeatureGrid, Regions, cells_under
 
 HOLD_OUT = 8  # every n-th view is held out of the lifts
 LEAST_HELD_OUT = 6  # if there are three times as many: five views may agree by chance (1 of 32)
@@ -173,10 +173,9 @@ def compare(
     """
     candidates = candidates_of(settings)
     if kernel is not None:
-        device = choose_device(settings.get("device", "auto"))
         with one_step(progress, "compile"):
             for candidate in candidates:
-                warm_up_lift(kernel, device, LiftSettings.of(**{**settings, **candidate.settings}))
+                compile_lift(kernel, LiftSettings.of(**{**settings, **candidate.settings}))
     progress("tradeoff", 0, len(candidates), "runs")
     start, runs, accuracies, over_budget = time.monotonic(), [], [], []
     with scratch_folder("splatlift-tradeoff-") as folder:
@@ -272,6 +271,18 @@ def _run(spec: RunSpec, candidate: Candidate) -> dict[str, Any]:
     return {**answer, "process_s": time.monotonic() - start}
 
 
+def compile_lift(kernel: Kernel, settings: LiftSettings) -> None:
+    """Lift three splats, which compiles what lifts with these settings run, or loads it from the disk."""
+    means, scales = [[0, 0, 2], [0.1, 0, 2], [0, 0.1, 2]], np.zeros((3, scale_count(kernel)))
+    beta = np.zeros(3) if kernel is Kernel.BETA else None
+    splats = Splats(np.array(means), np.ones((3, 4)), scales, np.zeros(3), kernel, beta=beta)
+    labels = np.arange(64).reshape(8, 8) % 3
+    views = {"a": Regions(labels, np.eye(3)), "b": Regions(labels, np.eye(3)), "c": FeatureGrid(np.ones((2, 2, 3)))}
+    cameras = {name: Camera.pinhole(name, 8, 8, 8.0, 8.0, 4.0, 4.0, np.eye(4)) for name in views}
+    every_level = settings.model_copy(update={"levels": "rows"})
+    lift(splats, cameras, views, every_level, threads=1, progress=False, on_plan=lambda _: None)
+
+
 def measure_run(spec: RunSpec) -> dict[str, Any]:
     """Lift, and return the figures of the run and of its features."""
     settings, scene = LiftSettings.of(**spec.settings), spec.scene
@@ -280,7 +291,7 @@ def measure_run(spec: RunSpec) -> dict[str, Any]:
     features = pair(packs, cameras)[0]
     lifted = features.seen_by({view: view for view in spec.lifted if view in features}, cameras)
     reading = {"cpu": time.process_time() - cpu, "wall": time.perf_counter() - wall}
-    warm_up_lift(splats.kernel, choose_device(settings.device), settings)  # the lift's own then takes no time
+    compile_lift(splats.kernel, settings)  # the lift's own then takes no time
     cpu, wall = time.process_time(), time.perf_counter()
     result = lift(splats, cameras, lifted, settings, threads=spec.threads)
     seconds = {"cpu": time.process_time() - cpu, "wall": time.perf_counter() - wall}

@@ -22,9 +22,9 @@ from liftcore.lifting.in_memory import weigh_in_memory
 from liftcore.lifting.inputs import LiftInputs
 from liftcore.lifting.pieces import Pieces
 from liftcore.lifting.planning.plan import Plan, plan_lift
-from liftcore.lifting.warm_up import warm_up_lift
 from liftcore.query.result import LiftResult
 from liftcore.raster import open_raster
+from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.runtime.device import choose_device, give_back_memory, within_memory
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, Timings, shown_progress
@@ -125,16 +125,13 @@ def run(
     """Run all steps of a lift in memory, or in ``blocks``."""
     splats, settings = inputs.splats, inputs.settings
     device = choose_device(settings.device)
-    with timings.step("compile"):
-        warm_up_lift(splats.kernel, device, settings)
     with timings.step("plan"):
         if blocks is None:  # the weighing reports contradictions, by the views that it begins with
             plan = plan_lift(splats, inputs.views, settings, device, threads)
         else:
             plan = blocks.plan(inputs, device, threads)
-    if plan.device != device:
-        with timings.step("compile"):
-            warm_up_lift(splats.kernel, plan.device, settings)
+    with timings.step("compile"):  # a minute on a new machine
+        warm_up(splats.kernel, plan.device, settings.compositing, settings.weighting)
     inputs = replace(inputs, views=inputs.views.only(plan.views))
     with within_memory(plan.device):
         if blocks is None:

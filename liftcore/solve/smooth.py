@@ -46,7 +46,6 @@ from liftcore.runtime.jit import kernel
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, silent
 from liftcore.scene.neighbours import SplatGraph
-from liftcore.scene.splats import Splats
 from liftcore.solve import shared_rows as wide
 
 LEAST_CONFIDENCE = 0.02  # lower bound of c, for splats of a single view
@@ -163,14 +162,6 @@ def smooth(
             "features are less smooth than requested"
         )
     return X, facts
-
-
-def warm_up_smoothing() -> None:
-    """Compile the kernels, or load them from the disk cache."""
-    graph = SplatGraph.of(Splats(torch.eye(3), torch.zeros(3, 4), torch.zeros(3, 3), torch.zeros(3)), 1)
-    ones = torch.ones(3)
-    for X in (torch.eye(3), torch.eye(3).half()):
-        smooth(X, graph, ones, None, ones > 0, 1.0, threads=1)
 
 
 def smoothing_weights(total_weight: Tensor, confidence: Tensor | None) -> np.ndarray:
