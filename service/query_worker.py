@@ -172,16 +172,9 @@ class Answers:
 
         return self._cache.get(_key(request, "query"), make)
 
-    def _grouped(self, request: Request) -> Any:
-        answer = self._answer(request)
-        return self._cache.get(_key(request, "query", "world"), lambda: self._scene(request).objects(answer))
-
     def _view_mask(self, request: Request) -> ViewMask:
-        answer = self._answer(request)
-
         def make() -> ViewMask:
-            view = view_of(request)
-            return self._scene(request).view_mask(answer, view, find_objects=lambda: self._grouped(request))
+            return self._scene(request).view_mask(self._answer(request), view_of(request))
 
         return self._cache.get(_key(request, "query", "view", "camera"), make)
 
@@ -220,8 +213,9 @@ class Answers:
         return document | {"view": view, "links": links}
 
     def objects(self, request: Request) -> dict[str, Any]:
-        document = self._answer(request).model_dump(mode="json", include=set(SelectionSummary.model_fields))
-        return document | self._grouped(request).model_dump(mode="json")
+        answer = self._answer(request)
+        document = answer.model_dump(mode="json", include=set(SelectionSummary.model_fields))
+        return document | self._scene(request).objects(answer).model_dump(mode="json")
 
     def segment(self, request: Request) -> dict[str, Any]:
         return self._segmentation(request).summary.model_dump(mode="json")

@@ -14,7 +14,6 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,6 @@ from liftcore.lifting.files import open_files
 from liftcore.lifting.pipeline import lift
 from liftcore.lifting.planning.views import evenly_spaced
 from liftcore.query.ask import ask
-from liftcore.query.objects import objects
 from liftcore.query.question import Query
 from liftcore.query.render import view_mask
 from liftcore.query.result import LiftResult
@@ -340,9 +338,8 @@ def _phrase_ious(spec: RunSpec, scene: Scene, masks: Mapping[str, Tensor]) -> li
     ]
     for number in evenly_spaced([number for number, views in enumerate(showing) if views], MOST_PHRASES):
         answer = ask(scene, Query.of(spec.scene.classes[number]), encoder)
-        grouped = cache(partial(objects, scene, answer))  # once for all views, and on demand
         for view in evenly_spaced(showing[number], PHRASE_VIEWS):
-            answer_mask = view_mask(scene, answer, view, group=lambda *_, grouped=grouped: grouped())
+            answer_mask = view_mask(scene, answer, view)
             predicted, true = _resized(torch.from_numpy(answer_mask.mask), masks[view]), masks[view] == number
             ious.append(int((predicted & true).sum()) / int((predicted | true).sum()))
     return ious

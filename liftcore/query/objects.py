@@ -23,7 +23,7 @@ _TAIL = 1e-3  # of an object's total weight that its box leaves out at each end 
 
 
 def objects(scene: Scene, answer: Answer) -> Objects:
-    """Group the selected splats of an answer into objects.
+    """Group the selected splats of an answer into objects, once for an answer.
 
     An object is a group of touching splats (`touching`). A group with less than a twentieth of the total weight of
     the largest is unassigned: single splats and small groups anywhere in the scene whose scores happen to reach the
@@ -38,6 +38,12 @@ def objects(scene: Scene, answer: Answer) -> Objects:
         InvalidQuery: more splats were selected than are grouped.
         InvalidLift: the splats moved or changed since the lift.
     """
+    if answer._objects is None or answer._objects.world != scene.world:
+        answer._objects = _grouped(scene, answer)
+    return answer._objects
+
+
+def _grouped(scene: Scene, answer: Answer) -> Objects:
     rows = np.flatnonzero(answer.selected)
     sets = answer.query.splat_sets
     if len(rows) > MOST_SPLATS and not sets:

@@ -421,6 +421,7 @@ class Answer(SelectionSummary):
     box: Box | None = Field(default=None, description="around all selected splats, outliers too: see objects")
     _query: Query = PrivateAttr()
     _arrays: tuple[np.ndarray, np.ndarray, np.ndarray] = PrivateAttr()
+    _objects: Objects | None = PrivateAttr(None)  # cached by `liftcore.query.objects.objects`
 
     @classmethod
     def of(
@@ -440,6 +441,7 @@ class Answer(SelectionSummary):
         """Return the answer with other selected splats [P] bool, as that to another query, with other fields."""
         answer = self.model_copy(update={"text": query.text, "count": int(selected.sum())} | fields)
         answer._query, answer._arrays = query, (self.scores, self.has_feature, selected)
+        answer._objects = None
         return answer
 
     @property

@@ -1,7 +1,7 @@
 """Images of a scene and its answers from a camera: masks, attention, colours and depths, in the photo's pixels."""
 
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,7 @@ from scipy.ndimage import binary_dilation
 from liftcore.query.areas import MINIMUM_ROW_SUM
 from liftcore.query.colours import cluster_colours, heat_colours, map_colours
 from liftcore.query.objects import objects
-from liftcore.query.question import Answer, Objects
+from liftcore.query.question import Answer
 from liftcore.query.scene import Scene
 from liftcore.query.splat_colours import view_colours
 from liftcore.runtime.one_line import one_line, value_text
@@ -49,9 +49,7 @@ class ViewMask:
         return one_line(self, value_text(self.view), size, value_text(self.explanation))
 
 
-def view_mask(
-    scene: Scene, answer: Answer, view: str | Camera, group: Callable[[Scene, Answer], Objects] = objects
-) -> ViewMask:
+def view_mask(scene: Scene, answer: Answer, view: str | Camera) -> ViewMask:
     """Render an answer from a camera: its attention, and a mask of its objects.
 
     The mask is ``A m >= A 1 / 2``, with m = 1 for the splats of the answer's objects: the pixels where they are
@@ -61,7 +59,6 @@ def view_mask(
     Args:
         scene: the opened lift. answer: of that lift.
         view: the name of a camera, lifted or not; or any camera in the frame of the splats.
-        group: returns the objects of an answer; a caller that has them passes them so.
 
     Raises:
         NotFound: no camera has this name.
@@ -72,7 +69,7 @@ def view_mask(
     if answer.count > MOST_GROUPED and not answer.query.keeps_some:
         members, subject = answer.selected, f"all {answer.count} selected splats, too many to group into objects"
     else:
-        groups = group(scene, answer)
+        groups = objects(scene, answer)
         members, count = groups.numbers >= 0, len(groups.objects)
         subject = f"the {count} object{'s' * (count != 1)} that {'were' if count != 1 else 'was'} found"
     # A splat without a feature has a score of -1, which would lower the attention of its neighbours: it counts as 0.

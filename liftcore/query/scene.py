@@ -183,14 +183,12 @@ class Scene:
         view: str | Camera | None = None,
         *,
         encoder: AnyEncoder = None,
-        find_objects: Callable[[], Objects] | None = None,
     ) -> ViewMask:
         """Render an answer from a camera: its attention, and a mask of the objects that were found.
 
         Args:
             query: as in `ask`, or the answer to it. view: the name of a camera of the scene, or any camera in the
                 frame of the splats; None: the query's own.
-            find_objects: returns the answer's objects, such as cached ones; None: `objects`.
 
         Raises:
             InvalidQuery, NotFound, InvalidLift, Unavailable: as `ask` and `liftcore.query.render.view_mask`.
@@ -198,8 +196,7 @@ class Scene:
         from liftcore.query.render import view_mask
 
         answer = self._answer(query, encoder)
-        group = (lambda *_: self.objects(answer)) if find_objects is None else lambda *_: find_objects()
-        return view_mask(self, answer, answer.query.seen_from() if view is None else view, group)
+        return view_mask(self, answer, answer.query.seen_from() if view is None else view)
 
     def mask(
         self,
