@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
 from liftcore.errors import InvalidQuery
 from liftcore.query.question import MOST_CHARACTERS, Box, OwnCamera, Query, as_own_camera
-from liftcore.query.terms import PixelBox, Stroke, Vector, parse_example
+from liftcore.query.terms import PixelBox, Stroke, parse_example
 from liftcore.runtime.fields import Body, NoBoolean
 
 AREAS = "VIEW:box:x0,y0,x1,y1 or VIEW:stroke:x0,y0,x1,y1,..."
@@ -70,13 +70,3 @@ class Edit(Body):
         if not isinstance(area, PixelBox | Stroke):
             raise InvalidQuery("area", expected=AREAS, got=repr(self.area))
         return area
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the edit as a history has it, JSON: all but the bits, and of a vector its length."""
-        document = self.model_dump(mode="json", exclude_defaults=True, exclude={"bits", "camera"})
-        query = document.get("query", {})
-        for name in query.keys() & {"like", "unlike"}:
-            query[name] = [
-                example if isinstance(example, str) else str(Vector(tuple(example))) for example in query[name]
-            ]
-        return document

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import binascii
 import math
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Self
 
@@ -35,19 +34,6 @@ GROWTH_MARGIN = 0.25
 SIZE_QUANTILE = 0.99
 
 
-@dataclass(frozen=True)
-class Step:
-    """A state of a selection, and the edit that led to it."""
-
-    edit: dict[str, Any]  # as `Edit.to_json`
-    bits: bytes  # a bit a splat, the first in the lowest bit of its byte
-
-    @classmethod
-    def of(cls, edit: dict[str, Any], splats: np.ndarray) -> Self:
-        """Return the step to splats [P] bool."""
-        return cls(edit, np.packbits(splats, bitorder="little").tobytes())
-
-
 class Selection:
     """A named set of splats of a scene, with its edits, which can be undone.
 
@@ -57,7 +43,7 @@ class Selection:
 
     def __init__(self, scene: Scene, name: str) -> None:
         self._scene, self.name = scene, name
-        self._steps, self._place = [Step.of({"operation": "set"}, np.zeros(len(scene.features), np.bool_))], 0
+        self._steps, self._place = [bits_of(np.zeros(len(scene.features), np.bool_))], 0
 
     def __repr__(self) -> str:
         return one_line(self, repr(self.name), f"{int(self.splats.sum())} splats", f"step {self._place}")
@@ -65,12 +51,12 @@ class Selection:
     @property
     def splats(self) -> np.ndarray:
         """[P] bool, the selected splats."""
-        return splats_of_bits(self._steps[self._place].bits, len(self._scene.features))
+        return splats_of_bits(self.bits, len(self._scene.features))
 
     @property
     def bits(self) -> bytes:
-        """The selected splats, a bit a splat, the first in the lowest bit of its byte."""
-        return self._steps[self._place].bits
+        """The selected splats (`bits_of`)."""
+        return self._steps[self._place]
 
     @property
     def box(self) -> Box | None:
@@ -78,15 +64,10 @@ class Selection:
         rows = np.flatnonzero(self.splats)
         return object_box(self._scene.splats, rows, self._scene.weights_of(rows)) if rows.size else None
 
-    @property
-    def history(self) -> tuple[dict[str, Any], ...]:
-        """The edits up to the present state, in their order, without undone ones."""
-        return tuple(step.edit for step in self._steps[1 : self._place + 1])
-
     def edit(
         self, operation: str | Edit, source: Answer | Query | str | np.ndarray | int | None = None, **fields: Any
     ) -> Self:
-        """Edit the selection; edits that were undone before are dropped from the history.
+        """Edit the selection; edits that were undone before are dropped.
 
         Args:
             operation: set, add, remove, grow or shrink; or an `Edit`, with the answer to its query if that is known.
@@ -102,7 +83,7 @@ class Selection:
         if edit.query is not None and answer is None:
             answer = ask(self._scene, edit.query, self._scene.encoder() if edit.query.texts else None)
         splats = apply_edit(self._scene, self.splats, edit, answer)
-        self._steps = [*self._steps[: self._place + 1], Step.of(edit.to_json(), splats)][-MOST_HISTORY - 1 :]
+        self._steps = [*self._steps[: self._place + 1], bits_of(splats)][-MOST_HISTORY - 1 :]
         self._place = len(self._steps) - 1
         return self
 
@@ -123,15 +104,20 @@ def _edit_of(scene: Scene, operation: str | Edit, source: Any, fields: dict[str,
     if isinstance(operation, Edit):
         return operation, answer
     if isinstance(source, np.ndarray):
-        fields["bits"] = base64.b64encode(Step.of({}, _booleans(scene, source)).bits).decode()
+        fields["bits"] = base64.b64encode(bits_of(_booleans(scene, source))).decode()
     elif source is not None:
         query = answer.query if answer else Query(sets=[f"object:{source}"]) if isinstance(source, int) else source
         fields["query"] = Query.of(query) if isinstance(query, str) else query
     return Edit.model_validate({"operation": operation, **fields}), answer
 
 
+def bits_of(splats: np.ndarray) -> bytes:
+    """Pack splats [P] bool to a bit a splat, the first in the lowest bit of its byte."""
+    return np.packbits(splats, bitorder="little").tobytes()
+
+
 def splats_of_bits(bits: bytes, count: int) -> np.ndarray:
-    """Unpack a bit a splat, the first in the lowest bit of its byte, to [count] bool."""
+    """Unpack bits of `bits_of` to [count] bool."""
     return np.unpackbits(np.frombuffer(bits, np.uint8), count=count, bitorder="little").astype(np.bool_)
 
 
