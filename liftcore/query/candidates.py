@@ -72,11 +72,9 @@ def _path(scene: Scene, example: Term) -> dict[int, float]:
     else:
         assert isinstance(example, Area)
         rows, weights = area_splats(scene, example)
-    labels = scene.object if scene.node is None else scene.node
-    assert labels is not None and scene.object_views is not None
-    parents = np.full(len(scene.object_views), -1) if scene.node_parents is None else scene.node_parents
-    shares = dict[int, float]()
-    above, part = labels[rows].astype(np.int64), weights / weights.sum()
+    assert scene.node is not None and scene.node_parents is not None
+    shares, parents = dict[int, float](), scene.node_parents
+    above, part = scene.node[rows].astype(np.int64), weights / weights.sum()
     while (inside := above >= 0).any():
         above, part = above[inside], part[inside]
         for node, weight in zip(above.tolist(), part.tolist(), strict=True):
@@ -93,7 +91,6 @@ def _path(scene: Scene, example: Term) -> dict[int, float]:
 
 def _candidate(scene: Scene, node: int, share: float) -> Candidate:
     node_set = SplatSet("object", str(node))
-    confidence = None if scene.node_confidence is None else float(scene.node_confidence[node])
     splats = int(scene.members(node).sum())
-    kind = scene.node_kind(node)
+    kind, confidence = scene.node_kind(node), scene.confidence_of(node)
     return Candidate(id=node, set=str(node_set), kind=kind, splats=splats, share=share, confidence=confidence)

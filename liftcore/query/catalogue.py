@@ -27,7 +27,6 @@ from liftcore.text import check_texts
 
 MOST_WORDS = 65_536  # of a vocabulary: their vectors take 130 MB at 512 channels
 NONE_FOUND = "no object: masks of three views never keep the same splats together"
-NO_TREE = "this lift's objects have no tree: lift again"
 
 
 def tree(scene: Scene, words: Sequence[str] = (), vectors: Any = None) -> SceneTree:
@@ -44,11 +43,12 @@ def tree(scene: Scene, words: Sequence[str] = (), vectors: Any = None) -> SceneT
         InvalidLift: the splats moved or changed since the lift.
     """
     parents = scene.node_parents
-    if scene.object_views is None or scene.node is None or parents is None:
-        return _tree_of(scene, (), scene.lack_of_objects() if scene.object is None else NO_TREE)
-    assert scene.node_views is not None and scene.node_confidence is not None and scene.node_features is not None
-    of_parts = scene.node_features[len(scene.object_views) :].astype(np.float32)
-    naming = _names(np.concatenate([scene.object_means, of_parts]), words, vectors)
+    if scene.object_views is None or scene.node_views is None or parents is None:
+        return _tree_of(scene, (), scene.lack_of_objects())
+    features = scene.object_means
+    if scene.node_features is not None:
+        features = np.concatenate([features, scene.node_features[len(features) :].astype(np.float32)])
+    naming = _names(features, words, vectors)
     rows_of = [np.flatnonzero(scene.members(node)) for node in range(len(parents))]
     total_weight, view_names = scene.total_weight.astype(np.float64), scene.metadata.views
     total, nodes = total_weight.sum() or 1.0, list[SceneNode]()
@@ -75,7 +75,7 @@ def tree(scene: Scene, words: Sequence[str] = (), vectors: Any = None) -> SceneT
                 parent=int(parents[node]) if parents[node] >= 0 else None,
                 path=scene.node_path(node),
                 parts=tuple(part for part in np.flatnonzero(parents == node).tolist() if rows_of[part].size),
-                confidence=float(scene.node_confidence[node]),
+                confidence=scene.confidence_of(node),
             )
         )
     return _tree_of(scene, tuple(nodes), _counts(nodes) if nodes else NONE_FOUND)

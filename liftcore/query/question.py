@@ -568,7 +568,9 @@ class SceneNode(Value):
     parent: int | None = Field(description="the node that it is a part of; null where it is of none")
     path: tuple[int, ...] = Field(description="the nodes that hold it, the largest first, and itself")
     parts: tuple[int, ...] = Field(description="the nodes that are its parts, the largest total weight first")
-    confidence: float = Field(description="of the views that see it, the share that has a mask of the whole")
+    confidence: float | None = Field(
+        description="of the views that see it, the share that has a mask of the whole; null in a lift without a tree"
+    )
 
 
 class SceneTree(WithUnits):

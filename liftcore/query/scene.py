@@ -123,6 +123,10 @@ class Scene:
         features, code = arrays.pop("features"), arrays.pop("code", None)
         self.features = Features(features if code is None else features.astype(np.float32), code)
         self._has_feature = arrays.pop("has_feature")
+        views = arrays.get("object_views")
+        if views is not None and "node" not in arrays:  # every object is a node without parts
+            parents = np.full(len(views), -1, np.int32)
+            arrays |= {"node": arrays["object"], "node_parents": parents, "node_views": views}
         self.__dict__.update(arrays)
         if splats_path is not None and splats_path.exists():
             self._require_rows(quick_count(splats_path))
@@ -597,6 +601,10 @@ class Scene:
             return "object"
         return "part" if min(self.node_path(node)) < objects else "group"
 
+    def confidence_of(self, node: int) -> float | None:
+        """Return the share of the views that see a node which have a mask of it; None in a lift without a tree."""
+        return None if self.node_confidence is None else float(self.node_confidence[node])
+
     def lack_of_objects(self) -> str:
         """Explain why the lift has no objects, and how to get some."""
         settings = self.metadata.settings
@@ -614,14 +622,11 @@ class Scene:
         Raises:
             NotFound: the lift has no such object.
         """
-        count = 0 if self.object_views is None else len(self.object_views)
-        nodes = count if self.node_parents is None else len(self.node_parents)
-        if self.object is None or not 0 <= number < nodes:
+        nodes = 0 if self.node_parents is None else len(self.node_parents)
+        if self.node is None or not 0 <= number < nodes:
             expected = f"a number from 0 to {nodes - 1}" if nodes else "a lift with objects"
             hint = "the list of the lift's objects has them" if nodes else self.lack_of_objects()
             raise NotFound("object", expected=expected, got=str(number), hint=hint)
-        if self.node is None or self.node_parents is None:
-            return self.object == number
         below = [number in self.node_path(node) for node in range(nodes)]
         return np.array([*below, False])[self.node]  # the last entry is of splats without a node
 
@@ -674,8 +679,7 @@ class Scene:
         rows = np.flatnonzero(inner._has_feature)
         rows = rows[:: -(-len(rows) // MOST_SAMPLED) or 1]
         inner.__dict__["rough_mean"] = self.features.mean(self.total_weight[rows], rows)
-        if self.node is not None and self.node_views is not None:
-            inner.object, inner.object_views = self.node, self.node_views
+        inner.object, inner.object_views = self.node, self.node_views
         inner.node_features = None  # of all splats of the nodes
         return inner
 

@@ -12,7 +12,7 @@ import torch
 from liftcore.errors import InvalidLift, NotFound
 from liftcore.query.result import LiftResult, load_lift
 from liftcore.query.scene import Scene
-from liftcore.values.lift_file import save_lift
+from liftcore.values.lift_file import NODE_TENSORS, save_lift
 from liftcore.values.settings import LiftSettings
 from tests.tiny_scene import CHANNELS, WORDS
 
@@ -89,6 +89,15 @@ def test_a_tree_or_clusters_that_are_none_are_refused(
     save_lift(replace(with_parts(scene), **change), tmp_path / "wrong.lift")
     with pytest.raises(InvalidLift, match=r"tree|cluster"):
         load_lift(tmp_path / "wrong.lift")
+
+
+def test_objects_without_a_tree_are_listed_as_objects_without_parts(scene: Scene) -> None:
+    bare = replace(scene.lift, **dict.fromkeys(NODE_TENSORS))
+    tree = Scene(bare, scene.splats, scene.cameras).tree(WORDS, EYE)
+    assert [(obj.id, obj.kind, obj.parts, obj.confidence) for obj in tree.nodes] == [
+        (number, "object", (), None) for number in range(3)
+    ]
+    assert {obj.name for obj in tree.objects} == set(WORDS)
 
 
 def test_objects_without_splats_are_left_out(scene: Scene, tmp_path: Path) -> None:
