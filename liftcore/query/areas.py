@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from liftcore.errors import InvalidQuery, NotFound
+from liftcore.errors import InvalidQuery
 from liftcore.query.scene import Scene, as_numpy
 from liftcore.query.scores import LEAST_LIKENESS, cosines_about, norms_of
-from liftcore.query.terms import AREAS, NOTATIONS, Area, Pixel, PixelBox, Stroke
+from liftcore.query.terms import Area
 
 if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera
@@ -38,7 +38,7 @@ def area_feature(scene: Scene, area: Area) -> np.ndarray:
             or a box or a stroke lacks corners.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
-    camera = _camera(scene, area)
+    camera = scene.cameras[area.view]
     inside, around = _pixels(area, *camera.photo_size)
     rows = _rendered(scene, camera, area, inside)
     if len(rows) == 1:
@@ -46,36 +46,27 @@ def area_feature(scene: Scene, area: Area) -> np.ndarray:
     return _common(scene, rows, _rendered(scene, camera, None, around))
 
 
-def _camera(scene: Scene, area: Area) -> Camera:
-    """Return the camera of an area; if no view is called "VIEW:box", `VIEW:box:x,y` is a box that lacks corners."""
-    try:
-        return scene.cameras[area.view]
-    except NotFound:
-        if isinstance(area, Pixel) and area.view.endswith(AREAS):
-            raise InvalidQuery(str(area), expected=NOTATIONS, got="two numbers", hint="give all corners") from None
-        raise
-
-
 def _pixels(area: Area, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     """Return pixels of an area and of the band around it, [n, 2] and [m, 2] i64 (x, y)."""
     none = np.zeros((0, 2), np.int64)
-    if isinstance(area, PixelBox):
-        if not (0 <= area.x0 < area.x1 <= width and 0 <= area.y0 < area.y1 <= height):
+    corners = np.array(area.corners)
+    if area.kind == "box":
+        (x0, y0), (x1, y1) = area.corners
+        if not (0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height):
             expected = f"0 <= x0 < x1 <= {width} and 0 <= y0 < y1 <= {height}"
-            got = f"{area.x0},{area.y0},{area.x1},{area.y1}"
-            raise InvalidQuery(str(area), expected=expected, got=got, hint="give the upper left corner first")
-        band = [math.ceil(BAND * side) for side in (area.x1 - area.x0, area.y1 - area.y0)]
-        left, top = max(0, area.x0 - band[0]), max(0, area.y0 - band[1])
-        right, bottom = min(width, area.x1 + band[0]), min(height, area.y1 + band[1])
+            hint = "give the upper left corner first"
+            raise InvalidQuery(str(area), expected=expected, got=f"{x0},{y0},{x1},{y1}", hint=hint)
+        band = np.ceil(BAND * (corners[1] - corners[0])).astype(np.int64)
+        left, top = np.maximum(corners[0] - band, 0).tolist()
+        right, bottom = np.minimum(corners[1] + band, (width, height)).tolist()
         near = _grid(left, top, right, bottom, 2 * AREA_PIXELS)
-        is_inside = ((near >= (area.x0, area.y0)) & (near < (area.x1, area.y1))).all(axis=1)
-        return _grid(area.x0, area.y0, area.x1, area.y1, AREA_PIXELS), near[~is_inside]
-    corners = np.array([(area.x, area.y)] if isinstance(area, Pixel) else area.pixels)
+        is_inside = ((near >= corners[0]) & (near < corners[1])).all(axis=1)
+        return _grid(x0, y0, x1, y1, AREA_PIXELS), near[~is_inside]
     if not ((corners >= 0) & (corners < (width, height))).all():
         x, y = next((x, y) for x, y in corners.tolist() if not (0 <= x < width and 0 <= y < height))
         expected = f"x in 0..{width - 1} and y in 0..{height - 1}"
         raise InvalidQuery(str(area), expected=expected, got=f"{x},{y}")
-    return (_line(corners) if isinstance(area, Stroke) else corners), none
+    return (_line(corners) if area.kind == "stroke" else corners), none
 
 
 def _grid(left: int, top: int, right: int, bottom: int, limit: int) -> np.ndarray:
@@ -113,7 +104,7 @@ def area_splats(scene: Scene, area: Area) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         NotFound, InvalidQuery, InvalidLift: as `area_feature`.
     """
-    camera = _camera(scene, area)
+    camera = scene.cameras[area.view]
     rays = _rays(scene, camera, area, _pixels(area, *camera.photo_size)[0])
     splats, weights = zip(*rays, strict=True)
     return np.concatenate(splats), np.concatenate(weights)
@@ -125,7 +116,7 @@ def _rays(scene: Scene, camera: Camera, area: Area | None, pixels: np.ndarray) -
 
     from liftcore.scene.cameras import drawn_by, pixel_of
 
-    noun = "a pixel" if isinstance(area, Pixel) else "an area"
+    noun = "a pixel" if area is not None and area.kind == "pixel" else "an area"
     pinhole_pixels = [place for x, y in pixels.tolist() if (place := pixel_of(camera, x, y)) is not None]
     if not pinhole_pixels:
         if area is None:

@@ -8,7 +8,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
 from liftcore.errors import InvalidQuery
 from liftcore.query.question import MOST_CHARACTERS, Box, OwnCamera, Query, as_own_camera
-from liftcore.query.terms import PixelBox, Stroke, parse_example
+from liftcore.query.terms import Area, parse_example
 from liftcore.runtime.fields import Body, NoBoolean
 
 AREAS = "VIEW:box:x0,y0,x1,y1 or VIEW:stroke:x0,y0,x1,y1,..."
@@ -64,9 +64,9 @@ class Edit(Body):
             self.parsed_area()
         return self
 
-    def parsed_area(self) -> PixelBox | Stroke:
+    def parsed_area(self) -> Area:
         """Parse the area; InvalidQuery if it is neither a box nor a stroke."""
         area = parse_example(str(self.area), "area")
-        if not isinstance(area, PixelBox | Stroke):
+        if not isinstance(area, Area) or area.kind == "pixel":
             raise InvalidQuery("area", expected=AREAS, got=repr(self.area))
         return area

@@ -16,7 +16,7 @@ from liftcore.query.edits import Edit
 from liftcore.query.objects import MOST_SPLATS, object_box, objects
 from liftcore.query.question import Answer, Box, Query
 from liftcore.query.scene import MOST_PIXELS, Scene
-from liftcore.query.terms import PixelBox, Stroke
+from liftcore.query.terms import Area
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.touching import REACH, spreads_along, touching_pairs
 
@@ -164,18 +164,19 @@ def _source(scene: Scene, edit: Edit, answer: Answer | None) -> np.ndarray:
     return splats_of_bits(bits, count)
 
 
-def area_mask(area: PixelBox | Stroke, size: tuple[int, int], radius: float) -> np.ndarray:
+def area_mask(area: Area, size: tuple[int, int], radius: float) -> np.ndarray:
     """Return the pixels of a box, or within a radius of a stroke, [H, W] bool; without parts outside the image.
 
     Args:
         size: width and height of the image.
     """
     mask = np.zeros(size[::-1], np.bool_)
-    if isinstance(area, PixelBox):
-        mask[max(0, area.y0) : max(0, area.y1), max(0, area.x0) : max(0, area.x1)] = True
+    if area.kind == "box":
+        (x0, y0), (x1, y1) = np.maximum(area.corners, 0).tolist()
+        mask[y0:y1, x0:x1] = True
         return mask
     reach = radius + ROUNDING
-    for begin, end in pairwise(np.array(area.pixels, np.float64)):
+    for begin, end in pairwise(np.array(area.corners, np.float64)):
         left, top = np.clip(np.ceil(np.minimum(begin, end) - reach), 0, size).astype(np.int64).tolist()
         right, bottom = np.clip(np.floor(np.maximum(begin, end) + reach) + 1, 0, size).astype(np.int64).tolist()
         along_x, along_y = (end - begin).tolist()

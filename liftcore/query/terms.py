@@ -15,6 +15,7 @@ Examples stand in place of words, "more of this":
 colons and commas: the notation is parsed from its end.
 """
 
+import math
 import re
 from dataclasses import dataclass
 
@@ -22,49 +23,24 @@ from liftcore.errors import InvalidQuery
 
 SETS = "object:N or selection:NAME"
 NOTATIONS = f"VIEW:x,y, VIEW:box:x0,y0,x1,y1, VIEW:stroke:x0,y0,x1,y1,..., splat:J, {SETS}"
-_PIXEL = re.compile(r"(.+):\s*(-?\d{1,9})\s*,\s*(-?\d{1,9})\s*", re.ASCII | re.DOTALL)
-_AREA = re.compile(r"(.+):(box|stroke):([^:]*)", re.ASCII | re.DOTALL)
-AREAS = (":box", ":stroke")  # ends of a pixel's view that look like an area without its corners
-_INTEGER = re.compile(r"\s*-?\d{1,9}\s*", re.ASCII)
+_NUMBER = r"\s*-?\d{1,9}\s*"
+_AREA = re.compile(rf"(.+?)(?::(box|stroke))?:({_NUMBER}(?:,{_NUMBER})*)", re.ASCII | re.DOTALL)
+CORNERS = {"pixel": (1, 1), "box": (2, 2), "stroke": (2, math.inf)}  # fewest and most
 _SPLAT = re.compile(r"splat:(\d{1,18})", re.ASCII)
 _SET = re.compile(r"object:(?P<object>\d{1,9})|selection:(?P<selection>[^:,]{1,100})", re.ASCII)
 
 
 @dataclass(frozen=True)
-class Pixel:
-    """A pixel of a camera's image."""
+class Area:
+    """A pixel, a box or a stroke of a camera's image; what is also around a box does not count."""
 
     view: str  # the name of a camera
-    x: int  # column of the camera's image, from the left
-    y: int  # row, from the top
+    kind: str  # pixel, box or stroke
+    corners: tuple[tuple[int, int], ...]  # column and row; of a box its first pixel and the one after its last
 
     def __str__(self) -> str:
-        return f"{self.view}:{self.x},{self.y}"
-
-
-@dataclass(frozen=True)
-class PixelBox:
-    """A box of a camera's image; what is also around it does not count."""
-
-    view: str  # the name of a camera
-    x0: int  # its first column, from the left
-    y0: int  # its first row, from the top
-    x1: int  # the column after its last one
-    y1: int  # the row after its last one
-
-    def __str__(self) -> str:
-        return f"{self.view}:box:{self.x0},{self.y0},{self.x1},{self.y1}"
-
-
-@dataclass(frozen=True)
-class Stroke:
-    """A line that is drawn on a camera's image."""
-
-    view: str  # the name of a camera
-    pixels: tuple[tuple[int, int], ...]  # column and row of its corners, two or more
-
-    def __str__(self) -> str:
-        return f"{self.view}:stroke:{','.join(f'{x},{y}' for x, y in self.pixels)}"
+        kind = "" if self.kind == "pixel" else f"{self.kind}:"
+        return f"{self.view}:{kind}{','.join(f'{x},{y}' for x, y in self.corners)}"
 
 
 @dataclass(frozen=True)
@@ -98,15 +74,12 @@ class Vector:
         return f"a vector of {len(self.values)} channels"
 
 
-Area = Pixel | PixelBox | Stroke  # of a camera's image
 Example = Area | SplatTerm | SplatSet | Vector
 Term = str | Example  # a text, or an example
 
 
 def parse_example(notation: str, argument: str = "like") -> Example:
     """Read the notation of an example.
-
-    Pixels are tried first, so a camera may be called "splat" or "v:box".
 
     Args:
         notation: as in the table above.
@@ -115,14 +88,15 @@ def parse_example(notation: str, argument: str = "like") -> Example:
     Raises:
         InvalidQuery: it is none of these notations.
     """
-    if pixel := _PIXEL.fullmatch(notation):
-        return Pixel(pixel[1], int(pixel[2]), int(pixel[3]))
     if splat := _SPLAT.fullmatch(notation):
         return SplatTerm(int(splat[1]))
     if members := _SET.fullmatch(notation):
         return _splat_set(members)
     if area := _AREA.fullmatch(notation):
-        return _area(notation, area, argument)
+        kind, numbers = area[2] or "pixel", list(map(int, area[3].split(",")))
+        least, most = CORNERS[kind]
+        if len(numbers) % 2 == 0 and least <= len(numbers) // 2 <= most:
+            return Area(area[1], kind, tuple(zip(numbers[::2], numbers[1::2], strict=True)))
     raise InvalidQuery(argument, expected=NOTATIONS, got=repr(notation[:120]))
 
 
@@ -136,18 +110,3 @@ def parse_set(notation: str, argument: str = "sets") -> SplatSet:
 def _splat_set(parts: re.Match[str]) -> SplatSet:
     kind, name = next((kind, name) for kind, name in parts.groupdict().items() if name is not None)
     return SplatSet(kind, str(int(name)) if kind == "object" else name)
-
-
-def _area(notation: str, parts: re.Match[str], argument: str) -> PixelBox | Stroke:
-    view, kind, coordinates = parts.groups()
-    numbers = [int(text) for text in coordinates.split(",") if _INTEGER.fullmatch(text)]
-    corners = tuple(zip(numbers[::2], numbers[1::2], strict=False))
-    if (
-        len(numbers) < coordinates.count(",") + 1
-        or len(numbers) % 2
-        or len(corners) < 2
-        or (kind == "box" and len(corners) > 2)
-    ):
-        expected = f"{kind}:x0,y0,x1,y1{'' if kind == 'box' else ',...'}, whole numbers of pixels"
-        raise InvalidQuery(argument, expected=expected, got=repr(notation[:120]))
-    return PixelBox(view, *corners[0], *corners[1]) if kind == "box" else Stroke(view, corners)

@@ -20,9 +20,8 @@ from liftcore.query.directions import directions, read_vector
 from liftcore.query.question import Query
 from liftcore.query.result import load_lift
 from liftcore.query.scene import Scene
-from liftcore.query.terms import Example, Pixel, PixelBox, SplatTerm, Stroke, Vector, parse_example
+from liftcore.query.terms import Area, Example, SplatTerm, Vector, parse_example
 from liftcore.query.threshold import find_threshold
-from liftcore.scene.cameras import Cameras
 from liftcore.values.lift_file import save_lift
 from tests.promises.tiny_files import write_lift
 from tests.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH
@@ -103,9 +102,9 @@ def test_every_kind_of_example_finds_its_cluster(scene: Scene, cluster: int) -> 
     splats = slice(cluster * SPLATS_A_CLUSTER, (cluster + 1) * SPLATS_A_CLUSTER)
     x = (6, 16, 26)[cluster]
     kinds: list[Example] = [
-        Pixel("middle", x, HEIGHT // 2),
-        PixelBox("middle", x - 4, 2, x + 5, HEIGHT - 2),
-        Stroke("middle", ((x, 6), (x + 1, 12), (x, 18))),
+        Area("middle", "pixel", ((x, HEIGHT // 2),)),
+        Area("middle", "box", ((x - 4, 2), (x + 5, HEIGHT - 2))),
+        Area("middle", "stroke", ((x, 6), (x + 1, 12), (x, 18))),
         SplatTerm(cluster * SPLATS_A_CLUSTER + 3),
         Vector(tuple(1e30 * np.eye(CHANNELS)[cluster])),
     ]
@@ -120,7 +119,7 @@ def test_pixel_is_the_feature_rendered_there(scene: Scene) -> None:
     features = torch.from_numpy(scene.features[:]).float()
     image = scene.raster.render(scene.cameras["middle"], features, scene.compositing)
     for x, y in ((5, 12), (16, 12), (26, 10)):
-        (direction,) = directions(scene, Query.of((Pixel("middle", x, y),)), None)
+        (direction,) = directions(scene, Query(like=[f"middle:{x},{y}"]), None)
         expected = torch.nn.functional.normalize(image[y, x], dim=0)
         np.testing.assert_allclose(direction, expected.numpy(), atol=1e-5)
 
@@ -160,11 +159,11 @@ def test_threshold_of_examples_is_above_a_least_likeness(scene: Scene) -> None:
 @pytest.mark.parametrize(
     ("example", "error", "message"),
     [
-        (Pixel("behind", 1, 1), NotFound, "behind"),
-        (Pixel("middle", WIDTH, 0), InvalidQuery, rf"0\.\.{WIDTH - 1}"),
-        (Pixel("middle", 0, 0), InvalidQuery, r"got a ray with an opacity of [\d.]+%"),
-        (PixelBox("middle", 0, 0, WIDTH + 1, 2), InvalidQuery, f"x1 <= {WIDTH}"),
-        (Stroke("middle", ((0, 0), (1, 1))), InvalidQuery, "an area that shows the scene"),
+        (parse_example("behind:1,1"), NotFound, "behind"),
+        (parse_example(f"middle:{WIDTH},0"), InvalidQuery, rf"0\.\.{WIDTH - 1}"),
+        (parse_example("middle:0,0"), InvalidQuery, r"got a ray with an opacity of [\d.]+%"),
+        (parse_example(f"middle:box:0,0,{WIDTH + 1},2"), InvalidQuery, f"x1 <= {WIDTH}"),
+        (parse_example("middle:stroke:0,0,1,1"), InvalidQuery, "an area that shows the scene"),
         (Vector((1.0,) * 7), InvalidQuery, "8 channels"),
         ("apple", InvalidQuery, "ask by example"),
     ],
@@ -182,19 +181,16 @@ def test_term_without_a_feature_says_why_under_its_name(
 
 @given(view=NAMES, x=st.integers(0, 9999), y=st.integers(0, 9999))
 def test_any_name_of_a_view_can_be_pointed_at(view: str, x: int, y: int) -> None:
-    points = (Pixel(view, x, y), Pixel(f"region:{view}", x, y), Pixel("splat", x, y), Pixel(f"{view}:box", x, y))
-    for example in (*points, PixelBox(view, x, y, y, x), Stroke(view, ((x, y), (y, x), (x, x)))):
+    corners = ((x, y), (y, x), (x, x))
+    points = [Area(name, "pixel", corners[:1]) for name in (view, f"region:{view}", "splat", "object")]
+    for example in (*points, Area(view, "box", corners[:2]), Area(view, "stroke", corners)):
         assert parse_example(str(example)) == example
 
 
 @pytest.mark.parametrize("area", ["box", "stroke"])
-def test_an_area_without_corners_is_a_pixel_only_of_a_view_so_named(scene: Scene, area: str) -> None:
-    unfinished = Query(like=[f"middle:{area}:6,12"])
+def test_an_area_without_its_corners_is_refused(scene: Scene, area: str) -> None:
     with pytest.raises(InvalidQuery, match="VIEW:box:x0,y0,x1,y1"):
-        scene.ask(unfinished)
-    scene.cameras = Cameras({**scene.cameras, f"middle:{area}": scene.cameras["middle"]})
-    selected = scene.ask(unfinished).selected
-    assert selected.any() and np.array_equal(selected, scene.ask(Query(like=["middle:6,12"])).selected)
+        scene.ask(Query(like=[f"middle:{area}:6,12"]))
 
 
 def test_vectors_come_from_numpy_files(tmp_path: Path) -> None:

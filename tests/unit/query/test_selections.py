@@ -10,7 +10,7 @@ import torch
 
 from liftcore.query.scene import Scene
 from liftcore.query.selections import area_mask
-from liftcore.query.terms import Stroke
+from liftcore.query.terms import Area
 from liftcore.raster.reference import ReferenceRaster
 from liftcore.scene.cameras import Camera
 from liftcore.scene.touching import touching_pairs
@@ -39,7 +39,7 @@ def test_stroke_marks_the_pixels_within_its_radius(radius: float) -> None:
             way = np.array([bx - ax, by - ay], np.float64)
             share = np.clip(((x - ax) * way[0] + (y - ay) * way[1]) / max(way @ way, 1.0), 0, 1)
             far = np.minimum(far, np.hypot(x - ax - share * way[0], y - ay - share * way[1]))
-        mask = area_mask(Stroke("view", tuple(map(tuple, corners))), (width, height), radius)
+        mask = area_mask(Area("view", "stroke", tuple(map(tuple, corners))), (width, height), radius)
         off_the_edge = np.abs(far - radius) > 1e-5
         assert (mask == (far <= radius))[off_the_edge].all() and mask[far == radius].all()
 
