@@ -278,7 +278,7 @@ def gltf_blocks(splats: Splats, document: Mapping[str, Any] | None = None) -> It
     if splats.kernel is not Kernel.GAUSSIAN_3D:
         extras["note"] = NEAREST.format(kernel=splats.kernel)
     asset: dict[str, Any] = {"version": "2.0", "generator": f"splatlift {__version__}", "extras": extras}
-    gltf: dict[str, Any] = {"asset": asset, "extensionsUsed": [EXTENSION]}
+    gltf: dict[str, Any] = {"extensionsUsed": [EXTENSION], "asset": asset}  # files are recognised by their beginning
     if sets:
         primitive["extensions"][FEATURES] = {"featureIds": [_feature_set(columns, name, sets) for name in sets]}
         gltf["extensionsUsed"].append(FEATURES)

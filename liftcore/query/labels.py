@@ -34,7 +34,8 @@ def labels(scene: Scene, source: Segmentation | Answer | Mapping[str, Answer] | 
     is a class; a splat that several select belongs to the one whose threshold it exceeds most. Of a tree, the
     instances are its objects and the classes their names, without names none; ``node_id`` is 1 + the id of the
     smallest node of a splat: object, part or group. 0 means none in all columns. ``score`` is the cosine to the word,
-    or the answer's score. ``confidence`` is that of a reweighted lift; other lifts have none.
+    or the answer's score. ``confidence`` is that of a reweighted lift, ``code`` of a lift as codes; other lifts have
+    none.
 
     Raises:
         InvalidQuery: no splat has a label, or more splats are selected than are grouped to objects.
@@ -162,6 +163,8 @@ def _labels(
     if scene.confidence is not None:
         confidence = np.where((classes > 0) | (instances > 0), scene.confidence, 0)
         columns["confidence"] = confidence.astype(np.float32)
+    if scene.features.code is not None:
+        columns["code"] = scene.features.code.astype(np.int32)
     class_rows = [
         {
             "class_id": value,

@@ -127,6 +127,15 @@ def test_an_edited_copy_of_the_splats_takes_their_codes(coded: lc.LiftResult) ->
     assert np.array_equal(copy.arrays()["code"], coded.arrays()["code"][keep])
 
 
+@pytest.mark.parametrize("suffix", [".ply", ".glb"])
+def test_labelled_splats_bring_their_codes(coded: lc.LiftResult, tmp_path: Path, suffix: str) -> None:
+    # Nearly each splat is an instance, so the document in the .glb is longer than the beginning that readers look at.
+    scene, path = lc.Scene(coded, row_of_splats(COUNT)), tmp_path / f"labelled{suffix}"
+    scene.export(path, scene.segment(WORDS, encoder="lvis"), "labelled")
+    codes = lc.read_splats(path).extras["code"].numpy()
+    assert np.array_equal(coded.arrays()["features"][codes], coded.with_exact_features().arrays()["features"])
+
+
 def test_features_that_share_nothing_stay_exact() -> None:
     rng = np.random.default_rng(0)
     for features in (rng.normal(size=(COUNT, 64)), rng.normal(size=(40, 64))):
