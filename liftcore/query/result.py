@@ -144,8 +144,10 @@ class LiftResult(Lift):
         if not isinstance(codes, str):
             facts = {"rows": len(codes.codebook), "loss": codes.loss}
             changes = {"features": torch.from_numpy(codes.codebook), "code": torch.from_numpy(codes.code)}
-            if lift.confidence is not None:  # so that the file takes two bytes for it
-                changes["confidence"] = lift.confidence.half().float()
+            for name in ("total_weight", "confidence"):  # so that the file takes two bytes for each
+                column = getattr(lift, name)
+                if column is not None and (rounded := column.half().float()).isfinite().all():
+                    changes[name] = rounded
         metadata = self.metadata.model_copy(update={"diagnostics": self.diagnostics | {"codes": facts}})
         return replace(lift, **changes, metadata=metadata)
 

@@ -6,9 +6,9 @@ i32, -1 for splats in none, and ``cluster_features`` [K, F]; where objects were 
 none, and ``object_views`` [N, 5] i32, and of the tree of objects, parts and groups ``node`` [P] i32, ``node_parents``
 [T] i32, ``node_views`` [T, 5] i32, ``node_confidence`` [T] f32 and ``node_features`` [T, F] f16 (`Lift`); of packs
 with words their vectors, ``embeddings`` [n, F] f32. A lift as codes (`liftcore.solve.codes`) has ``code`` [P] u16,
-the row of ``features`` [K, F] of each splat, whose first row is zero. Columns of i32, and the confidence, are written
-as i16 and f16 where that loses nothing. Its metadata hold settings, inputs with digests, the encoder, words, the
-diagnostics, timings and the version, as JSON.
+the row of ``features`` [K, F] of each splat, whose first row is zero. Columns of i32, total
+weight and confidence are written as i16 and f16 where that loses nothing. Its metadata hold settings, inputs with
+digests, the encoder, words, the diagnostics, timings and the version, as JSON.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ NODE_TENSORS = ("node", "node_parents", "node_views", "node_confidence", "node_f
 MOST_DEPTH = 63  # of a tree of nodes
 EMBEDDINGS = "embeddings"  # in lifts of packs with words
 NARROWED = {  # columns that take two bytes in the file, where that loses nothing
-    CONFIDENCE: np.float32, "cluster": np.int32, "object": np.int32, "node": np.int32,
+    "total_weight": np.float32, CONFIDENCE: np.float32, "cluster": np.int32, "object": np.int32, "node": np.int32,
 }  # fmt: skip
 SCHEMA = {  # types, and axes: P splats, K rows, F channels, C clusters, O objects, V views, N nodes, W words
-    "features": ("f2 f4", "K F"), "code": ("u2", "P"), "total_weight": ("f4", "P"), "has_feature": ("?", "P"),
+    "features": ("f2 f4", "K F"), "code": ("u2", "P"), "total_weight": ("f2 f4", "P"), "has_feature": ("?", "P"),
     CONFIDENCE: ("f2 f4", "P"), "cluster": ("i2 i4", "P"), "cluster_features": ("f2 f4", "C F"),
     "object": ("i2 i4", "P"), "object_views": ("i4", "O V"),
     "node": ("i2 i4", "P"), "node_parents": ("i4", "N"), "node_views": ("i4", "N V"), "node_confidence": ("f4", "N"),
