@@ -25,7 +25,7 @@ COMMANDS = {
     "check": "check that splats, cameras, photos and features match",
     "lift": "lift features onto splats",
     "transfer": "transfer a lift to an edited copy of its splats",
-    "plan": "plan a lift: views, memory and time",
+    "plan": "plan a lift: views and memory",
     "query": "find words and examples in a lift",
     "segment": "label every splat of a lift with the best of many words",
     "objects": "list the objects in a lift",

@@ -80,6 +80,12 @@ def test_documented_levels_of_quality_set_what_the_table_says() -> None:
         assert cells == [json.dumps(levels[level][name]).strip('"') for name in head]
 
 
+def test_table_of_settings_has_each_with_its_default() -> None:
+    rows = re.findall(r"^`(\w+)` \| `(\S+)` \| \S", text("docs/settings.md"), flags=re.MULTILINE)
+    defaults = LiftSettings.of().model_dump(mode="json")
+    assert rows == [(name, json.dumps(value).strip('"')) for name, value in defaults.items()]
+
+
 def _commands() -> dict[str, argparse.ArgumentParser]:
     actions = build_parser()._actions
     choices = next(action.choices for action in actions if isinstance(action, argparse._SubParsersAction))
