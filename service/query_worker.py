@@ -15,6 +15,7 @@ import sys
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlencode
@@ -266,7 +267,7 @@ class Answers:
         answer = self._answer(request) if "query" in request else None
         edit = Edit.model_validate(request["edit"])
         selection = _select(scene, EDITED, request["before"]).edit(edit, answer)
-        box = None if selection.box is None else {"low": selection.box.low, "high": selection.box.high}
+        box = None if selection.box is None else asdict(selection.box)
         bits = selection.bits.hex()
         return {"count": int(selection.splats.sum()), "box": finite(box), "bits": bits}
 

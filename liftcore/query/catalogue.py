@@ -59,7 +59,7 @@ def tree(scene: Scene, words: Sequence[str] = (), vectors: Any = None) -> SceneT
         if key not in scene.node_boxes:
             scene.node_boxes[key] = object_box(scene.splats, rows, scene.weights_of(rows))
         box = scene.node_boxes[key]
-        x, y, z = np.mean(box, axis=0).tolist()
+        x, y, z = np.mean([*box], axis=0).tolist()
         nodes.append(
             SceneNode(
                 id=node,

@@ -7,6 +7,7 @@ answer has its texts as the one class, and its objects as instances. A tree has 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -129,7 +130,7 @@ def _of_tree(scene: Scene, tree: SceneTree) -> Labels:
         numbers[node.id], scores[node.id] = class_of.get(node.name or "", 0), node.score or 0.0
         entry: dict[str, Any] = {"colour": colours[node.id], "score": node.score, "share": node.share}
         entry |= {"views": list(node.views)} | _facts(scene, np.flatnonzero(scene.members(node.id)), None)
-        nodes.append(_path(node) | entry | {"box": {"low": node.box[0], "high": node.box[1]}})
+        nodes.append(_path(node) | entry | {"box": asdict(node.box)})
     values = numbers[scene.object]  # the last entry is of splats without an object
     instances = [
         {"instance_id": node.id + 1, "class_id": int(numbers[node.id])} | entry
@@ -205,14 +206,13 @@ def _boxes(means: np.ndarray, weights: np.ndarray) -> dict[str, Any]:
 
     Both leave out a thousandth of the total weight at each end of each axis.
     """
-    low, high = trimmed_box(means, weights)
     middle = np.average(means, axis=0, weights=weights)
     spread = (means - middle).T @ ((means - middle) * weights[:, None])
     axes = np.linalg.eigh(spread)[1][:, ::-1].T  # rows, the longest first
     axes[2] = np.cross(axes[0], axes[1])  # right-handed
-    ends = np.array(trimmed_box((means - middle) @ axes.T, weights))
+    ends = np.array([*trimmed_box((means - middle) @ axes.T, weights)])
     return {
-        "box": {"low": low, "high": high},
+        "box": asdict(trimmed_box(means, weights)),
         "oriented_box": {
             "centre": (middle + ends.mean(axis=0) @ axes).tolist(),
             "axes": axes.tolist(),

@@ -79,7 +79,7 @@ def _grouped(scene: Scene, answer: Answer) -> Objects:
                 splats=int(inside.sum()),
                 share=float(weights[inside].sum() / weights.sum()),
                 score=float(np.average(answer.scores[members], weights=member_weights)),
-                centre=point_of(np.mean(box, axis=0)),
+                centre=point_of(np.mean([*box], axis=0)),
                 box=box,
                 size=size_of(scene.world, box),
             )

@@ -8,21 +8,19 @@ Nothing here imports numpy or torch, which help and the HTTP process do not need
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, get_args
 
 from pydantic import (
-    BaseModel,
     BeforeValidator,
     ConfigDict,
     Field,
-    GetCoreSchemaHandler,
     PlainSerializer,
     PrivateAttr,
     model_validator,
 )
-from pydantic_core import CoreSchema, core_schema
 
 from liftcore.errors import InvalidQuery
 from liftcore.query.terms import NOTATIONS, SETS, Example, SplatSet, Term, Vector, parse_example, parse_set
@@ -272,33 +270,18 @@ def _parse_examples(examples: list[Any], field: str) -> list[Example]:
     ]
 
 
-def _is_pair(value: Any) -> bool:
-    return isinstance(value, tuple | list) and len(value) == 2
+Corner = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(description="x y z")]
 
 
-class Box(NamedTuple):
+@dataclass(frozen=True)
+class Box:
     """An axis-aligned box, world frame."""
 
-    low: Point
-    high: Point
+    low: Corner
+    high: Corner
 
-    @classmethod
-    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Return a schema that writes an object with ``low`` and ``high`` as JSON."""
-        return core_schema.no_info_before_validator_function(
-            lambda value: cls(*value)._asdict() if _is_pair(value) else value,
-            core_schema.no_info_after_validator_function(lambda box: cls(**vars(box)), handler(Corners)),
-            serialization=core_schema.plain_serializer_function_ser_schema(
-                lambda box: Corners(low=box.low, high=box.high), return_schema=handler(Corners)
-            ),
-        )
-
-
-class Corners(BaseModel):
-    """An axis-aligned box, world frame, as JSON has it."""
-
-    low: tuple[Coordinate, Coordinate, Coordinate] = Field(description="x y z")
-    high: tuple[Coordinate, Coordinate, Coordinate]
+    def __iter__(self) -> Iterator[Point]:
+        return iter((self.low, self.high))
 
 
 class Value(PlainModel):

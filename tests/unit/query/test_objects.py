@@ -129,8 +129,8 @@ def test_tails_of_a_thousandth_are_not_in_the_box() -> None:
     assert (low[0], high[0]) == (2, 1998)  # two of 2001 below, two above
     weights = np.ones(2001)
     weights[-1] = 100.0
-    assert module.trimmed_box(means, weights)[1][0] == 2000
-    assert module.trimmed_box(means[:1], np.ones(1))[0] == (0, 0, 0)
+    assert module.trimmed_box(means, weights).high[0] == 2000
+    assert module.trimmed_box(means[:1], np.ones(1)).low == (0, 0, 0)
 
 
 def test_a_twentieth_of_the_weight_of_the_largest_makes_an_object(scene: Scene) -> None:

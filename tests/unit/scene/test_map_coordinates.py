@@ -194,7 +194,7 @@ def positions_of_answers(splats: Splats, cameras: Cameras, views: dict[str, Any]
     rows = [line.split(",")[5:14] for line in table_csv(listing).decode().splitlines()[1:]]
     return {
         "top": [item.position for item in best.top],
-        "box": best.box,
+        "box": list(best.box or ()),
         "objects": [point for item in parts.objects for point in (item.centre, *item.box)],
         "words": [point for item in words.named_words for point in item.box],
         "labels": [item["oriented_box"]["centre"] for item in document["instances"]],
