@@ -49,4 +49,5 @@ class SplatFormat(_Row, Enum):
 
 
 WRITERS = {row.suffix: row for row in SplatFormat if row.write}
-HTTP_SUFFIXES = (".ply", ".splat", ".spz", ".sog", ".glb")  # over HTTP, where no pickle is opened
+# Over HTTP, where no pickle is opened.
+HTTP_SUFFIXES = tuple(row.suffix for row in SplatFormat if row.read and row is not SplatFormat.CHECKPOINT)

@@ -17,7 +17,7 @@ from liftcore.features.encoders import ImageEncoder, Pixels, open_image_encoder
 from liftcore.features.folders import files_below, folders_of, grids_of
 from liftcore.io.cameras import read_cameras
 from liftcore.io.files import check_output, writing
-from liftcore.io.photos import UPRIGHT, PhotoHeader, Reading, header_of, open_photo, orientation_warnings
+from liftcore.io.photos import ORIENTATION, UPRIGHT, PhotoHeader, Reading, header_of, open_photo, orientation_warnings
 from liftcore.runtime.arguments import as_path, as_paths
 from liftcore.runtime.folders import scratch_folder
 from liftcore.runtime.progress import Progress, shown_progress
@@ -28,6 +28,7 @@ from liftcore.values.views import check_finite
 
 LARGEST_F16 = 65_504.0
 MAX_CELLS = 65_536  # of a grid: attention over more patches needs too much memory
+TURNED_BACK = {6: 8, 8: 6}  # of the turns that EXIF has, those that are not their own inverse
 PAPER = (255, 255, 255)  # the colour behind transparent pixels: white, as in captures without a background
 
 
@@ -184,9 +185,10 @@ def read_image(path: Path | str, size: tuple[int, int] | None = None) -> tuple[I
     with open_photo(Path(path)) as image:
         header = header_of(image)
         orientation = _reading(header, size)
-        if image.format == "TIFF" and orientation is Reading.STORED:
-            raise ValueError("a TIFF as it is stored, got one that Pillow turns as its EXIF asks; convert it to PNG")
         image.load()
+        if image.format == "TIFF" and orientation is Reading.STORED:  # which Pillow turned as it was loaded
+            image.getexif()[ORIENTATION] = TURNED_BACK.get(header.orientation, header.orientation)
+            return _colours(ImageOps.exif_transpose(image)), orientation
         return _colours(ImageOps.exif_transpose(image) if orientation is Reading.ORIENTED else image), orientation
 
 

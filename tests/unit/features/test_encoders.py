@@ -112,7 +112,7 @@ TURNS = {  # what a stored photo is, of the one that EXIF's orientation shows
 }
 
 
-@pytest.mark.parametrize("suffix", [".jpg", ".webp"])
+@pytest.mark.parametrize("suffix", [".jpg", ".webp", ".tif"])
 @pytest.mark.parametrize("tag", TURNS)
 def test_a_photo_is_read_in_the_orientation_of_its_camera(tag: int, suffix: str, tmp_path: Path) -> None:
     upright = np.zeros((48, 64, 3), np.uint8)
