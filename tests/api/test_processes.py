@@ -156,6 +156,17 @@ def test_query_process_that_is_killed_or_stopped_is_replaced(queries: QueryClien
     until(queries.is_ready)
 
 
+@pytest.mark.parametrize("change", [{"lift": None}, {"splats": 1}, {"kernel": "none"}, {"encoder": "lvis", "lift": []}])
+def test_unforeseen_error_fails_its_question_alone(queries: QueryClient, change: dict[str, Any]) -> None:
+    fault = fault_of_request(queries)
+    process = running()
+    with pytest.raises(Fault) as error:
+        queries.call(REQUEST | change)
+    assert (error.value.fault["status"], error.value.fault["type"]) == (500, "/problems/crashed")
+    assert fault_of_request(queries) == fault
+    assert running() == process  # the same one answers
+
+
 def test_calls_beyond_the_line_or_after_the_stop_are_refused(queries: QueryClient) -> None:
     outcomes = list[type[BaseException] | None]()
 
