@@ -12,15 +12,18 @@ from pathlib import Path
 
 from liftcore.lifting.files import lift_files
 from liftcore.raster.cpu.warm_up import warm_up
+from liftcore.scene.compositing import CompositingParams, Weighting
 from liftcore.scene.splats import Kernel
 from liftcore.values.settings import LiftSettings
 from tests.tiny_scene import make_scene
 
 
 def main() -> None:
-    """The kernels that are named, else every one; and a lift."""
+    """The kernels that are named, else every one; of 3D Gaussians each weighting; and a lift."""
     for kernel in map(Kernel, sys.argv[1:] or Kernel):
         warm_up(kernel)
+    warm_up(params=CompositingParams(opacity_logit_scale=1.2))
+    warm_up(weighting=Weighting(top_k=1))
     scene = make_scene()
     with tempfile.TemporaryDirectory() as name:
         files = {"splats.ply": scene.splats, "cameras.json": scene.cameras, "features.safetensors": scene.features}

@@ -65,7 +65,7 @@ def map_of(camera: lc.Camera, fit: str) -> np.ndarray:
 def share_right(scene: tuple[lc.Splats, lc.Cameras, np.ndarray], true_fit: str, fit: Any) -> float:
     splats, cameras, patches = scene
     views = {name: lc.FeatureGrid(map_of(camera, true_fit), fit=fit) for name, camera in cameras.items()}
-    result = lc.lift(splats, cameras, views, preset="row-sum", progress=False)
+    result = lc.lift(splats, cameras, views, preset="row-sum", diagnostic_rays=0, progress=False)
     return float((result.features.float().argmax(dim=1).numpy() == patches)[result.has_feature.numpy()].mean())
 
 
@@ -141,7 +141,7 @@ def test_maps_and_masks_of_a_distorted_photo_lie_where_it_shows_things(
         path = tmp_path / f"{name}.json"
         path.write_text(json.dumps({"w": WIDTH, "h": HEIGHT, "frames": frames, **lens}))
         with_lens = lc.read_cameras(path)
-        result = lc.lift(splats, with_lens, views, preset="row-sum", progress=False)
+        result = lc.lift(splats, with_lens, views, preset="row-sum", diagnostic_rays=0, progress=False)
         has_feature = result.has_feature.numpy()
         right[name] = (result.features.float().argmax(dim=1).numpy() == patches)[has_feature].mean()
         assert ("distorted photos" in " ".join(result.diagnostics["warnings"])) == bool(lens)

@@ -37,12 +37,8 @@ if TYPE_CHECKING:
 
 UNDECIDED = 0.03  # of rays too close to call in a weighting, which no comparison sees
 GAIN = CompositingParams(opacity_logit_scale=1.2)
-PARAMS = (
-    CompositingParams(),
-    GAIN,
-    CompositingParams(opacity_logit_scale=0.5),
-    CompositingParams(alpha_cap=0.999, transmittance_stop=0.05),
-)
+UNSCALED = (CompositingParams(), CompositingParams(alpha_cap=0.999, transmittance_stop=0.05))
+PARAMS = (*UNSCALED, GAIN, CompositingParams(opacity_logit_scale=0.5))
 SELECTIONS = (
     Weighting(1, top_k=1),
     Weighting(2, top_k=3),
@@ -59,10 +55,14 @@ every_footprint = pytest.mark.parametrize("footprint", FOOTPRINTS)
 def draw_case(
     data: st.DataObject, footprint: str, backend: Backend, *, strided: bool = False
 ) -> tuple[Splats, Camera, ViewFeatures, CompositingParams]:
-    """Draw a scene of the kernel, a view with its features, and parameters, with a stride if ``strided``."""
+    """Draw a scene of the kernel, a view with its features, and parameters, with a stride if ``strided``.
+
+    Strided weights of scaled opacities compile for 20 s a kernel: they are drawn of 3D Gaussians alone.
+    """
     kernel, antialiased = FOOTPRINTS[footprint]
     splats, camera, observation = data.draw(scenes(kernel, backend.splats, backend.size))
-    params = replace(data.draw(st.sampled_from(PARAMS)), antialiased=antialiased)
+    choices = UNSCALED if strided and kernel is not Kernel.GAUSSIAN_3D else PARAMS
+    params = replace(data.draw(st.sampled_from(choices)), antialiased=antialiased)
     if strided:
         stride = data.draw(st.integers(1, 5))
         left, top = (data.draw(st.integers(0, min(stride, side) - 1)) for side in (camera.width, camera.height))
@@ -115,12 +115,11 @@ def test_region_weights_and_total_weight_equal_the_oracle(footprint, backend):
         check_region_weights(backend.open(splats), splats, camera, observation, params, weighting)
 
 
-@every_footprint
 @every_backend
-def test_weights_that_count_equal_the_oracle_ray_by_ray(footprint, backend):
+def test_weights_that_count_equal_the_oracle_ray_by_ray(backend):
     @backend.holds(st.data(), st.sampled_from(SELECTIONS))
     def check(data, weighting) -> None:
-        splats, camera, _, params = draw_case(data, footprint, backend, strided=True)
+        splats, camera, _, params = draw_case(data, "3dgs", backend, strided=True)
         check_selected_weights(backend.open(splats), splats, camera, params, weighting)
 
 

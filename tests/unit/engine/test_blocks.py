@@ -26,7 +26,7 @@ from liftcore.values.settings import LiftSettings
 from tests.promises.scenes import look_at, random_grid, regions_of
 from tests.scenes import random_splats
 
-ROWS = 1 << 15  # of a block
+ROWS = 1 << 11  # of a block
 COUNT = 2 * ROWS + 500
 VIEWS = 10  # two pieces
 
@@ -176,4 +176,4 @@ def test_other_engines_go_on_from_the_pieces_of_each_stage(scene: dict[str, Any]
     result = in_blocks(Shuffled(2), stored, settings, folder=folder)
     expected = lc.lift(**scene, preset=settings)
     assert_same(result, expected)
-    assert result.diagnostics["reweighting"] == expected.diagnostics["reweighting"]
+    assert result.diagnostics["reweighting"] == pytest.approx(expected.diagnostics["reweighting"], rel=1e-12)

@@ -80,13 +80,16 @@ def stored(scene: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> d
     return {**scene, "views": lc.read_features(path)}
 
 
+DEADLY = ("gather", "solve", "weigh")  # steps: another worker, which takes seconds to start, repeats each
+
+
 class Deadly(RayEngine):
     """An engine whose workers die in some pieces, once each."""
 
     def run(self, work: Any, job: Any, pieces: int) -> Iterator[int]:
         def deadly(job: Any, piece: int, threads: int | None) -> None:
             mark = job.folder / f"{work.__name__}-{piece}.died"
-            if piece == 1 and not mark.exists():
+            if piece == 1 and work.__name__ in DEADLY and not mark.exists():
                 mark.touch()
                 os.kill(os.getpid(), signal.SIGKILL)
             work(job, piece, threads)
@@ -99,12 +102,11 @@ class Deadly(RayEngine):
 def test_workers_and_nodes_may_die(
     cluster: Any, stored: dict[str, Any], scene: dict[str, Any], tmp_path: Path
 ) -> None:
-    settings = LiftSettings.of(preset="default", diagnostic_rays=100)
+    settings = LiftSettings.of(preset="default", diagnostic_rays=0)
     expected = in_blocks(LocalEngine(1), stored, settings)
     folder = tmp_path / "killed"
     assert_same(in_blocks(Deadly("auto"), stored, settings, folder=folder), expected)
-    steps = ("compare", "contain", "gather", "join", "label", "relate", "share", "solve", "weigh")
-    assert sorted(path.name for path in folder.rglob("*.died")) == [f"{step}-1.died" for step in steps]
+    assert sorted(path.name for path in folder.rglob("*.died")) == [f"{step}-1.died" for step in DEADLY]
     third = cluster.add_node(num_cpus=1, object_store_memory=80_000_000)
 
     def remove(stage: str, completed: int, total: int, unit: str) -> None:
