@@ -156,7 +156,9 @@ def test_query_process_that_is_killed_or_stopped_is_replaced(queries: QueryClien
     until(queries.is_ready)
 
 
-@pytest.mark.parametrize("change", [{"lift": None}, {"splats": 1}, {"kernel": "none"}, {"encoder": "lvis", "lift": []}])
+@pytest.mark.parametrize(
+    "change", [{"lift": None}, {"splats": 1}, {"kernel": "none"}, {"encoder": "lvis", "lift": []}]
+)
 def test_unforeseen_error_fails_its_question_alone(queries: QueryClient, change: dict[str, Any]) -> None:
     fault = fault_of_request(queries)
     process = running()
