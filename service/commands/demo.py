@@ -128,17 +128,14 @@ def show(folder: Path, phrases: Sequence[str], url: str, out: Path, say: Callabl
         lift, took = lift_files(client, {kind: folder / name for kind, name in FILES.items()})
         views = tuple(truth.masks)
         say(f"Lifted {lift['channels']} channels onto {lift['count']:,} splats in {took:.1f} s.")
-        pictures = {"rgb": f"render-{views[0]}.png", "pca": f"features-{views[0]}.png"}
-        for channel, name in pictures.items():
-            parameters = {"lift": lift["id"], "view": views[0], "channel": channel}
-            (out / name).write_bytes(client.get("/render", params=parameters).content)
+        picture = f"render-{views[0]}.png"
+        render = client.get("/render", params={"lift": lift["id"], "view": views[0]})
+        (out / picture).write_bytes(render.content)
         phrases = phrases or truth.questions
-        # The first query opens the lift and is not timed.
-        client.get("/query", params={"lift": lift["id"], "text": phrases[0], "threshold": "0"})
         findings = [ask(client, lift["id"], phrase, truth, out, say) for phrase in phrases]
     return {
         "lift": lift["id"], "splats": lift["count"], "channels": lift["channels"], "views": lift["view_count"],
-        "lift_seconds": took, "diagnostics": lift["diagnostics"], "view": views[0], "pictures": pictures,
+        "lift_seconds": took, "diagnostics": lift["diagnostics"], "view": views[0], "picture": picture,
         "phrases": findings,
     }  # fmt: skip
 
@@ -147,32 +144,27 @@ def ask(
     client: httpx.Client, lift: str, phrase: str, truth: Truth, out: Path, say: Callable[[str], None]
 ) -> dict[str, Any]:
     """Ask one phrase: write its pictures, say what it selects, and return that."""
-    parameters, view, begin = {"lift": lift, "text": phrase}, next(iter(truth.masks)), time.perf_counter()
+    parameters, view = {"lift": lift, "text": phrase}, next(iter(truth.masks))
     answer = client.get("/query", params=parameters).json()
-    query_ms = 1e3 * (time.perf_counter() - begin)
     masks = {
         name: pixels(client.get("/query/mask", params=parameters | {"view": name}).content) > 0
         for name in truth.masks
     }
     slug = "-".join(re.findall(r"\w+", phrase.casefold()))
-    names = {picture: f"{slug}-{picture}-{view}.png" for picture in ("mask", "heat", "found")}
-    Image.fromarray(masks[view].astype(np.uint8) * 255).save(out / names["mask"])
+    names = {picture: f"{slug}-{picture}-{view}.png" for picture in ("heat", "found")}
     (out / names["heat"]).write_bytes(client.get("/query/attention", params=parameters | {"view": view}).content)
     shade = np.where(masks[view][..., None], 1.0, 0.35)
     picture = pixels((out / f"render-{view}.png").read_bytes()) * shade
     Image.fromarray(picture.astype(np.uint8)).save(out / names["found"])
-    label, iou = truth.name_of(masks), truth.mean_iou(phrase, masks)
+    iou = truth.mean_iou(phrase, masks)
     if answer["present"] is False:
         say(f'  "{phrase}" finds nothing\n      {answer["reason"]}')
     else:
         against = "" if iou is None else f", IoU {iou:.2f} against the truth of views that were not lifted"
-        say(f'  "{phrase}": {f"the {label}" if label else "something"}')
-        say(f"      {answer['count']:,} splats, {query_ms:.0f} ms{against}")
-        say(f"      {names['found']}")
+        say(f'  "{phrase}": {answer["count"]:,} splats{against}\n      {names["found"]}')
     return {
-        "phrase": phrase, "present": answer["present"], "reason": answer["reason"], "object": label,
-        "splats": answer["count"], "score": answer["top"][0]["score"] if answer["top"] else None,
-        "threshold": answer["threshold"]["value"], "query_ms": query_ms, "iou": iou, "pictures": names,
+        "phrase": phrase, "present": answer["present"], "reason": answer["reason"], "splats": answer["count"],
+        "threshold": answer["threshold"]["value"], "iou": iou, "pictures": names,
     }  # fmt: skip
 
 
@@ -192,12 +184,6 @@ class Truth:
     names: tuple[str, ...]  # object names
     masks: Mapping[str, np.ndarray]  # view -> [H, W] integers, rows of names; -1 = none
     questions: tuple[str, ...]  # phrases that show what it can do
-
-    def name_of(self, masks: Mapping[str, np.ndarray]) -> str | None:
-        """Return the name of the object with most pixels in these masks [H, W] bool; None if there is none."""
-        labels = np.concatenate([self.masks[view][mask] for view, mask in masks.items()])
-        counts = np.bincount(labels[labels >= 0], minlength=1)
-        return self.names[int(counts.argmax())] if counts.any() else None
 
     def mean_iou(self, phrase: str, masks: Mapping[str, np.ndarray]) -> float | None:
         """Return the mean intersection over union of masks [H, W] bool, over the views with the object named so."""
