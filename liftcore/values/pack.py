@@ -9,12 +9,11 @@ no encoder for queries by these.
 
 import errno
 import json
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import IO, Any, Protocol, cast
+from typing import IO, Any, NamedTuple, Protocol, cast
 
 import torch
 from torch import Tensor
@@ -22,7 +21,13 @@ from torch import Tensor
 from liftcore.errors import InvalidFeatures, InvalidTable, Unavailable, reading
 from liftcore.io.files import whole_file
 from liftcore.io.kinds import wrong_kind
-from liftcore.io.safetensors_file import MAX_HEADER_BYTES, TYPES, check_header, safetensors_header, tensor_bytes
+from liftcore.io.safetensors_file import (
+    MAX_HEADER_BYTES,
+    check_arrays,
+    check_header,
+    safetensors_header,
+    tensor_bytes,
+)
 from liftcore.runtime.arguments import as_path
 from liftcore.runtime.folders import scratch_folder
 from liftcore.runtime.progress import Progress, silent
@@ -36,28 +41,29 @@ from liftcore.values.views import MAX_CHANNELS, NO_LABEL, FeatureGrid, Regions, 
 
 U8_NO_LABEL = 255
 LARGEST_I16 = 32_767
-LABEL_TYPES = ("U8", "I16", "I32")
-FEATURE_TYPES = ("F16", "F32", "BF16")
-PARTS = ("labels", "codebook", "grid")
+FEATURE_TYPES = "f2 f4 bf16"
+PARTS = {"labels": ("u1 i2 i4", "L h w"), "codebook": (FEATURE_TYPES, "M F"), "grid": (FEATURE_TYPES, "h w F")}
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 TABLE = "embeddings"
 FIT = "map_fit"  # of the metadata: of the pack's grids
 MAX_TENSORS = 2 * MAX_VIEWS + 1  # of a pack: labels and a codebook a view, and its words
 
 
-@dataclass(frozen=True)
-class TensorSpec:
-    """Type and shape of a tensor, known before it is read."""
+class TensorSpec(NamedTuple):
+    """Type and shape of a tensor of a pack, known before it is read."""
 
-    dtype: str  # safetensors' name: "F16"
+    dtype: str  # as safetensors names it: "F16"
     shape: tuple[int, ...]
+
+
+Shapes = dict[str, tuple[int, ...]]  # of the tensors of a view: labels and codebook, or grid
 
 
 class _Source(Protocol):
     """Source of one view."""
 
     @property
-    def specs(self) -> Mapping[str, TensorSpec]: ...  # by part: labels and codebook, or grid
+    def shapes(self) -> Shapes: ...
     @property
     def fit(self) -> str: ...  # of a grid to its photo, "" for not recorded
     def read(self) -> ViewFeatures: ...
@@ -116,22 +122,21 @@ class Views(Mapping[str, ViewFeatures]):
 
     def is_regions(self, view: str) -> bool:
         """Return True if the view is a region map; else it is a grid."""
-        return "labels" in self._find(view).specs
+        return "labels" in self._find(view).shapes
 
-    def specs(self, view: str) -> dict[str, TensorSpec]:
-        """Return the tensors of a view by part (labels and codebook, or grid), from the header alone."""
-        specs = dict(self._find(view).specs)
+    def shapes(self, view: str) -> Shapes:
+        """Return the shapes of a view's tensors by part (labels and codebook, or grid), from the header alone."""
+        shapes = self._find(view).shapes
         camera = self.seeing(view)
         if camera is not None and (window := self.window(view, camera)) is not None:
             sides = (part.stop - part.start for part in (window.rows, window.columns))
-            return {"grid": replace(specs["grid"], shape=(*sides, specs["grid"].shape[2]))}
+            return {"grid": (*sides, shapes["grid"][2])}
         if camera is None or camera.lens is None:
-            return specs
-        if "grid" in specs:
-            height, width, channels = specs["grid"].shape
-            return {"grid": replace(specs["grid"], shape=(*grid_sides(height, width, camera), channels))}
-        levels = math.prod(specs["labels"].shape[:-2])
-        return specs | {"labels": replace(specs["labels"], shape=(levels, camera.height, camera.width))}
+            return shapes
+        if "grid" in shapes:
+            height, width, channels = shapes["grid"]
+            return {"grid": (*grid_sides(height, width, camera), channels)}
+        return shapes | {"labels": (shapes["labels"][0], camera.height, camera.width)}
 
     def fit(self, view: str) -> str:
         """Return the fit of a view's map to its photo; "" where it is not recorded, as of region maps."""
@@ -143,8 +148,8 @@ class Views(Mapping[str, ViewFeatures]):
 
     def map_size(self, view: str) -> tuple[int, int]:
         """Width and height of a view's labels or grid as they are stored, from the header alone."""
-        specs = self._find(view).specs
-        height, width = specs["labels"].shape[-2:] if "labels" in specs else specs["grid"].shape[:2]
+        shapes = self._find(view).shapes
+        height, width = shapes["labels"][1:] if "labels" in shapes else shapes["grid"][:2]
         return width, height
 
     def seen_by(self, views: Mapping[str, str], cameras: Mapping[str, Camera]) -> "Views":
@@ -376,10 +381,8 @@ class _MemoryView:
     name: str
 
     @property
-    def specs(self) -> Mapping[str, TensorSpec]:
-        return {
-            part: TensorSpec(TYPES[str(tensor.dtype)], tuple(tensor.shape)) for part, tensor in _parts(self.read())
-        }
+    def shapes(self) -> Shapes:
+        return {part: tuple(tensor.shape) for part, tensor in _parts(self.read())}
 
     @property
     def fit(self) -> str:
@@ -423,6 +426,10 @@ class _Stored:
         return {part: self.pack.specs[key] for part, key in keys.items() if key in self.pack.specs}
 
     @property
+    def shapes(self) -> Shapes:
+        return {part: spec.shape for part, spec in self.specs.items()}
+
+    @property
     def fit(self) -> str:
         return self.pack.metadata.get(FIT, "") if "grid" in self.specs else ""
 
@@ -462,10 +469,14 @@ def _open(path: Path) -> _PackFile:
 
 
 def _axes(name: str, shape: Sequence[int]) -> tuple[int, ...]:
-    """Return the shape of a tensor of a pack without axes of length 1 before its own, which values do without too."""
-    dimensions = {"labels": 3, "grid": 3, "codebook": 2}.get(name.rpartition("/")[2], len(shape))
-    extra = max(len(shape) - dimensions, 0)
-    return tuple(shape[extra:]) if all(side == 1 for side in shape[:extra]) else tuple(shape)
+    """Return the shape of a tensor of a pack with the axes of its part: others of length 1 before them go, and labels
+    [h, w] are one level.
+    """
+    part = name.rpartition("/")[2]
+    extra = len(shape) - len(PARTS[part][1].split()) if part in PARTS else 0
+    if part == "labels" and extra == -1:
+        return (1, *shape)
+    return tuple(shape[extra:]) if extra > 0 and all(side == 1 for side in shape[:extra]) else tuple(shape)
 
 
 def _view_names(tensors: Sequence[str]) -> list[str]:
@@ -484,15 +495,11 @@ def _check_specs(specs: Mapping[str, TensorSpec]) -> int:
     """Check the header of one view; its channels."""
     if set(specs) not in ({"grid"}, {"labels", "codebook"}):
         raise ValueError(f"labels with a codebook, or a grid, got {' with '.join(specs)}")
-    axes = {"grid": "h, w, F", "codebook": "M, F", "labels": "L, h, w"}
-    for part, spec in specs.items():
-        expected_axes = "h, w" if part == "labels" and len(spec.shape) == 2 else axes[part]
-        types = LABEL_TYPES if part == "labels" else FEATURE_TYPES
-        fits = len(spec.shape) == len(expected_axes.split()) and all(spec.shape) and spec.dtype in types
-        if not fits or (part != "labels" and spec.shape[-1] > MAX_CHANNELS):
-            expected = f"{part} {' or '.join(types)} [{expected_axes}], no side empty"
-            raise ValueError(f"{expected}, got {spec.dtype} {list(spec.shape)}")
-    return specs["grid" if "grid" in specs else "codebook"].shape[-1]
+    lengths = check_arrays(specs, PARTS)
+    if not all(lengths.values()) or lengths["F"] > MAX_CHANNELS:
+        got = " with ".join(f"{part} {list(spec.shape)}" for part, spec in specs.items())
+        raise ValueError(f"no side empty, and at most {MAX_CHANNELS} channels, got {got}")
+    return lengths["F"]
 
 
 def _table(packs: Sequence[_PackFile], channels: int) -> TableEncoder | None:

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import ceil
 from pathlib import Path
@@ -15,13 +15,17 @@ from scipy.sparse import csr_array
 from torch import Tensor
 
 from liftcore.errors import InvalidInput, reading
-from liftcore.io.safetensors_file import map_tensors, write_tensors
+from liftcore.io.safetensors_file import check_arrays, map_tensors, write_tensors
 from liftcore.runtime.arguments import check_count
 from liftcore.runtime.cores import cores
 from liftcore.runtime.memory import zeros
 from liftcore.runtime.one_line import one_line
 
 FORMAT = "splatlift-weights/2"
+SCHEMA = {  # of its tensors in a file; indptr and offsets have one more than there are rows and views
+    "splats": ("i4", "n"), "indptr": ("i8", "n+1"), "region": ("i4", "nnz"), "weight": ("f4", "nnz"),
+    "total_weight_splats": ("i4", "m"), "total_weight": ("f4 f8", "m"), "offsets": ("i8", "V+1"),
+}  # fmt: skip
 MEMORY_LIMIT = 1 << 28  # bytes of W that stay in memory; what is beyond lies in mapped files
 MOST_REGIONS = 2**31 - 1  # of all views: an entry names its region in four bytes
 BLOCK_ENTRIES = 1 << 17  # that a thread works on at a time, unless a splat alone has more
@@ -71,7 +75,7 @@ class RegionWeights:
 
     def tensors(self) -> dict[str, Tensor]:
         """Return its tensors by name."""
-        return {field.name: getattr(self, field.name) for field in fields(self) if field.name != "views"}
+        return {name: getattr(self, name) for name in SCHEMA}
 
     def cpu(self) -> Self:
         """Return the same on the CPU: all of it at once into pinned memory, as other copies wait for each part."""
@@ -165,15 +169,17 @@ class RegionWeights:
     @classmethod
     def load_with_others(cls, path: Path | str) -> tuple[Self, dict[str, Tensor]]:
         """Load the weights and the other tensors of the file."""
-        names, hint = [field.name for field in fields(cls) if field.name != "views"], "save it anew"
-        with reading("weights", InvalidInput, f"a file of {FORMAT}", hint):
+        with reading("weights", InvalidInput, f"a file of {FORMAT}", "save it anew"):
             arrays, metadata = map_tensors(Path(path))
-            if metadata.get("format") != FORMAT or not set(names) <= arrays.keys():
+            if metadata.get("format") != FORMAT or not SCHEMA.keys() <= arrays.keys():
                 raise ValueError("another safetensors file")
+            lengths = check_arrays(arrays, SCHEMA)
+            if lengths["n+1"] != lengths["n"] + 1:
+                raise ValueError(f"indptr of {lengths['n']} rows, got {lengths['n+1']} places")
+            views = tuple(json.loads(metadata["views"]))
         tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
-        extra_tensors = {name: tensor for name, tensor in tensors.items() if name not in names}
-        stored = {name: tensors[name] for name in names}
-        return cls(**stored, views=tuple(json.loads(metadata["views"]))), extra_tensors
+        stored = {name: tensors.pop(name) for name in SCHEMA}
+        return cls(**stored, views=views), tensors
 
 
 def one_view(

@@ -343,13 +343,12 @@ def _parts_a_tile(features: Views, view: str, settings: LiftSettings) -> int:
 
 def _levels(features: Views, view: str) -> int:
     """Return the number of levels of a view's region map; 1 for a grid."""
-    shape = features.specs(view)["labels"].shape if features.is_regions(view) else ()
-    return shape[0] if len(shape) == 3 else 1
+    return features.shapes(view)["labels"][0] if features.is_regions(view) else 1
 
 
 def _codebook(features: Views, view: str) -> tuple[int, ...]:
     """Return the shape of the view's codebook, or of its grid."""
-    return next(spec.shape for part, spec in features.specs(view).items() if part != "labels")
+    return next(shape for part, shape in features.shapes(view).items() if part != "labels")
 
 
 def check_device_memory(device: Device, splats: int, requested: str) -> list[str]:
