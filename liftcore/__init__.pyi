@@ -16,7 +16,6 @@ from liftcore.features.packing import retag_pack as retag_pack
 from liftcore.io.cameras import read_cameras as read_cameras
 from liftcore.io.splats import read_splats as read_splats
 from liftcore.io.splats import write_splats as write_splats
-from liftcore.lifting.checkpoint import Checkpoint as Checkpoint
 from liftcore.lifting.engines import LocalEngine as LocalEngine
 from liftcore.lifting.engines import open_engine as open_engine
 from liftcore.lifting.engines.ray import RayEngine as RayEngine

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liftcore import (
-    Checkpoint,
     Kernel,
     LiftResult,
     LiftSettings,
@@ -207,7 +206,7 @@ def lift(order: Order, report: Reporter) -> dict[str, Any]:
         threads=order["threads"],
         progress=report,
         on_plan=report_plan,
-        checkpoint=Checkpoint(Path(order["work"])),
+        checkpoint=order["work"],
         engine=open_engine(order["engine"], "auto" if order["engine"] == "ray" else None, order["threads"]),
     )
     lift, output = _as_clients_know(lift, order["file_names"]), Path(order["output"])

@@ -64,16 +64,16 @@ class SplatSupport:
 class Algebra:
     """W of a lift, and all that is computed of it, in this order."""
 
-    scene: Pieces
+    pieces: Pieces
     engine: Engine
     progress: Progress
     threads: int | None = None
     is_related: bool = False  # True if tuples are there, which objects and consensus share
 
-    def run(self, stage: str, step: Step, pieces: int) -> None:
-        """Run a step for all pieces, and report progress."""
-        for completed, _ in enumerate(self.engine.run(step, self.scene, pieces), start=1):
-            self.progress(stage, completed, pieces, "blocks")
+    def run(self, stage: str, step: Step, count: int) -> None:
+        """Run a step for all its pieces, and report progress."""
+        for completed, _ in enumerate(self.engine.run(step, self.pieces, count), start=1):
+            self.progress(stage, completed, count, "blocks")
 
     def find_objects(self) -> tuple[RegionObjects, NodeVectors]:
         """Group splats into objects that the masks of many views agree on, and objects into parts.
@@ -81,63 +81,63 @@ class Algebra:
         Returns:
             The objects, and the mean feature of each node's masks.
         """
-        scene = self.scene
+        pieces = self.pieces
         self._relate("objects")
-        sizes = np.concatenate([scene.load("relate", number)["sizes"] for number in range(scene.view_pieces)])
-        groups = steps.groups_of(scene)
+        sizes = np.concatenate([pieces.load("relate", number)["sizes"] for number in range(pieces.view_pieces)])
+        groups = steps.groups_of(pieces)
         nodes, other_masks = choose_nodes(groups, sizes)
-        scene.save("nodes", None, {"nodes": nodes, "other_masks": other_masks})
-        self.run("objects", steps.contain, scene.view_pieces)
-        parts = [scene.load("contain", number)["container"] for number in range(scene.view_pieces)]
+        pieces.save("nodes", None, {"nodes": nodes, "other_masks": other_masks})
+        self.run("objects", steps.contain, pieces.view_pieces)
+        parts = [pieces.load("contain", number)["container"] for number in range(pieces.view_pieces)]
         tree = region_tree(nodes, groups, np.concatenate(parts), self.threads)
         number = tree.parents.size
         if number and other_masks.size:
             self._label(0, tree)
-            tree = add_regions(tree, other_masks, scene.sums("labels-0"))
+            tree = add_regions(tree, other_masks, pieces.sums("labels-0"))
         self._label(1, tree)
-        labels, total_weight = scene.column("labels-1", "labels"), scene.column("rows", "total_weight")
-        view_weights = scene.table("labels-1", (1, number * groups.views)).reshape(number, groups.views)
+        labels, total_weight = pieces.column("labels-1", "labels"), pieces.column("rows", "total_weight")
+        view_weights = pieces.table("labels-1", (1, number * groups.views)).reshape(number, groups.views)
         objects = number_objects(labels, tree, node_numbering(labels, total_weight, tree), view_weights)
-        return objects, NodeVectors.of(scene.codebook, self._region_totals(), objects)
+        return objects, NodeVectors.of(pieces.codebook, self._region_totals(), objects)
 
     def _label(self, turn: int, tree: RegionTree) -> None:
-        self.scene.save(f"tree-{turn}", None, vars(tree))
-        self.scene = replace(self.scene, turn=turn)
-        self.run("objects", steps.label, self.scene.splat_pieces)
+        self.pieces.save(f"tree-{turn}", None, vars(tree))
+        self.pieces = replace(self.pieces, turn=turn)
+        self.run("objects", steps.label, self.pieces.splat_pieces)
 
     def _region_totals(self) -> np.ndarray:
         """Return the weight of each region, [M] f64."""
-        return self.scene.table("rows", (1, self.scene.codebook.regions))[0]
+        return self.pieces.table("rows", (1, self.pieces.codebook.regions))[0]
 
     def _relate(self, stage: str) -> None:
         """Number the tuples of regions to which splats belong, over all views, unless that is done."""
-        scene = self.scene
+        pieces = self.pieces
         if self.is_related:
             return
-        self.run(stage, steps.relate, scene.view_pieces)
+        self.run(stage, steps.relate, pieces.view_pieces)
         bases, parents, members = [0], list[np.ndarray](), list[np.ndarray]()
-        for number in range(scene.view_pieces):
-            part = scene.load("relate", number)
+        for number in range(pieces.view_pieces):
+            part = pieces.load("relate", number)
             parents.append(np.where(part["parents"] < 0, part["parents"], part["parents"] + np.int32(bases[-1])))
             members.append(part["members"].copy())
             bases.append(bases[-1] + parents[-1].size)
         arrays = {"parents": np.concatenate(parents), "members": np.concatenate(members)}
-        scene.save("tuples", None, arrays | {"bases": np.array(bases[:-1])})
-        self.run(stage, steps.join, scene.splat_pieces)
+        pieces.save("tuples", None, arrays | {"bases": np.array(bases[:-1])})
+        self.run(stage, steps.join, pieces.splat_pieces)
         self.is_related = True
 
     def compare_masks(self) -> None:
         """Compute the consensus of masks, for `reweight`."""
-        scene = self.scene
+        pieces = self.pieces
         self._relate("consensus")
-        bounds = np.concatenate([scene.load("rows", number)["bounds"] for number in range(scene.splat_pieces)])
+        bounds = np.concatenate([pieces.load("rows", number)["bounds"] for number in range(pieces.splat_pieces)])
         curve = np.stack([bounds.min(axis=0), bounds.max(axis=0)]) if bounds.size else bounds
-        scene.save("curve", None, {"bounds": curve})
-        self.run("consensus", steps.share, scene.view_pieces)
-        parts = [scene.load("share", number)["shares"] for number in range(scene.view_pieces)]
+        pieces.save("curve", None, {"bounds": curve})
+        self.run("consensus", steps.share, pieces.view_pieces)
+        parts = [pieces.load("share", number)["shares"] for number in range(pieces.view_pieces)]
         share_sum, share_count = np.sum(parts, axis=0)
-        scene.drop("relate", "join")
-        self.scene = replace(scene, usual_share=mean_share(int(share_sum), int(share_count)))
+        pieces.drop("relate", "join")
+        self.pieces = replace(pieces, usual_share=mean_share(int(share_sum), int(share_count)))
 
     def reweight(self, levels_apart: bool) -> float | None:
         """Prepare the factors of W, which `solve` applies; return the median reliability of regions.
@@ -148,31 +148,31 @@ class Algebra:
         Returns:
             None without masks.
         """
-        scene = self.scene = replace(self.scene, levels_apart=levels_apart)
-        codebook, mask = scene.codebook, scene.load("regions")["levels"] >= 0
-        entries = sum(scene.load("rows", number)["region"].size for number in range(scene.splat_pieces))
+        pieces = self.pieces = replace(self.pieces, levels_apart=levels_apart)
+        codebook, mask = pieces.codebook, pieces.load("regions")["levels"] >= 0
+        entries = sum(pieces.load("rows", number)["region"].size for number in range(pieces.splat_pieces))
         totals = torch.from_numpy(self._region_totals())
-        directions = RegionDirections.of(codebook, totals, entries, scene.settings.robust_directions)
+        directions = RegionDirections.of(codebook, totals, entries, pieces.settings.robust_directions)
         axes = {} if directions.axes is None else {"axes": directions.axes}
-        scene.save("directions", None, {"mean": directions.mean, "distances": directions.distances, **axes})
-        self.run("reweight", steps.compare, scene.splat_pieces)
-        groups = steps.compared_groups(scene)
-        sums = scene.table("cosines", (2, codebook.regions + int(groups.max(initial=0)) + 1))
-        scene.save("consistency", None, vars(SceneConsistency.of(sums, groups, mask)))
+        pieces.save("directions", None, {"mean": directions.mean, "distances": directions.distances, **axes})
+        self.run("reweight", steps.compare, pieces.splat_pieces)
+        groups = steps.compared_groups(pieces)
+        sums = pieces.table("cosines", (2, codebook.regions + int(groups.max(initial=0)) + 1))
+        pieces.save("consistency", None, vars(SceneConsistency.of(sums, groups, mask)))
         return median_reliability(sums, mask)
 
     def solve(self) -> tuple[Tensor, SplatSupport]:
         """Solve for X [P, F] in closed form."""
-        scene, dtype = self.scene, getattr(torch, self.scene.settings.dtype)
-        if dtype == torch.float16 and not scene.codebook.fits_float16():
+        pieces, dtype = self.pieces, getattr(torch, self.pieces.settings.dtype)
+        if dtype == torch.float16 and not pieces.codebook.fits_float16():
             dtype = torch.float32
-        scene = self.scene = replace(scene, dtype=dtype)
-        sums, total_weight = scene.column("rows", "sums"), torch.from_numpy(scene.column("rows", "total_weight"))
-        self.run("solve", steps.solve, scene.splat_pieces)
-        confidence = torch.from_numpy(scene.column("columns", "confidence")) if scene.settings.robust else None
-        return scene.features(), SplatSupport(sums, total_weight, confidence)
+        pieces = self.pieces = replace(pieces, dtype=dtype)
+        sums, total_weight = pieces.column("rows", "sums"), torch.from_numpy(pieces.column("rows", "total_weight"))
+        self.run("solve", steps.solve, pieces.splat_pieces)
+        confidence = torch.from_numpy(pieces.column("columns", "confidence")) if pieces.settings.robust else None
+        return pieces.features(), SplatSupport(sums, total_weight, confidence)
 
     def measure(self, X: Tensor) -> ViewMeasures:
         """Measure X on the sampled rays of all views."""
-        books = [view.rows for view in self.scene.codebook.views]
-        return measure_samples(self.scene.samples(), X, books, self.threads)
+        books = [view.rows for view in self.pieces.codebook.views]
+        return measure_samples(self.pieces.samples(), X, books, self.threads)

@@ -29,7 +29,6 @@ from llvmlite.binding import get_host_cpu_name
 from liftcore.errors import InvalidInput
 from liftcore.io.safetensors_file import tensor_bytes
 from liftcore.raster.base import RayRows, ViewWeights
-from liftcore.runtime.arguments import as_path
 from liftcore.runtime.version import __version__
 from liftcore.scene.origin import FILE_ORIGIN
 from liftcore.values.region_weights import FORMAT, RegionWeights
@@ -55,10 +54,6 @@ class Checkpoint:
 
     folder: Path
     identity: str = ""  # digest of the splats, the code and the device of all answers (`of`)
-
-    def __post_init__(self) -> None:
-        as_path(self.folder, "folder")
-        object.__setattr__(self, "folder", Path(self.folder))
 
     def of(
         self, splats: Splats, device: Mapping[str, Any], packages: Iterable[str] = ("raster", "scene")

@@ -9,7 +9,6 @@ from pathlib import Path
 from liftcore.errors import InvalidFeatures
 from liftcore.io.cameras import read_cameras
 from liftcore.io.splats import read_splats
-from liftcore.lifting.checkpoint import Checkpoint
 from liftcore.lifting.engines import Engine
 from liftcore.lifting.pipeline import lift, plan
 from liftcore.lifting.planning.plan import Plan
@@ -33,7 +32,7 @@ def lift_files(
     threads: int | None = None,
     progress: Progress | bool | None = None,
     on_plan: Callable[[Plan], None] | None = None,
-    checkpoint: Checkpoint | Path | str | None = None,
+    checkpoint: Path | str | None = None,
     engine: Engine | None = None,
 ) -> LiftResult:
     """Lift the features of packs onto the splats of a file, as `liftcore.lift` does, and store the files' digests.

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @one_thread()
-def scene_of(
+def pieces_of(
     geometry: Geometry,
     means: Tensor,
     settings: LiftSettings,
@@ -40,15 +40,15 @@ def scene_of(
         means: [P, 3], of the splats. names: of the views. memory_limit: bytes of X beyond which it is a mapped file.
     """
     W, book = geometry.weights, geometry.codebook
-    scene = Pieces(
+    pieces = Pieces(
         settings=settings, names=names, splats=W.splats.shape[0], channels=book.channels, memory_limit=memory_limit
     )
-    scene.arrays["scene", None] = {"means": means, "codebook": book, "samples": geometry.samples}
-    scene.save("regions", None, {"offsets": W.offsets, "levels": geometry.levels})
+    pieces.arrays["scene", None] = {"means": means, "codebook": book, "samples": geometry.samples}
+    pieces.save("regions", None, {"offsets": W.offsets, "levels": geometry.levels})
     tensors = {"splats": W.splats, "starts": W.indptr, "region": W.region, "weight": W.weight}
-    scene.save("weights", 0, tensors)
-    scene.save("rows", 0, *row_arrays(scene, W, means, geometry.total_weight(), threads))
-    return scene
+    pieces.save("weights", 0, tensors)
+    pieces.save("rows", 0, *row_arrays(pieces, W, means, geometry.total_weight(), threads))
+    return pieces
 
 
 def weigh_in_memory(
@@ -75,5 +75,7 @@ def weigh_in_memory(
         checkpoint=checkpoint.of(splats, plan.device.facts()) if checkpoint else None,
         first=first, on_first=check_first,
     )  # fmt: skip
-    scene = scene_of(geometry, splats.means, settings, views.names, threads=threads, memory_limit=plan.features_room)
-    return scene, WeightStatistics(plans[-1], geometry.levels, geometry.weights.region.shape[0], geometry.blind)
+    pieces = pieces_of(
+        geometry, splats.means, settings, views.names, threads=threads, memory_limit=plan.features_room
+    )
+    return pieces, WeightStatistics(plans[-1], geometry.levels, geometry.weights.region.shape[0], geometry.blind)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from liftcore.errors import InvalidSettings
 from liftcore.lifting.algebra import Algebra, SplatSupport, WeightStatistics
 from liftcore.lifting.checkpoint import Checkpoint
 from liftcore.lifting.engines import Engine, LocalEngine
-from liftcore.lifting.engines.lift import BlockFolder, block_folder
+from liftcore.lifting.engines.folder import engine_folder, weigh_in_files
 from liftcore.lifting.geometry import strided
 from liftcore.lifting.in_memory import weigh_in_memory
 from liftcore.lifting.inputs import LiftInputs
@@ -25,7 +26,8 @@ from liftcore.lifting.planning.plan import Plan, plan_lift
 from liftcore.query.result import LiftResult
 from liftcore.raster import open_raster
 from liftcore.raster.cpu.warm_up import warm_up
-from liftcore.runtime.device import choose_device, give_back_memory, within_memory
+from liftcore.runtime.arguments import as_path
+from liftcore.runtime.device import CPU, choose_device, give_back_memory, within_memory
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, Timings, shown_progress
 from liftcore.runtime.torch_modes import default_modes
@@ -60,7 +62,7 @@ def lift(
     progress: Progress | bool | None = None,
     on_plan: Callable[[Plan], None] | None = None,
     threads: int | None = None,
-    checkpoint: Checkpoint | Path | str | None = None,
+    checkpoint: Path | str | None = None,
     engine: Engine | None = None,
     **settings: Any,
 ) -> LiftResult:
@@ -100,53 +102,59 @@ def lift(
     inputs = LiftInputs.of(splats, cameras, views, preset, settings, threads)
     if on_plan is not None and not callable(on_plan):
         raise InvalidSettings("on_plan", expected="a function of the plan, or None", got=repr(on_plan)[:80])
-    checkpoint = _open_checkpoint(checkpoint)
-    log_once = WarningLog()
+    stored = None if checkpoint is None else Checkpoint(as_path(checkpoint, "checkpoint"))
+    logged = set[str]()
+
+    def log_once(warnings: Iterable[str]) -> None:
+        for warning in warnings:
+            if warning not in logged:
+                log.warning(warning)
+                logged.add(warning)
+
     show_plan = on_plan or (lambda plan: log_once(plan.warnings))
     with shown_progress(progress) as reporter, one_thread():
         timings = Timings(reporter)
-        if engine is None:
-            result = run(inputs, timings, show_plan, threads, checkpoint)
-        else:
-            with block_folder(engine, checkpoint.folder if checkpoint else None) as blocks:
-                result = run(inputs, timings, show_plan, threads, blocks=blocks)
+        with nullcontext() if engine is None else engine_folder(engine, stored) as folder:
+            result = _run(inputs, timings, show_plan, threads, stored, engine, folder)
     log_once(result.diagnostics["warnings"] if on_plan is None else ())
     return result
 
 
-def run(
+def _run(
     inputs: LiftInputs,
     timings: Timings,
     on_plan: Callable[[Plan], None],
-    threads: int | None = None,
-    checkpoint: Checkpoint | None = None,
-    blocks: BlockFolder | None = None,
+    threads: int | None,
+    checkpoint: Checkpoint | None,
+    engine: Engine | None,
+    folder: Path | None,
 ) -> LiftResult:
-    """Run all steps of a lift in memory, or in ``blocks``."""
-    splats, settings = inputs.splats, inputs.settings
-    device = choose_device(settings.device)
-    with timings.step("plan"):
-        if blocks is None:  # the weighing reports contradictions, by the views that it begins with
-            plan = plan_lift(splats, inputs.views, settings, device, threads)
-        else:
-            plan = blocks.plan(inputs, device, threads)
+    """Run all steps of a lift in memory, or by an engine in blocks in a folder."""
+    splats, settings, device = inputs.splats, inputs.settings, choose_device(inputs.settings.device)
+    if settings.device == "auto" and engine is not None and not isinstance(engine, LocalEngine):
+        device = CPU  # workers may have other GPUs than this machine, or none
+    with timings.step("plan"):  # in memory the weighing reports contradictions, by the views that it begins with
+        probe = folder is not None and bool(inputs.views.features.paths)
+        arguments = splats, inputs.views, settings, device, threads
+        plan = plan_lift(*arguments, in_blocks=folder is not None, folder=folder, probe=probe)
     with timings.step("compile"):  # a minute on a new machine
         warm_up(splats.kernel, plan.device, settings.compositing, settings.weighting)
     inputs = replace(inputs, views=inputs.views.only(plan.views))
     with within_memory(plan.device):
-        if blocks is None:
-            with timings.stage("geometry"):
-                scene, statistics = weigh_in_memory(inputs, plan, on_plan, timings, threads, checkpoint)
-            lift = _solve(scene, LocalEngine(threads), inputs, statistics, timings, threads)
-            is_in_file = scene.memory_limit is not None and lift.features.nbytes > scene.memory_limit
-            return lift if is_in_file else lift.to(plan.device.place)
         with timings.stage("geometry"):
-            job, statistics = blocks.weigh(inputs, plan, on_plan, timings)
-        return _solve(job, blocks.engine, inputs, statistics, timings, threads)  # X is mapped
+            if engine is None or folder is None:
+                pieces, statistics = weigh_in_memory(inputs, plan, on_plan, timings, threads, checkpoint)
+            else:
+                on_plan(plan)
+                pieces, statistics = weigh_in_files(engine, folder, inputs, plan, timings)
+        lift = _solve(pieces, engine or LocalEngine(threads), inputs, statistics, timings, threads)
+        room = plan.features_room
+        is_mapped = folder is not None or (room is not None and lift.features.nbytes > room)
+        return lift if is_mapped else lift.to(plan.device.place)
 
 
 def _solve(
-    scene: Pieces,
+    pieces: Pieces,
     engine: Engine,
     inputs: LiftInputs,
     statistics: WeightStatistics,
@@ -155,7 +163,7 @@ def _solve(
 ) -> LiftResult:
     """Run the steps after W is known."""
     settings, views, splats, aggregation = inputs.settings, inputs.views, inputs.splats, None
-    algebra = Algebra(scene, engine, timings.progress, threads)
+    algebra = Algebra(pieces, engine, timings.progress, threads)
     objects = node_vectors = reliability = None
     if settings.finds_objects(statistics.masks):
         with timings.stage("objects"):
@@ -210,15 +218,15 @@ def _optimum_facts(
     inputs: LiftInputs, plan: Plan, X: Tensor, support: SplatSupport, algebra: Algebra, threads: int | None
 ) -> dict[str, Any]:
     """Compare X with the least-squares optimum of the splats that have weights."""
-    settings, views, scene = inputs.settings, inputs.views, algebra.scene
+    settings, views, pieces = inputs.settings, inputs.views, algebra.pieces
 
     def read(number: int) -> tuple[Camera, ViewFeatures, CompositingParams]:
         camera, features = views[number]
         params = strided(settings.compositing, settings, camera, number)
         return camera, at_levels(features, settings.levels, camera.name), params
 
-    raster, books = open_raster(inputs.splats, plan.device, threads), [view.rows for view in scene.codebook.views]
-    arguments = map(read, range(len(views))), X, support.sums > 0, scene.samples(), books
+    raster, books = open_raster(inputs.splats, plan.device, threads), [view.rows for view in pieces.codebook.views]
+    arguments = map(read, range(len(views))), X, support.sums > 0, pieces.samples(), books
     return compare_with_optimum(raster, *arguments, settings, algebra.progress)
 
 
@@ -283,29 +291,3 @@ def plan(
     inputs = LiftInputs.of(splats, cameras, views, preset, settings, threads)
     device = choose_device(inputs.settings.device)
     return plan_lift(inputs.splats, inputs.views, inputs.settings, device, threads, in_blocks=in_blocks, probe=True)
-
-
-class WarningLog:
-    """Log each warning once. For lifts without ``on_plan``: few programs read the warnings in the diagnostics."""
-
-    def __init__(self) -> None:
-        self._previous = set[str]()
-
-    def __call__(self, warnings: Iterable[str]) -> None:
-        for warning in dict.fromkeys(warnings):
-            if warning not in self._previous:
-                log.warning(warning)
-        self._previous |= set(warnings)
-
-
-def _open_checkpoint(value: object) -> Checkpoint | None:
-    """Return the checkpoint, or that of a folder.
-
-    Raises:
-        InvalidSettings: the value is of another type.
-    """
-    if value is None or isinstance(value, Checkpoint):
-        return value
-    if isinstance(value, Path | str) and str(value):
-        return Checkpoint(Path(value))
-    raise InvalidSettings("checkpoint", expected="the path of a folder, or None", got=repr(value)[:80])

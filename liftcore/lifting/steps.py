@@ -1,6 +1,6 @@
 """The steps of a lift from W to X; a step works on a piece of views, or on a block of splats (`lifting.pieces`).
 
-A step is a function ``(scene, piece, threads)`` that loads the arrays of earlier steps and saves its own. Sums over
+A step is a function ``(pieces, piece, threads)`` that loads the arrays of earlier steps and saves its own. Sums over
 the scene are saved by pieces of splats (`liftcore.solve.sums`); `lifting.algebra` adds them up and saves the totals
 as tables. So the result is bitwise identical for any division of the scene.
 
@@ -66,19 +66,19 @@ def saved_as(name: str) -> Callable[[Callable[[Any, int, int | None], Saved]], S
     def decorate(compute: Callable[[Any, int, int | None], Saved]) -> Step:
         @wraps(compute)
         @one_thread()
-        def work(scene: Pieces, piece: int, threads: int | None) -> None:
-            step = name.format(scene.turn)
-            if not scene.has(step, piece):
-                scene.save(step, piece, *compute(scene, piece, threads))
+        def work(pieces: Pieces, piece: int, threads: int | None) -> None:
+            step = name.format(pieces.turn)
+            if not pieces.has(step, piece):
+                pieces.save(step, piece, *compute(pieces, piece, threads))
 
         return work
 
     return decorate
 
 
-def groups_of(scene: Pieces) -> RegionGroups:
+def groups_of(pieces: Pieces) -> RegionGroups:
     """Return the view and the level of each region."""
-    table = scene.load("regions")
+    table = pieces.load("regions")
     return RegionGroups.of(table["offsets"], table["levels"])
 
 
@@ -99,9 +99,13 @@ class ViewBlock(NamedTuple):
     W: RegionWeights  # a row for each; regions are numbered over all views
 
 
-def view_block(scene: Pieces, piece: int) -> ViewBlock:
+def view_block(pieces: Pieces, piece: int) -> ViewBlock:
     """Load W of a piece of views."""
-    arrays, numbers, offsets = scene.load("weights", piece), scene.views_of(piece), scene.load("regions")["offsets"]
+    arrays, numbers, offsets = (
+        pieces.load("weights", piece),
+        pieces.views_of(piece),
+        pieces.load("regions")["offsets"],
+    )
     base, region = int(offsets[numbers.start]), torch.from_numpy(arrays["region"])
     if base:
         region = values_of(region.shape[0], torch.int32)
@@ -112,13 +116,13 @@ def view_block(scene: Pieces, piece: int) -> ViewBlock:
 
 
 @saved_as("relate")
-def relate(scene: Pieces, piece: int, threads: int | None) -> Saved:
+def relate(pieces: Pieces, piece: int, threads: int | None) -> Saved:
     """Save the memberships and tuples of the splats of some views, and the count of splats in their regions."""
-    block, groups = view_block(scene, piece), groups_of(scene)
+    block, groups = view_block(pieces, piece), groups_of(pieces)
     own_region = memberships(block.W, groups, threads)
     lengths = np.diff(block.W.indptr.numpy())
     rows = np.flatnonzero(lengths)
-    rows = rows[along_curve(scene.means[torch.from_numpy(block.splats[rows]).long()])]  # so that tuples repeat
+    rows = rows[along_curve(pieces.means[torch.from_numpy(block.splats[rows]).long()])]  # so that tuples repeat
     tuples = splat_tuples(block.W, own_region, groups, rows)
     lengths[rows] = np.diff(tuples.starts)
     _, numbers = take_rows(tuples.starts, np.argsort(rows), tuples.tuples)
@@ -129,16 +133,18 @@ def relate(scene: Pieces, piece: int, threads: int | None) -> Saved:
     return arrays | {"parents": tuples.parents, "members": tuples.members}, (), None
 
 
-def tuples_of(scene: Pieces, splats: np.ndarray) -> tuple[SplatTuples, np.ndarray]:
+def tuples_of(pieces: Pieces, splats: np.ndarray) -> tuple[SplatTuples, np.ndarray]:
     """Load the tuples of some splats [n] ascending in all views, and their totals t_j [n] f64."""
-    ends = np.searchsorted(splats, [scene.bounds(block)[0] for block in range(scene.splat_pieces)] + [scene.splats])
+    ends = np.searchsorted(
+        splats, [pieces.bounds(block)[0] for block in range(pieces.splat_pieces)] + [pieces.splats]
+    )
     starts, totals = np.zeros(splats.size + 1, np.int64), np.zeros(splats.size)
     for target in (None, "filled"):
         tuples = values_of(int(starts[-1]) if target else 0, torch.int32).numpy()
         for block, (first, last) in enumerate(pairwise(ends.tolist())):
             if first == last:
                 continue
-            arrays, rows = scene.load("join", block), splats[first:last] - scene.bounds(block)[0]
+            arrays, rows = pieces.load("join", block), splats[first:last] - pieces.bounds(block)[0]
             if target is None:
                 starts[first + 1 : last + 1] = np.diff(arrays["starts"])[rows]
                 totals[first:last] = arrays["totals"][rows]
@@ -146,32 +152,36 @@ def tuples_of(scene: Pieces, splats: np.ndarray) -> tuple[SplatTuples, np.ndarra
                 tuples[starts[first] : starts[last]] = take_rows(arrays["starts"], rows, arrays["tuples"])[1]
         if target is None:
             np.cumsum(starts, out=starts)
-    table = scene.load("tuples")
+    table = pieces.load("tuples")
     return SplatTuples(starts, tuples, table["parents"], table["members"]), totals
 
 
 @saved_as("contain")
-def contain(scene: Pieces, piece: int, threads: int | None) -> Saved:
+def contain(pieces: Pieces, piece: int, threads: int | None) -> Saved:
     """Save the nodes that contain those of some views."""
-    block, groups, nodes = view_block(scene, piece), groups_of(scene), scene.load("nodes")["nodes"]
-    related = scene.load("relate", piece)
+    block, groups, nodes = view_block(pieces, piece), groups_of(pieces), pieces.load("nodes")["nodes"]
+    related = pieces.load("relate", piece)
     begins, rows = sample_splats(block.W, related["own_region"], related["sizes"], nodes, block.base)
     is_sampled = np.zeros(block.splats.size, np.bool_)
     is_sampled[rows] = True
     local, numbers = np.flatnonzero(is_sampled), (np.cumsum(is_sampled) - 1)[rows]
-    tuples, totals = tuples_of(scene, block.splats[local])
+    tuples, totals = tuples_of(pieces, block.splats[local])
     table = node_splats(begins, numbers, tuples, totals, nodes, groups.view.size)
     return {"container": node_containers(table, nodes, groups, threads)}, (), None
 
 
 @saved_as("share")
-def share(scene: Pieces, piece: int, threads: int | None) -> Saved:
+def share(pieces: Pieces, piece: int, threads: int | None) -> Saved:
     """Save the consensus of other views about the entries of some views."""
-    block, groups, own_region = view_block(scene, piece), groups_of(scene), scene.load("relate", piece)["own_region"]
+    block, groups, own_region = (
+        view_block(pieces, piece),
+        groups_of(pieces),
+        pieces.load("relate", piece)["own_region"],
+    )
     visible = np.flatnonzero(np.diff(block.W.indptr.numpy()))
-    bounds = torch.from_numpy(scene.load("curve")["bounds"])
-    order = along_curve(scene.means[torch.from_numpy(block.splats[visible]).long()], bounds)
-    tuples, totals = tuples_of(scene, block.splats[visible])
+    bounds = torch.from_numpy(pieces.load("curve")["bounds"])
+    order = along_curve(pieces.means[torch.from_numpy(block.splats[visible]).long()], bounds)
+    tuples, totals = tuples_of(pieces, block.splats[visible])
     tuples = SplatTuples(*take_rows(tuples.starts, order, tuples.tuples), tuples.parents, tuples.members)
     arguments = block.W, own_region, groups, visible[order], totals[order], tuples
     shares = region_shares(*arguments, base=block.base, threads=threads)
@@ -189,119 +199,119 @@ class SplatBlock(NamedTuple):
     means: Tensor  # [n, 3]
 
 
-def row_arrays(scene: Pieces, W: RegionWeights, means: Tensor, total_weight: Tensor, threads: int | None) -> Saved:
+def row_arrays(pieces: Pieces, W: RegionWeights, means: Tensor, total_weight: Tensor, threads: int | None) -> Saved:
     """Return what is saved of W of a block: its sums, total weight, bounds and, if read later, weights of regions."""
     sums, visible = W.row_sums(), means[W.indptr.diff() > 0]
     arrays = {"indptr": W.indptr, "region": W.region, "weight": W.weight, "sums": sums, "total_weight": total_weight}
     ends = [visible.amin(dim=0), visible.amax(dim=0)] if visible.numel() else []
     arrays["bounds"] = torch.stack(ends).double() if ends else torch.zeros(0, 3, dtype=torch.float64)
-    if not (scene.settings.robust or scene.settings.objects):
+    if not (pieces.settings.robust or pieces.settings.objects):
         return arrays, (), None
     return arrays, region_totals(W, threads), (1, int(W.offsets[-1]))
 
 
-def splat_block(scene: Pieces, piece: int) -> SplatBlock:
+def splat_block(pieces: Pieces, piece: int) -> SplatBlock:
     """Load W of a block of splats."""
-    arrays = scene.load("rows", piece)
+    arrays = pieces.load("rows", piece)
     region, weight = (torch.from_numpy(arrays[name]) for name in ("region", "weight"))
-    W = weights_of(arrays["indptr"], region, weight, scene.load("regions")["offsets"])
-    return SplatBlock(W, scene.means[slice(*scene.bounds(piece))])
+    W = weights_of(arrays["indptr"], region, weight, pieces.load("regions")["offsets"])
+    return SplatBlock(W, pieces.means[slice(*pieces.bounds(piece))])
 
 
 @saved_as("join")
-def join(scene: Pieces, piece: int, threads: int | None) -> Saved:
+def join(pieces: Pieces, piece: int, threads: int | None) -> Saved:
     """Save the tuples of a block of splats in all views, and the sums of its rows of W."""
-    bases, ends = scene.load("tuples")["bases"], scene.bounds(piece)
+    bases, ends = pieces.load("tuples")["bases"], pieces.bounds(piece)
 
     def parts() -> Iterator[SomeRows]:
         for number, base in enumerate(bases):
-            arrays = scene.load("relate", number)
+            arrays = pieces.load("relate", number)
             part = part_of(arrays["splats"], arrays["starts"], [arrays["tuples"]], ends)
             yield SomeRows(part.rows, part.starts, [part.values[0] + np.int32(base)])
 
     starts, (tuples,) = gather_rows(parts, ends[1] - ends[0], (torch.int32,))
-    return {"starts": starts, "tuples": tuples, "totals": scene.load("rows", piece)["sums"]}, (), None
+    return {"starts": starts, "tuples": tuples, "totals": pieces.load("rows", piece)["sums"]}, (), None
 
 
 @saved_as("labels-{}")
-def label(scene: Pieces, piece: int, threads: int | None) -> Saved:
+def label(pieces: Pieces, piece: int, threads: int | None) -> Saved:
     """Save the smallest node of each splat, and the weight of nodes: at first in other regions, then in views."""
-    W, groups, tree = splat_block(scene, piece).W, groups_of(scene), RegionTree(**_tree(scene))
+    W, groups, tree = splat_block(pieces, piece).W, groups_of(pieces), RegionTree(**_tree(pieces))
     labels, number = node_labels(W, groups, tree, threads), tree.parents.size
-    if scene.turn == 0:
-        other_masks = scene.load("nodes")["other_masks"]
+    if pieces.turn == 0:
+        other_masks = pieces.load("nodes")["other_masks"]
         return {"labels": labels}, node_shares(W, labels, number, other_masks, threads), None
     return {"labels": labels}, view_shares(W, groups, labels, number, threads), (1, number * groups.views)
 
 
-def _tree(scene: Pieces) -> dict[str, Any]:
+def _tree(pieces: Pieces) -> dict[str, Any]:
     names = "region", "parents", "confidence"
-    return {name: scene.load(f"tree-{scene.turn}")[name] for name in names}
+    return {name: pieces.load(f"tree-{pieces.turn}")[name] for name in names}
 
 
-def compared_groups(scene: Pieces) -> np.ndarray:
+def compared_groups(pieces: Pieces) -> np.ndarray:
     """Return the group of each region [M] i8, in which regions are compared: one, or the levels."""
-    levels = scene.load("regions")["levels"]
+    levels = pieces.load("regions")["levels"]
     groups = np.unique(levels, return_inverse=True)[1].astype(np.int8)
-    return groups if scene.levels_apart else np.zeros_like(groups)
+    return groups if pieces.levels_apart else np.zeros_like(groups)
 
 
 @saved_as("cosines")
-def compare(scene: Pieces, piece: int, threads: int | None) -> Saved:
+def compare(pieces: Pieces, piece: int, threads: int | None) -> Saved:
     """Save the cosines of regions with their sums over the scene."""
-    block, levels = splat_block(scene, piece), scene.load("regions")["levels"]
-    reweighter = BlockReweighter(block.W, compared_groups(scene), block.means, threads)
-    cosines, sums = reweighter.cosines(_directions(scene), by_region=bool((levels >= 0).any()))
+    block, levels = splat_block(pieces, piece), pieces.load("regions")["levels"]
+    reweighter = BlockReweighter(block.W, compared_groups(pieces), block.means, threads)
+    cosines, sums = reweighter.cosines(_directions(pieces), by_region=bool((levels >= 0).any()))
     return {"cosines": cosines}, sums, reweighter.shape
 
 
-def _directions(scene: Pieces) -> RegionDirections:
-    arrays = scene.load("directions")
+def _directions(pieces: Pieces) -> RegionDirections:
+    arrays = pieces.load("directions")
     parts = {name: torch.from_numpy(arrays[name]) for name in ("mean", "distances", "axes") if name in arrays}
-    return RegionDirections(scene.codebook, **parts)
+    return RegionDirections(pieces.codebook, **parts)
 
 
 def reweighted(
-    scene: Pieces, piece: int, block: SplatBlock, threads: int | None
+    pieces: Pieces, piece: int, block: SplatBlock, threads: int | None
 ) -> tuple[RegionWeights, Tensor | None]:
     """Compute W of a block after the robust step, and the confidence of splats [n]; None without the step."""
-    if not scene.settings.robust:
+    if not pieces.settings.robust:
         return block.W, None
-    scores, consensus = np.zeros((2, block.means.shape[0])), consensus_of(scene, piece, block.W, threads)
-    factors, facts = scene.writable(scene.load("cosines", piece)["cosines"]), scene.load("consistency")
+    scores, consensus = np.zeros((2, block.means.shape[0])), consensus_of(pieces, piece, block.W, threads)
+    factors, facts = pieces.writable(pieces.load("cosines", piece)["cosines"]), pieces.load("consistency")
     consistency = SceneConsistency(*(facts[name] for name in ("mean_cosines", "powers", "regions")))
-    BlockReweighter(block.W, compared_groups(scene), None, threads).weigh(factors, consistency, consensus, scores)
+    BlockReweighter(block.W, compared_groups(pieces), None, threads).weigh(factors, consistency, consensus, scores)
     return scale_weights(block.W, factors), confidence_of(scores)
 
 
-def consensus_of(scene: Pieces, piece: int, W: RegionWeights, threads: int | None) -> Tensor | None:
+def consensus_of(pieces: Pieces, piece: int, W: RegionWeights, threads: int | None) -> Tensor | None:
     """Compute c_jm of the entries of a block [nnz] f32; None if no view has masks."""
-    if scene.usual_share is None:
+    if pieces.usual_share is None:
         return None
-    if scene.view_pieces == scene.splat_pieces == 1:  # the entries are in this order
-        arrays = scene.load("share", 0)
-        sums, views = scene.writable(arrays["sums"]), torch.from_numpy(arrays["views"])
+    if pieces.view_pieces == pieces.splat_pieces == 1:  # the entries are in this order
+        arrays = pieces.load("share", 0)
+        sums, views = pieces.writable(arrays["sums"]), torch.from_numpy(arrays["views"])
     else:
         sums, views = (values_of(W.region.shape[0], dtype) for dtype in (torch.float32, torch.uint8))
-        files = (scene.load("share", number) for number in range(scene.view_pieces))
+        files = (pieces.load("share", number) for number in range(pieces.view_pieces))
         parts = (
-            part_of(arrays["splats"], arrays["starts"], (arrays["sums"], arrays["views"]), scene.bounds(piece))
+            part_of(arrays["splats"], arrays["starts"], (arrays["sums"], arrays["views"]), pieces.bounds(piece))
             for arrays in files
         )
         fill_rows(parts, W.indptr.numpy(), [sums.numpy(), views.numpy()])
-    with_mean(sums.numpy(), views.numpy(), scene.usual_share, threads)
+    with_mean(sums.numpy(), views.numpy(), pieces.usual_share, threads)
     return sums
 
 
 @saved_as("columns")
-def solve(scene: Pieces, piece: int, threads: int | None) -> Saved:
+def solve(pieces: Pieces, piece: int, threads: int | None) -> Saved:
     """Save X of a block of splats, and their confidence."""
-    block = splat_block(scene, piece)
-    W, confidence = reweighted(scene, piece, block, threads)
-    sums, means = None if W is not block.W else torch.from_numpy(scene.load("rows", piece)["sums"]), block.means
+    block = splat_block(pieces, piece)
+    W, confidence = reweighted(pieces, piece, block, threads)
+    sums, means = None if W is not block.W else torch.from_numpy(pieces.load("rows", piece)["sums"]), block.means
     del block
-    scene.drop("rows", "weights", "share", "cosines")  # in memory W is now that of the solve alone
-    X = scene.new_features(piece)
-    solve_rows(X, W, scene.codebook, sums=sums, means=means, threads=threads)
-    scene.save_features(piece, X)
+    pieces.drop("rows", "weights", "share", "cosines")  # in memory W is now that of the solve alone
+    X = pieces.new_features(piece)
+    solve_rows(X, W, pieces.codebook, sums=sums, means=means, threads=threads)
+    pieces.save_features(piece, X)
     return {} if confidence is None else {"confidence": confidence}, (), None

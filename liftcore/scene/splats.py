@@ -516,7 +516,8 @@ def chosen_rows(keep: Rows, count: int) -> Tensor:
             selection = np.asarray(selection)
             selection = selection[:, 0] if selection.shape[1:] == (1,) else selection
             selection = selection if selection.size else slice(0)  # an empty list has no type
-        rows = np.arange(count)[selection]
+        is_slice = isinstance(selection, slice)
+        rows = np.arange(*selection.indices(count)) if is_slice else np.arange(count)[selection]
         if rows.ndim != 1:
             raise IndexError(f"{keep!r}")
     except (IndexError, TypeError, ValueError) as error:

@@ -30,10 +30,10 @@ GRIDS = {"default", "smooth"}
 class ShuffledEngine(lc.LocalEngine):
     """An engine that runs pieces in another order, and the first of them twice, as a cluster may."""
 
-    def run(self, work: Any, job: Any, pieces: int) -> Iterator[int]:
-        order = np.random.default_rng(pieces).permutation(pieces).tolist()
+    def run(self, work: Any, pieces: Any, count: int) -> Iterator[int]:
+        order = np.random.default_rng(count).permutation(count).tolist()
         for piece in [*order, order[0]]:
-            work(job, piece, self.threads)
+            work(pieces, piece, self.threads)
         yield from order
 
 
@@ -159,7 +159,7 @@ def test_checkpoint_serves_the_same_geometry_and_features_alone(regions: RandomS
 
 @pytest.mark.parametrize("damage", ["cut", "noise"])
 def test_damaged_checkpoint_is_computed_again(damage: str, regions: RandomScene, tmp_path: Path) -> None:
-    expected = lift(regions, checkpoint=lc.Checkpoint(tmp_path))
+    expected = lift(regions, checkpoint=str(tmp_path))
     answers = [path for path in tmp_path.rglob("*") if path.is_file()]
     assert len(answers) >= 4
     (tmp_path / "thesis.tex").write_text("words")

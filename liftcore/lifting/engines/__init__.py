@@ -23,7 +23,7 @@ ENGINES = ("local", "ray")
 
 
 class Engine(Protocol):
-    """A runner of the pieces of a job, each at least once. A piece reads files and writes others atomically.
+    """A runner of the pieces of a lift, each at least once. A piece reads files and writes others atomically.
 
     So a piece may be repeated elsewhere: the lift is bitwise identical for any assignment and order of pieces.
     """
@@ -33,8 +33,8 @@ class Engine(Protocol):
         """A folder that all workers share, for lifts without a checkpoint; None: the system's temporary folder."""
         ...
 
-    def run(self, work: Work, job: Pieces, pieces: int) -> Iterator[int]:
-        """Run ``work(job, piece, threads)`` for all pieces below ``pieces``; yield each finished one, in any order.
+    def run(self, work: Work, pieces: Pieces, count: int) -> Iterator[int]:
+        """Run ``work(pieces, piece, threads)`` for all below ``count``; yield each finished one, in any order.
 
         Raises:
             SplatliftError, OSError: an error of a piece. Unavailable: no worker can run a piece.
@@ -60,10 +60,10 @@ class LocalEngine:
     def __repr__(self) -> str:
         return one_line(self, f"threads={self.threads}")
 
-    def run(self, work: Work, job: Pieces, pieces: int) -> Iterator[int]:
+    def run(self, work: Work, pieces: Pieces, count: int) -> Iterator[int]:
         """See the protocol."""
-        for piece in range(pieces):
-            work(job, piece, self.threads)
+        for piece in range(count):
+            work(pieces, piece, self.threads)
             yield piece
 
 

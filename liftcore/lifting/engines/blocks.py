@@ -1,4 +1,4 @@
-"""A lift in blocks: the job that all workers receive, and its first steps, W of views and of blocks, all in files.
+"""A lift in blocks: its pieces in files, which all workers read, and its first steps, W of views and of blocks.
 
 **Weighing** (`weigh`) reads PIECE_VIEWS views. For each it writes a file of the codebook E of its regions and its
 sampled rays, and for all of them one file of ``W = A'^T S``. The rows of W are splats: a block of splats is
@@ -23,7 +23,7 @@ from torch import Tensor
 
 from liftcore.io.safetensors_file import map_tensors, tensor_bytes, write_tensors
 from liftcore.lifting.geometry import weigh_views
-from liftcore.lifting.pieces import PIECE_VIEWS, SELECTED, Pieces, Shape, SomeRows, gather_rows, part_of, values_of
+from liftcore.lifting.pieces import PIECE_VIEWS, Pieces, Shape, SomeRows, gather_rows, part_of, values_of
 from liftcore.lifting.steps import Saved, row_arrays, saved_as, weights_of
 from liftcore.raster import open_raster
 from liftcore.raster.base import RayRows
@@ -44,18 +44,18 @@ SCENE = "scene.safetensors"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Job(Pieces):
-    """A lift in blocks, as every worker receives it: arrays are files, whose paths are valid on all workers."""
+class PiecesInFiles(Pieces):
+    """The pieces of a lift in blocks, as every worker receives them: files, whose paths are valid on all workers."""
 
     folder: Path  # of the pieces
     packs: tuple[Path, ...]  # of the features
     cameras: Cameras
     kernel: Kernel
-    selected: int = SELECTED
+    selected: int  # splats of scenes that workers load as a whole
 
     @property
     def means(self) -> Tensor:
-        return scene_of(self).means
+        return splats_of(self).means
 
     @property
     def codebook(self) -> Codebook:
@@ -148,23 +148,28 @@ def forget_files() -> None:
 
 
 @one_thread()
-def weigh(job: Job, piece: int, threads: int | None) -> None:
+def weigh(pieces: PiecesInFiles, piece: int, threads: int | None) -> None:
     """Write W, E and sampled rays of a few views, unless they are there.
 
     Raises:
         InvalidFeatures: a view is malformed.
     """
-    if job.has("weights", piece):
+    if pieces.has("weights", piece):
         return
-    packs, numbers = packs_at(job.packs, tuple(map(file_version, job.packs))), job.views_of(piece)
-    views = LiftViews(job.cameras, pair(packs, job.cameras)[0], job.names, [])
-    splats, ids = visible_splats(job, [views.camera(number) for number in numbers], threads)
-    arguments = open_raster(splats, choose_device(job.settings.device), threads), splats.count, views, job.settings
-    by_rows = job.settings.weighs_rows
+    packs, numbers = packs_at(pieces.packs, tuple(map(file_version, pieces.packs))), pieces.views_of(piece)
+    views = LiftViews(pieces.cameras, pair(packs, pieces.cameras)[0], pieces.names, [])
+    splats, ids = visible_splats(pieces, [views.camera(number) for number in numbers], threads)
+    arguments = (
+        open_raster(splats, choose_device(pieces.settings.device), threads),
+        splats.count,
+        views,
+        pieces.settings,
+    )
+    by_rows = pieces.settings.weighs_rows
     geometry = weigh_views(*arguments, silent, by_rows=by_rows, threads=threads, numbers=numbers)
     for number, view, sample in zip(numbers, geometry.codebook.views, geometry.samples, strict=True):
         rows = replace(sample.rows, splats=ids[sample.rows.splats.long()])
-        _write_view(job.view_file(number), view, replace(sample, rows=rows))
+        _write_view(pieces.view_file(number), view, replace(sample, rows=rows))
     W = geometry.weights
     has_row = torch.nonzero(W.indptr.diff())[:, 0]
     arrays = {
@@ -178,28 +183,28 @@ def weigh(job: Job, piece: int, threads: int | None) -> None:
         "levels": geometry.levels,
         "blind": np.array([name in geometry.blind for name in W.views]),
     }
-    job.save("weights", piece, arrays)
+    pieces.save("weights", piece, arrays)
 
 
-def visible_splats(job: Job, cameras: list[Camera], threads: int | None) -> tuple[Splats, Tensor]:
+def visible_splats(pieces: PiecesInFiles, cameras: list[Camera], threads: int | None) -> tuple[Splats, Tensor]:
     """Select the splats that the raster's projection puts into any of the images, with their numbers [n] i32.
 
     All splats where they are few; the first one alone where none is visible. The order stays, so that rays meet the
     same splats in the same order as in the full scene.
     """
-    scene = scene_of(job)
-    if job.splats <= job.selected:
-        return scene, torch.arange(job.splats, dtype=torch.int32)
-    params, visible = job.settings.compositing, np.zeros(job.splats, bool)
-    device = choose_device(job.settings.device)
-    for first in range(0, job.splats, STEP):
-        last = min(first + STEP, job.splats)
-        raster = open_raster(_rows(scene, slice(first, last)), device, threads)
+    scene = splats_of(pieces)
+    if pieces.splats <= pieces.selected:
+        return scene, torch.arange(pieces.splats, dtype=torch.int32)
+    params, visible = pieces.settings.compositing, np.zeros(pieces.splats, bool)
+    device = choose_device(pieces.settings.device)
+    for first in range(0, pieces.splats, STEP):
+        last = min(first + STEP, pieces.splats)
+        raster = open_raster(scene[first:last], device, threads)
         for camera in cameras:
             visible[first:last] |= raster.footprints(camera, params).numpy() > 0
     ids = np.flatnonzero(visible).astype(np.int32)
     ids = ids if ids.size else np.zeros(1, np.int32)
-    return _rows(scene, torch.from_numpy(ids).long()), torch.from_numpy(ids)
+    return scene[ids], torch.from_numpy(ids)
 
 
 def write_scene(splats: Splats, path: Path) -> None:
@@ -209,10 +214,10 @@ def write_scene(splats: Splats, path: Path) -> None:
     write_tensors(path, {name: tensor.cpu() for name, tensor in tensors.items() if tensor is not None}, {})
 
 
-def scene_of(job: Job) -> Splats:
+def splats_of(pieces: PiecesInFiles) -> Splats:
     """Map the geometry of all splats."""
-    path = job.folder / SCENE
-    return mapped_scene(path, file_version(path), job.kernel)
+    path = pieces.folder / SCENE
+    return mapped_scene(path, file_version(path), pieces.kernel)
 
 
 def file_version(path: Path) -> tuple[int, int]:
@@ -228,12 +233,6 @@ def mapped_scene(path: Path, version: tuple[int, int], kernel: Kernel) -> Splats
     means, quats, log_scales, logits = (tensors[name] for name in ("means", "quats", "log_scales", "opacity_logits"))
     origin = tensors["origin"].tolist()
     return Splats(means, quats, log_scales, logits, kernel, beta=tensors.get("beta"), origin=origin)
-
-
-def _rows(splats: Splats, rows: slice | Tensor) -> Splats:
-    beta = None if splats.beta is None else splats.beta[rows]
-    parts = splats.means[rows], splats.quats[rows], splats.log_scales[rows], splats.opacity_logits[rows]
-    return Splats(*parts, splats.kernel, beta=beta, origin=splats.origin)
 
 
 @lru_cache(maxsize=1)
@@ -265,29 +264,29 @@ def read_view(path: Path) -> tuple[ViewCodebook, SampledRays]:
 # ---- W of blocks of splats
 
 
-def _weight_rows(job: Job, ends: tuple[int, int]) -> Iterator[SomeRows]:
+def _weight_rows(pieces: PiecesInFiles, ends: tuple[int, int]) -> Iterator[SomeRows]:
     """Iterate over the rows of W of a block in each piece of views, with one file open at a time."""
-    offsets = job.load("regions")["offsets"]
-    for piece in range(job.view_pieces):
-        arrays, base = job.load("weights", piece), np.int32(offsets[job.views_of(piece).start])
+    offsets = pieces.load("regions")["offsets"]
+    for piece in range(pieces.view_pieces):
+        arrays, base = pieces.load("weights", piece), np.int32(offsets[pieces.views_of(piece).start])
         part = part_of(arrays["splats"], arrays["starts"], (arrays["region"], arrays["weight"]), ends)
         yield SomeRows(part.rows, part.starts, [part.values[0] + base, part.values[1]])
 
 
-def _total_weight(job: Job, ends: tuple[int, int]) -> Tensor:
+def _total_weight(pieces: PiecesInFiles, ends: tuple[int, int]) -> Tensor:
     """Sum the total weight of a block [n] f32 over pieces of views, in their order."""
     sums = np.zeros(ends[1] - ends[0])
-    for piece in range(job.view_pieces):
-        arrays = job.load("weights", piece)
+    for piece in range(pieces.view_pieces):
+        arrays = pieces.load("weights", piece)
         part = slice(*np.searchsorted(arrays["hit_splats"], ends))
         sums[arrays["hit_splats"][part] - ends[0]] += arrays["total_weight"][part]
     return torch.from_numpy(sums).float()
 
 
 @saved_as("rows")
-def gather(job: Job, piece: int, threads: int | None) -> Saved:
+def gather(pieces: PiecesInFiles, piece: int, threads: int | None) -> Saved:
     """Save W of a block of splats in all views, its sums and total weight."""
-    ends = first, last = job.bounds(piece)
-    starts, values = gather_rows(lambda: _weight_rows(job, ends), last - first, (torch.int32, torch.float32))
-    W = weights_of(starts, values[0], values[1], job.load("regions")["offsets"])
-    return row_arrays(job, W, job.means[first:last], _total_weight(job, ends), threads)
+    ends = first, last = pieces.bounds(piece)
+    starts, values = gather_rows(lambda: _weight_rows(pieces, ends), last - first, (torch.int32, torch.float32))
+    W = weights_of(starts, values[0], values[1], pieces.load("regions")["offsets"])
+    return row_arrays(pieces, W, pieces.means[first:last], _total_weight(pieces, ends), threads)

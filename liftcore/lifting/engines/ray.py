@@ -1,6 +1,6 @@
 """Pieces of a lift by the workers of a Ray cluster (the extra ``splatlift[ray]``).
 
-A worker needs this package, and the folders of the lift under the same paths. Ray sends it the job, of a few
+A worker needs this package, and the folders of the lift under the same paths. Ray sends it `PiecesInFiles`, of a few
 kilobytes, and receives nothing: results are files, so that no object store ever holds W or X.
 """
 
@@ -58,21 +58,21 @@ class RayEngine:
     def __repr__(self) -> str:
         return one_line(self, repr(self._address), f"cpus={self._cpus}", f"gpus={self._gpus}")
 
-    def run(self, work: Work, job: Pieces, pieces: int) -> Iterator[int]:
+    def run(self, work: Work, pieces: Pieces, count: int) -> Iterator[int]:
         """See `lifting.engines.Engine`."""
         ray = self._ray
         needs: dict[str, float] = {"num_cpus": self._cpus, "max_retries": RETRIES}
-        if job.settings.device == "cuda":
+        if pieces.settings.device == "cuda":
             needs["num_gpus"] = self._gpus
-        task, job_ref = ray.remote(**needs)(work), ray.put(job)
-        numbers, waiting = iter(range(pieces)), dict[Any, int]()
+        task, pieces_ref = ray.remote(**needs)(work), ray.put(pieces)
+        numbers, waiting = iter(range(count)), dict[Any, int]()
 
-        def send(count: int) -> None:
-            for number, _ in zip(numbers, range(count), strict=False):
-                waiting[task.remote(job_ref, number, self._cpus)] = number
+        def send(most: int) -> None:
+            for number, _ in zip(numbers, range(most), strict=False):
+                waiting[task.remote(pieces_ref, number, self._cpus)] = number
 
         try:
-            send(min(pieces, MAX_QUEUED))
+            send(min(count, MAX_QUEUED))
             while waiting:
                 (task_ref,), _ = ray.wait(list(waiting), num_returns=1)
                 number = waiting.pop(task_ref)

@@ -19,11 +19,10 @@ from typing import NamedTuple
 import torch
 
 from liftcore.features.smoothness import some_grids, unlike_maps
-from liftcore.lifting.geometry import Geometry, weigh_views
-from liftcore.lifting.planning.views import NOISE_CHANNELS, SAMPLE, ViewDisagreement, evenly_spaced, spaced_indices
+from liftcore.lifting.geometry import Geometry
+from liftcore.lifting.planning.views import NOISE_CHANNELS, SAMPLE, ViewDisagreement, spaced_indices, weigh_coarsely
 from liftcore.raster.base import Raster
 from liftcore.runtime.one_thread import one_thread
-from liftcore.runtime.progress import silent
 from liftcore.solve.optimum import random_axes
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.settings import LiftSettings
@@ -100,14 +99,10 @@ def disagreement(agreement: float) -> list[str]:
     return [f"features: {finding}: {MANY_CAUSES}; {HINT}"]
 
 
+@one_thread()
 def agreement_of_views(raster: Raster, views: LiftViews, settings: LiftSettings) -> ViewAgreement:
     """Compute W of a few views at coarse pixels, and measure their consistency."""
-    few = views.only(evenly_spaced(views.names, PROBE_VIEWS))
-    longest = max(max(few.camera(k).width, few.camera(k).height) for k in range(len(few)))
-    coarse = {"stride": max(1, longest // SIDE), "diagnostic_rays": RAYS}
-    coarse_settings = settings.model_copy(update=coarse)
-    with one_thread():
-        return agreement_of(weigh_views(raster, raster.splats.count, few, coarse_settings, silent, by_rows=False))
+    return agreement_of(weigh_coarsely(raster, views, PROBE_VIEWS, SIDE, RAYS, settings))
 
 
 def agreement_of(geometry: Geometry) -> ViewAgreement:

@@ -35,7 +35,7 @@ NOISE_CHANNELS random projections.
 
 import heapq
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -43,7 +43,7 @@ import torch
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from liftcore.lifting.geometry import weigh_views
+from liftcore.lifting.geometry import Geometry, weigh_views
 from liftcore.raster import open_raster
 from liftcore.raster.base import Raster
 from liftcore.runtime.device import CPU
@@ -102,7 +102,7 @@ def visibility(
     threads: int | None = None,
 ) -> Visibility:
     """Project evenly spaced splats, SAMPLE at most, into every camera."""
-    sample = spaced_splats(splats, min(SAMPLE, splats.count))
+    sample = splats[spaced_indices(splats.count, min(SAMPLE, splats.count))]
     raster = open_raster(sample, CPU, threads)
     areas = np.zeros((len(cameras), sample.count), np.float32)
     for row, camera in zip(areas, cameras, strict=True):
@@ -119,24 +119,6 @@ def evenly_spaced(items: Sequence[T], limit: int) -> list[T]:
 def spaced_indices(total: int, count: int) -> np.ndarray:
     """Return [count] i64: evenly spaced numbers below ``total``, with the first and the last."""
     return np.linspace(0, total - 1, count).astype(np.int64)
-
-
-def spaced_splats(splats: Splats, count: int) -> Splats:
-    """Copy the geometry of ``count`` evenly spaced splats."""
-    rows = torch.from_numpy(spaced_indices(splats.count, count))
-    return replace(
-        splats,
-        means=splats.means[rows],
-        quats=splats.quats[rows],
-        log_scales=splats.log_scales[rows],
-        opacity_logits=splats.opacity_logits[rows],
-        beta=None if splats.beta is None else splats.beta[rows],
-        sh=None,
-        sb_params=None,
-        extras={},
-        layout=(),
-        header=(),
-    )
 
 
 def view_order(visible: Visibility) -> Iterator[int]:
@@ -229,23 +211,33 @@ class ViewNoiseEstimate:
         return len(order), expected
 
 
+def weigh_coarsely(
+    raster: Raster, views: LiftViews, count: int, side: int, rays: int, settings: LiftSettings
+) -> Geometry:
+    """Compute W of ``count`` evenly spaced views, at coarse pixels: about ``side`` on an image's longer side.
+
+    Args:
+        rays: sampled of all of them.
+    """
+    few = views.only(evenly_spaced(views.names, count))
+    longest = max(max(few.camera(k).width, few.camera(k).height) for k in range(len(few)))
+    coarse = {"stride": max(1, longest // side), "diagnostic_rays": rays}
+    return weigh_views(raster, raster.splats.count, few, settings.model_copy(update=coarse), silent, by_rows=False)
+
+
+@one_thread()
 def estimate_view_noise(
     raster: Raster, views: LiftViews, settings: LiftSettings, visible: Visibility
 ) -> ViewNoiseEstimate:
     """Estimate the noise of features from evenly spaced views, two at least; ``visible`` is of all views."""
     total, count = len(views.names), min(NOISE_VIEWS, len(views.names))
     sample: list[int] = spaced_indices(total, count).tolist()
-    sample_views = views.only(views.names[view] for view in sample)
-    longest = max(max(sample_views.camera(k).width, sample_views.camera(k).height) for k in range(count))
-    coarse = {"stride": max(1, longest // NOISE_SIDE), "diagnostic_rays": 0}
-    coarse_settings = settings.model_copy(update=coarse)
     channels = views.features.channels
     axes = random_axes(channels, min(NOISE_CHANNELS, channels), settings.seed)
     rows = spaced_indices(raster.splats.count, visible.areas.shape[1])
-    with one_thread():
-        geometry = weigh_views(raster, raster.splats.count, sample_views, coarse_settings, silent, by_rows=False)
-        means = [view.means(view.rows.float() @ axes) for view in geometry.codebook.views]
-        disagreement = ViewDisagreement(geometry.weights, torch.cat(means), torch.from_numpy(rows))
+    geometry = weigh_coarsely(raster, views, count, NOISE_SIDE, 0, settings)
+    means = [view.means(view.rows.float() @ axes) for view in geometry.codebook.views]
+    disagreement = ViewDisagreement(geometry.weights, torch.cat(means), torch.from_numpy(rows))
     total_weight = _total_weight(geometry.total_weight().numpy()[rows], visible.areas, visible.areas[sample])
     if not total_weight.any():  # no ray hits a splat: there is no estimate
         return ViewNoiseEstimate(visible.areas, np.ones(len(total_weight)), np.ones(len(total_weight)))

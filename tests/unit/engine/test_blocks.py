@@ -16,10 +16,7 @@ import torch
 import liftcore as lc
 from liftcore.lifting import pipeline
 from liftcore.lifting.engines import LocalEngine, blocks
-from liftcore.lifting.engines.lift import block_folder
-from liftcore.lifting.inputs import LiftInputs
 from liftcore.lifting.planning.plan import Plan
-from liftcore.runtime.progress import Timings
 from liftcore.values.lift_file import SCHEMA
 from liftcore.values.pack import write_pack
 from liftcore.values.settings import LiftSettings
@@ -34,11 +31,11 @@ VIEWS = 10  # two pieces
 class Shuffled(LocalEngine):
     """An engine that runs pieces in any order, some of them twice."""
 
-    def run(self, work: Any, job: Any, pieces: int) -> Iterator[int]:
-        order = np.random.default_rng(pieces).permutation(pieces).tolist()
+    def run(self, work: Any, pieces: Any, count: int) -> Iterator[int]:
+        order = np.random.default_rng(count).permutation(count).tolist()
         for piece in order:
-            work(job, piece, self.threads)
-        work(job, order[0], self.threads)
+            work(pieces, piece, self.threads)
+        work(pieces, order[0], self.threads)
         yield from order
 
 
@@ -56,10 +53,13 @@ def scene() -> dict[str, Any]:
     return {"splats": splats, "cameras": lc.Cameras(cameras), "views": views}
 
 
-def in_blocks(engine: Any, scene: dict[str, Any], settings: LiftSettings, **keywords: Any) -> lc.LiftResult:
-    inputs, timings = LiftInputs.of(**scene, preset=settings), Timings(keywords.pop("progress", None))
-    with block_folder(engine, **{"rows": ROWS, "selected": 1000, **keywords}) as folder:
-        return pipeline.run(inputs, timings, lambda _: None, blocks=folder)
+def in_blocks(
+    engine: Any, scene: dict[str, Any], settings: LiftSettings, folder: Path | None = None, progress: Any = None
+) -> lc.LiftResult:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("liftcore.lifting.engines.folder.ROWS", ROWS)
+        patch.setattr("liftcore.lifting.engines.folder.SELECTED", 1000)
+        return lc.lift(**scene, preset=settings, engine=engine, checkpoint=folder, progress=progress)
 
 
 def assert_same(left: lc.LiftResult, right: lc.LiftResult) -> None:
@@ -98,13 +98,13 @@ def test_lift_goes_on_from_the_pieces_in_its_folder(scene: dict[str, Any], tmp_p
 
 def test_folder_that_is_full_or_that_workers_do_not_see_is_named(scene: dict[str, Any], tmp_path: Path) -> None:
     class Full(LocalEngine):
-        def run(self, work: Any, job: Any, pieces: int) -> Iterator[int]:
+        def run(self, work: Any, pieces: Any, count: int) -> Iterator[int]:
             raise OSError(errno.ENOSPC, "No space left on device")
 
     class RemoteEngine(LocalEngine):
-        def run(self, work: Any, job: Any, pieces: int) -> Iterator[int]:
-            (job.folder / blocks.SCENE).unlink()
-            return super().run(work, job, pieces)
+        def run(self, work: Any, pieces: Any, count: int) -> Iterator[int]:
+            (pieces.folder / blocks.SCENE).unlink()
+            return super().run(work, pieces, count)
 
     for engine, message in (
         (Full(1), "room for blocks in .*No space left"),

@@ -86,15 +86,15 @@ DEADLY = ("gather", "solve", "weigh")  # steps: another worker, which takes seco
 class Deadly(RayEngine):
     """An engine whose workers die in some pieces, once each."""
 
-    def run(self, work: Any, job: Any, pieces: int) -> Iterator[int]:
-        def deadly(job: Any, piece: int, threads: int | None) -> None:
-            mark = job.folder / f"{work.__name__}-{piece}.died"
+    def run(self, work: Any, pieces: Any, count: int) -> Iterator[int]:
+        def deadly(pieces: Any, piece: int, threads: int | None) -> None:
+            mark = pieces.folder / f"{work.__name__}-{piece}.died"
             if piece == 1 and work.__name__ in DEADLY and not mark.exists():
                 mark.touch()
                 os.kill(os.getpid(), signal.SIGKILL)
-            work(job, piece, threads)
+            work(pieces, piece, threads)
 
-        yield from super().run(deadly, job, pieces)
+        yield from super().run(deadly, pieces, count)
 
 
 @with_ray
@@ -121,7 +121,7 @@ def test_workers_and_nodes_may_die(
     assert raised.value.errno == errno.ENOSPC
 
 
-def _full(job: Any, piece: int, threads: int | None) -> None:
+def _full(pieces: Any, piece: int, threads: int | None) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")
 
 

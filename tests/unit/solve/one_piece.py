@@ -13,7 +13,7 @@ from liftcore.lifting import steps
 from liftcore.lifting.algebra import Algebra
 from liftcore.lifting.engines import LocalEngine
 from liftcore.lifting.geometry import Geometry
-from liftcore.lifting.in_memory import scene_of
+from liftcore.lifting.in_memory import pieces_of
 from liftcore.runtime.progress import silent
 from liftcore.solve.codebook import Codebook
 from liftcore.solve.directions import RegionDirections
@@ -48,8 +48,10 @@ def algebra_of(
     codebook = codebook or codebook_of([torch.zeros(int(count), 1) for count in W.offsets.diff()])
     geometry = Geometry(W, codebook, (), (), np.full(regions, -1, np.int8) if levels is None else levels)
     means, names = torch.zeros(splats, 3) if means is None else means, tuple(map(str, range(len(codebook.views))))
-    scene = scene_of(geometry, means, LiftSettings.of(**settings), names, threads=threads, memory_limit=memory_limit)
-    return Algebra(scene, LocalEngine(threads), silent, threads)
+    pieces = pieces_of(
+        geometry, means, LiftSettings.of(**settings), names, threads=threads, memory_limit=memory_limit
+    )
+    return Algebra(pieces, LocalEngine(threads), silent, threads)
 
 
 def mask_consensus(
@@ -58,7 +60,7 @@ def mask_consensus(
     """Return c of every entry of W [nnz] f32."""
     algebra = algebra_of(W, levels=levels, means=means, threads=threads)
     algebra.compare_masks()
-    consensus = steps.consensus_of(algebra.scene, 0, steps.splat_block(algebra.scene, 0).W, threads)
+    consensus = steps.consensus_of(algebra.pieces, 0, steps.splat_block(algebra.pieces, 0).W, threads)
     assert consensus is not None
     return consensus.numpy()
 

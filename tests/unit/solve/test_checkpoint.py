@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 import torch
 
-from liftcore.lifting.checkpoint import Checkpoint
 from liftcore.lifting.files import lift_files
 from liftcore.query.result import LiftResult
 from liftcore.raster.cpu.raster import CpuRaster
@@ -77,7 +76,7 @@ def test_killed_lift_goes_on_from_its_last_view_to_the_same_bits(
     scene = write_scene(tmp_path, 3, grids)
     uninterrupted = lifted(scene, threads=1)
     rasterized_views.clear()
-    checkpoint = Checkpoint(tmp_path / "kept")
+    checkpoint = tmp_path / "kept"
     for at in kills:
         kill_lift(scene, "geometry", at, threads=1, checkpoint=checkpoint)
     resumed = lifted(scene, threads=1, checkpoint=checkpoint)
@@ -89,7 +88,7 @@ def test_checkpoint_of_another_device_is_never_used(
     tmp_path: Path, rasterized_views: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = write_scene(tmp_path, 5)
-    checkpoint = Checkpoint(tmp_path / "kept")
+    checkpoint = tmp_path / "kept"
     for _ in range(2):
         lifted(scene, LiftSettings.of(device="cpu"), checkpoint=checkpoint)
         assert len(rasterized_views) == 3
@@ -103,5 +102,5 @@ def test_checkpoint_of_another_device_is_never_used(
 def test_lift_without_room_for_its_checkpoint_goes_on(tmp_path: Path) -> None:
     scene = write_scene(tmp_path, 7)
     (tmp_path / "file").write_bytes(b"")
-    full_checkpoint = Checkpoint(tmp_path / "file" / "kept")
+    full_checkpoint = tmp_path / "file" / "kept"
     assert_same(lifted(scene), lifted(scene, checkpoint=full_checkpoint))
