@@ -208,52 +208,26 @@ def _folders_of(views: Sequence[Camera]) -> str:
     return f"; cameras are named with their folders here, such as {example}: name views like them" if example else ""
 
 
-FEW_CELLS = 4  # on a side; with fewer, the aspect is too coarse
-FAR = 2.0  # ratio of aspects of map and image; square maps of photos are below
 CELL = 1  # cells of a map, and pixels of its image, by which rounding may change a side
-TRANSPOSED = 1.2  # ratio of aspect errors from which rows and columns are taken as swapped
 
 
 def shape_warnings(packs: Views, views: Sequence[Camera]) -> list[str]:
-    """Return warnings of maps whose aspect is far from their image's, or nearer with axes swapped, or is stretched.
+    """Return a warning if maps are stretched over their images, else none.
 
     Maps of any aspect are stretched over their image unless their fit is recorded, as some encoders squeeze images
     into squares. These cannot be distinguished from crops, so no lift is refused.
     """
-    odd, stretched = [], []
-    for camera in views:
-        size = packs.map_size(camera.name)
-        photo = camera.photo_size
-        if packs.fit(camera.name):  # it is said what was done to the photo
-            continue
-        if _odd(size, photo):
-            odd.append(camera)
-        elif is_stretched(size, photo):
-            stretched.append(camera)
-    advice = {
-        "of another shape than their images{}: check that they are [rows, columns], channels last": odd,
-        "of another aspect than their images{}, over which they are stretched: say if the encoder's preprocessing "
-        "stretched the photos, or did pad, pad-end or crop them (pack npy --map-fit, in Python FeatureGrid(map, "
-        "fit=)); splatlift check compares these": stretched,
-    }
+    unrecorded = [camera for camera in views if not packs.fit(camera.name)]
+    stretched = [camera for camera in unrecorded if is_stretched(packs.map_size(camera.name), camera.photo_size)]
+    if not stretched:
+        return []
+    (width, height), (W, H) = packs.map_size(stretched[0].name), stretched[0].photo_size
     return [
-        f"{len(cameras)} of {len(views)} views have maps {text.format(_shapes(packs, cameras[0]))}"
-        for text, cameras in advice.items()
-        if cameras
+        f"{len(stretched)} of {len(views)} views have maps of another aspect than their images "
+        f"({stretched[0].name}: {width}x{height} for {W}x{H}), over which they are stretched: check that they are "
+        "[rows, columns], channels last, or say if the encoder's preprocessing stretched the photos, or did pad, "
+        "pad-end or crop them (pack npy --map-fit, in Python FeatureGrid(map, fit=)); splatlift check compares these"
     ]
-
-
-def _shapes(packs: Views, camera: Camera) -> str:
-    (width, height), (W, H) = packs.map_size(camera.name), camera.photo_size
-    return f" ({camera.name}: {width}x{height} for {W}x{H})"
-
-
-def _odd(size: tuple[int, int], photo: tuple[int, int]) -> bool:
-    (width, height), (W, H) = size, photo
-    if min(width, height) < FEW_CELLS:
-        return False
-    off, transposed = (_factor(ratio * H / W) for ratio in (width / height, height / width))
-    return off > FAR or off > TRANSPOSED * transposed
 
 
 def is_stretched(size: tuple[int, int], photo: tuple[int, int]) -> bool:
@@ -261,7 +235,3 @@ def is_stretched(size: tuple[int, int], photo: tuple[int, int]) -> bool:
     (width, height), (W, H) = size, photo
     wide = (width - CELL) * (H - CELL) > (height + CELL) * (W + CELL)
     return wide or (height - CELL) * (W - CELL) > (width + CELL) * (H + CELL)
-
-
-def _factor(ratio: float) -> float:
-    return max(ratio, 1.0 / ratio)
