@@ -11,6 +11,7 @@ about the scene's mean, as for examples.
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -116,25 +117,20 @@ def _rays(scene: Scene, camera: Camera, area: Area | None, pixels: np.ndarray) -
 
     from liftcore.scene.cameras import drawn_by, pixel_of
 
-    noun = "a pixel" if area is not None and area.kind == "pixel" else "an area"
     pinhole_pixels = [place for x, y in pixels.tolist() if (place := pixel_of(camera, x, y)) is not None]
-    if not pinhole_pixels:
-        if area is None:
-            return []
-        hint, got = "pick one nearer to the middle", "one at the rim of a wide lens"
-        raise InvalidQuery(str(area), expected=f"{noun} within the pinhole's image", got=got, hint=hint)
-    ray_rows = scene.raster.ray_rows(
-        drawn_by(camera), torch.tensor(pinhole_pixels, dtype=torch.int32), scene.compositing
-    )
-    ends, splats, weights = map(as_numpy, (ray_rows.indptr, ray_rows.splats, ray_rows.weights))
-    rays = [slice(first, last) for first, last in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True)]
-    row_sums = [float(weights[ray].sum()) for ray in rays]
-    if area is not None and max(row_sums) < MINIMUM_ROW_SUM:
-        got = f"{'a ray' if len(rays) == 1 else 'rays'} with an opacity of {max(row_sums):.1%}"
+    rays, got = list[tuple[np.ndarray, np.ndarray]](), "one at the rim of a wide lens"
+    if pinhole_pixels:
+        pinhole, places = drawn_by(camera), torch.tensor(pinhole_pixels, dtype=torch.int32)
+        ray_rows = scene.raster.ray_rows(pinhole, places, scene.compositing)
+        ends, splats, weights = map(as_numpy, (ray_rows.indptr, ray_rows.splats, ray_rows.weights))
+        rays = [(splats[first:last], weights[first:last]) for first, last in pairwise(ends.tolist())]
+        row_sums = [float(on_ray.sum()) for _, on_ray in rays]
+        rays = [ray for ray, row_sum in zip(rays, row_sums, strict=True) if row_sum >= MINIMUM_ROW_SUM]
+        got = f"{'a ray' if len(row_sums) == 1 else 'rays'} with an opacity of {max(row_sums):.1%}"
+    if area is not None and not rays:
+        noun = "a pixel" if area.kind == "pixel" else "an area"
         raise InvalidQuery(str(area), expected=f"{noun} that shows the scene", got=got, hint="pick one on a surface")
-    return [
-        (splats[ray], weights[ray]) for ray, share in zip(rays, row_sums, strict=True) if share >= MINIMUM_ROW_SUM
-    ]
+    return rays
 
 
 def _common(scene: Scene, rows: np.ndarray, around: np.ndarray) -> np.ndarray:

@@ -10,14 +10,12 @@ from typing import Any
 import numpy as np
 
 from liftcore.errors import InvalidQuery
-from liftcore.io.json_file import finite
 from liftcore.query.candidates import candidates, parts_of
 from liftcore.query.directions import (
     directions,
     object_words,
     part_phrase,
     read_query,
-    unknown_part,
     wordings,
 )
 from liftcore.query.objects import point_of
@@ -44,7 +42,7 @@ from liftcore.query.question import (
     WordMatch,
 )
 from liftcore.query.scene import Scene, as_numpy
-from liftcore.query.scores import LEAST_LIKENESS, LOWEST_COSINE, combine, cosines, cosines_about
+from liftcore.query.scores import LEAST_LIKENESS, LOWEST_COSINE, combine, cosines, cosines_about, spaced
 from liftcore.query.selection import (
     LEAST_FIRST,
     NEAR,
@@ -88,6 +86,11 @@ class ResolvedQuery:
     part: PartQuery | None = None  # of a phrase that names a part of an object
     unknown_part: PartPhrase | None = None  # a part for which there is no word, so that the object is selected
 
+    @property
+    def wording(self) -> tuple[WordMatch, ...]:
+        """The texts that another word stands for."""
+        return tuple(WordMatch(**word._asdict()) for word in self.asked_as.values() if word.match)
+
 
 @dataclass(frozen=True)
 class PartQuery:
@@ -109,30 +112,18 @@ def ask(scene: Scene, query: Query | str, encoder: TextEncoder | None = None) ->
     the query keeps absent words. The presence of negatives and examples is not estimated.
 
     Args:
-        scene: an opened lift.
-        query: words and examples, or one text alone.
+        scene: an opened lift. query: words and examples, or one text alone.
         encoder: the text encoder of the lifted features' space; examples and the lift's own words need none.
 
     Raises:
-        InvalidQuery: a text without an encoder of the lift's space, or a term that has no feature.
-        NotFound: an example names a view that does not exist.
-        InvalidLift: an example needs the scene's files, and they moved or changed.
+        InvalidQuery, NotFound, InvalidLift: as `Scene.ask`.
     """
     query = Query.of(query) if isinstance(query, str) else query
     return answer_of(scene, resolve_query(scene, query, encoder))
 
 
 def ask_vectors(scene: Scene, positives: Any, negatives: Any = (), **fields: Any) -> Answer:
-    """Answer a query of vectors of the lift's text space, which count as words.
-
-    Args:
-        scene: an opened lift.
-        positives: the target: [n, F] or [F], torch or numpy, rows of any length above zero. negatives: likewise.
-        fields: of `Query`.
-
-    Raises:
-        InvalidQuery: a vector of another length, of zeros or not finite; or a field that `Query` rejects.
-    """
+    """Answer a query of vectors of the lift's text space, which count as words, as `LiftResult.query` does."""
     query = Query.of(_vectors(positives), _vectors(negatives), **fields)
     vars(query)["places"] = ["vector"] * len(query.terms)  # for errors
     rows = directions(scene, query, None)
@@ -153,14 +144,16 @@ def _vectors(values: Any) -> tuple[Vector, ...]:
 
 def resolve_query(scene: Scene, query: Query, encoder: TextEncoder | None) -> ResolvedQuery:
     """Resolve the terms of a query to directions; all errors of a query are raised here (see `ask`)."""
-    query, phrases = read_query(scene, query, encoder)
-    phrase = part_phrase(scene, query, encoder)
+    encoder = encoder or scene.table
+    query, phrases = read_query(query, encoder)
+    text = query.text[0] if query.text and len(query.positives) == 1 else ""  # that may name a part
+    phrase = part_phrase(text, encoder) if text and encoder is not None else None
     if phrase is None:
-        request = _resolve(scene, query, encoder)
+        request, source = _resolve(scene, query, encoder), table_of(encoder)
         as_typed = {
             index: Wording(typed, request.asked_as[index].word, form) for index, (typed, form) in phrases.items()
         }
-        missing = unknown_part(scene, query, encoder)
+        missing = source.vocabulary.unknown_part(text) if text and source is not None else None
         return replace(request, asked_as={**request.asked_as, **as_typed}, unknown_part=missing)
     object_query = _resolve(scene, Query(text=[phrase.object_phrase], absent=query.absent), encoder)
     request = _resolve(scene, query, encoder) if not phrase.sure else replace(object_query, query=query)
@@ -180,12 +173,11 @@ def _resolve(
     """
     words = np.array([isinstance(term, str) for term in query.terms], np.bool_)
     asked_as = wordings(scene, query, encoder)
-    if phrase is not None and table_of(encoder or scene.table) is not None:
+    if phrase is not None and table_of(encoder) is not None:
         asked_as = asked_as | {0: Wording(query.text[0], phrase.part, "part")}
     rows = directions(scene, query, encoder, asked_as)
     if phrase is not None:
         asked_as = asked_as | {0: Wording(query.text[0], str(phrase), "part")}
-    encoder = encoder or scene.table
     if encoder is None or not words[: len(query.positives)].any():
         return ResolvedQuery(query, rows, words, "", asked_as, candidates=candidates(scene, query))
     return ResolvedQuery(
@@ -224,9 +216,8 @@ def _part_answer(scene: Scene, request: ResolvedQuery) -> Answer:
         shared = int((answer.selected & whole.selected).sum())
         if shared <= max(answer.count / 2, LEAST_OF_WHOLE * whole.count):
             return whole
-    wording = tuple(WordMatch(**word._asdict()) for word in part.asked_as.values() if word.match)
     changes = {"present": False, "presence": object_answer.presence} if object_answer.present is False else {}
-    return answer.with_selected(answer.selected, request.query, reason=reason, wording=wording, **changes)
+    return answer.with_selected(answer.selected, request.query, reason=reason, wording=part.wording, **changes)
 
 
 def locate(scene: Scene, answer: Answer, count: int | None = None) -> Answer:
@@ -250,15 +241,15 @@ def locate(scene: Scene, answer: Answer, count: int | None = None) -> Answer:
     top = tuple(
         TopSplat(splat=int(row), score=float(answer.scores[row]), position=point_of(places[:, row])) for row in best
     )
-    selected_axes = [axis[np.flatnonzero(answer.selected)] for axis in places] if answer.count else []
-    ends = [np.array([end(axis) for axis in selected_axes]) for end in (np.min, np.max)] if selected_axes else []
-    return answer.model_copy(update={"top": top, "box": Box(*map(point_of, ends)) if ends else None})
+    selected = places.take(np.flatnonzero(answer.selected), axis=1)
+    box = Box(point_of(selected.min(axis=1)), point_of(selected.max(axis=1))) if answer.count else None
+    return answer.replace(top=top, box=box)
 
 
 def best_view(scene: Scene, answer: Answer) -> str | None:
     """Return the view that shows most of the object with the most selected splats, or else the first view."""
     views, objects = scene.metadata.views, scene.object
-    if scene.object_views is not None and objects is not None and (answer.selected & (objects >= 0)).any():
+    if objects is not None and scene.object_views is not None and (answer.selected & (objects >= 0)).any():
         largest = np.bincount(objects[answer.selected & (objects >= 0)]).argmax()
         return views[max(int(scene.object_views[largest, 0]), 0)]
     return views[0] if views else None
@@ -284,9 +275,7 @@ def _answer(scene: Scene, request: ResolvedQuery, similarities: np.ndarray) -> A
     if not rows.all_have_features:
         scores = np.where(rows.has_feature, scores, np.float32(LOWEST_COSINE))
     if presence.present is False and query.absent == "drop":
-        method = query.threshold if isinstance(query.threshold, str) else "fixed"
-        threshold = Threshold(value=math.inf, method=method, explanation=presence.reason, clear=False)
-        selected = np.zeros_like(has_feature)
+        threshold, selected = _select_nothing(scene, query, presence.reason)
     else:
         words = np.flatnonzero((request.by_cosine & mask)[: len(query.positives)])
         if query.threshold == "auto" and 1 < len(words) == mask[: len(query.positives)].sum():
@@ -299,25 +288,21 @@ def _answer(scene: Scene, request: ResolvedQuery, similarities: np.ndarray) -> A
     competitors = _nearer_words(rows, request, scores, is_selected, least)
     if presence.present is False and (members := _of_kind(scene, request)):
         competitors = members
-        presence = presence.model_copy(
-            update={"reason": f"{presence.reason} Of its kind in this scene: {', '.join(map(repr, members))}."}
-        )
+        named_members = ", ".join(map(repr, members))
+        presence = presence.replace(reason=f"{presence.reason} Of its kind in this scene: {named_members}.")
     counts = None if rows.row_counts is None else rows.row_counts[rows.has_feature]
-    statistics = finite(_statistics(scores[rows.has_feature], counts))
-    if rows is not scene:
-        scores = scene.features.of_splats(scores)
-        scores = scores if scene.all_have_features else np.where(has_feature, scores, np.float32(LOWEST_COSINE))
+    statistics = _statistics(scores[rows.has_feature], counts)
+    scores = scene.features.of_splats(scores)
+    if not scene.all_have_features:
+        scores = np.where(has_feature, scores, np.float32(LOWEST_COSINE))
     nodes = request.candidates
     if request.unknown_part is not None and selected.any():
         nodes = parts_of(scene, objects_within(scene, selected))
         # The part has no word, so the reason names the object that was selected.
         sentence = presence.reason.replace(repr(query.text[0]), repr(request.unknown_part.object_phrase))
-        presence = presence.model_copy(
-            update={"reason": f"{sentence} {_without_word(request.unknown_part, len(nodes))}"}
-        )
-    wording = tuple(WordMatch(**word._asdict()) for word in request.asked_as.values() if word.match)
+        presence = presence.replace(reason=f"{sentence} {_without_word(request.unknown_part, len(nodes))}")
     return Answer.of(
-        query, scores, has_feature, selected, wording=wording, rivals=competitors,
+        query, scores, has_feature, selected, wording=request.wording, rivals=competitors,
         candidates=nodes, threshold=threshold, clear=clear, statistics=statistics, **dict(presence),
     )  # fmt: skip
 
@@ -375,7 +360,7 @@ def _set_answer(scene: Scene, query: Query) -> Answer:
     presence = Presence(present=count > 0, presence=float(count > 0), reason=f"{label} has {count} splats.")
     return Answer.of(
         query, scores, np.ones_like(members), members,
-        threshold=threshold, clear=count > 0, statistics=finite(_statistics(scores, None)), **dict(presence),
+        threshold=threshold, clear=count > 0, statistics=_statistics(scores, None), **dict(presence),
     )  # fmt: skip
 
 
@@ -388,7 +373,7 @@ def _select(
         mask: [n] bool, the terms that take part in the scores. scores: [K] f32, of the rows of the features.
     """
     threshold, row_mask, competitors = _select_rows(scene.distinct, request, mask, scores)
-    selected = row_mask if scene.distinct is scene else scene.has_feature & scene.features.of_splats(row_mask)
+    selected = scene.has_feature & scene.features.of_splats(row_mask)
     if competitors is None:
         return threshold, selected
     (parts,) = part_nodes(scene, [competitors])
@@ -398,9 +383,7 @@ def _select(
     else:
         selected, addition = correct_by_objects(scene, selected, competitors)
     if addition:
-        threshold = threshold.model_copy(
-            update={"explanation": f"{threshold.explanation.removesuffix('.')}; {addition}."}
-        )
+        threshold = threshold.replace(explanation=f"{threshold.explanation.removesuffix('.')}; {addition}.")
     return threshold, selected
 
 
@@ -422,9 +405,7 @@ def _select_rows(
     ):
         return *_select_all(scene, valid_scores), None
     if lack:
-        method = query.threshold if isinstance(query.threshold, str) else "fixed"
-        threshold = Threshold(value=math.inf, method=method, explanation=lack, clear=False)
-        return threshold, np.zeros_like(scene.has_feature), None
+        return *_select_nothing(scene, query, lack), None
     least = -math.inf if in_words.any() else LEAST_LIKENESS
     threshold = find_threshold(valid_scores, query.threshold, scene.weights, least)
     selected = scene.has_feature & (scores >= np.float32(threshold.value))
@@ -433,7 +414,7 @@ def _select_rows(
     is_unclear = not has_references and has_one_mode(
         valid_scores, threshold.value, scene.weights, scene.effective_count
     )
-    threshold = threshold.model_copy(update={"clear": threshold.clear and not is_unclear})
+    threshold = threshold.replace(clear=threshold.clear and not is_unclear)
     if is_unclear and _are_of_word(scene, valid_scores, scores, competitors):
         threshold, selected = _select_all(scene, valid_scores)
     if not competitors:
@@ -445,11 +426,10 @@ def _select_rows(
         retry = find_threshold(valid_scores, "auto", scene.weights, comparison.lowest)
         value = max(retry.value, comparison.lowest)
         explanation = f"Below {comparison.lowest:.4g} other words are nearer. {retry.explanation}"
-        threshold = retry.model_copy(
-            update={"value": value, "explanation": explanation, "clear": retry.clear and retry.value == value}
-        )
+        is_clear = retry.clear and retry.value == value
+        threshold = retry.replace(value=value, explanation=explanation, clear=is_clear)
         selected = scene.has_feature & (scores >= np.float32(value))
-    threshold = threshold.model_copy(update={"clear": threshold.clear and comparison.first >= LEAST_FIRST})
+    threshold = threshold.replace(clear=threshold.clear and comparison.first >= LEAST_FIRST)
     if competitors[-1].nearer_limit == 0:  # a small table: splats nearer to another of its words are not selected
         selected = nearest_to_query(scene, selected, competitors[-1])
     return threshold, selected, competitors[0]
@@ -466,14 +446,20 @@ def _are_of_word(
 
 def _is_one_thing(scene: Scene, example: np.ndarray) -> bool:
     """Return True if a scene is alike to an example [F], and no valley parts it without the most similar splat."""
-    rows = np.flatnonzero(scene.has_feature)
-    rows = rows[:: -(-len(rows) // MOST_COMPARED) or 1]
+    rows = spaced(np.flatnonzero(scene.has_feature), MOST_COMPARED)
     similar = products(scene.features[rows], scene.norms[rows], example[None], example[None])[0][:, 0]
     if not len(rows) or similar.min() < SAME_AS_EXAMPLE:
         return False
     others = np.argsort(similar, kind="stable")[:-1]
     values, weights = similar[others], scene.total_weight[rows[others]]
     return not len(values) or has_one_mode(values, find_threshold(values, "auto", weights).value, weights)
+
+
+def _select_nothing(scene: Scene, query: Query, explanation: str) -> tuple[Threshold, np.ndarray]:
+    """Return a threshold above all scores, and no splats, [P] bool."""
+    method = query.threshold if isinstance(query.threshold, str) else "fixed"
+    threshold = Threshold(value=math.inf, method=method, explanation=explanation, clear=False)
+    return threshold, np.zeros_like(scene.has_feature)
 
 
 def _select_all(scene: Scene, valid_scores: np.ndarray) -> tuple[Threshold, np.ndarray]:
@@ -507,7 +493,7 @@ def _select_each(
         f"{request.query.positives[word]!r}: {cut.explanation}" for word, cut in zip(words, cuts, strict=True)
     )
     lowest = min(cuts, key=lambda cut: cut.value)
-    return lowest.model_copy(update={"explanation": explanation, "clear": all(cut.clear for cut in cuts)}), selected
+    return lowest.replace(explanation=explanation, clear=all(cut.clear for cut in cuts)), selected
 
 
 def _competing_words(request: ResolvedQuery, directions: np.ndarray) -> list[CompetingWords]:
@@ -536,7 +522,7 @@ def _presence(scene: Scene, request: ResolvedQuery, similarities: np.ndarray) ->
     ]
     presence = any_present(presences)
     if presence.present is False and len(words) < positives:  # examples may be present
-        presence = presence.model_copy(update={"present": None})
+        presence = presence.replace(present=None)
     if presence.present is not False and request.query.absent == "drop":
         mask[[k for k, word in zip(words, presences, strict=True) if word.present is False]] = False
     return presence, mask

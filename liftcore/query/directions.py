@@ -28,13 +28,13 @@ class ReadQuery(NamedTuple):
     phrases: Mapping[int, tuple[str, str]]  # by the index of a term: the phrase, and "list" or "negation"
 
 
-def read_query(scene: Scene, query: Query, encoder: TextEncoder | None) -> ReadQuery:
+def read_query(query: Query, encoder: TextEncoder | None) -> ReadQuery:
     """Read the texts of a query (`liftcore.text.phrases`): a list is several, a negation has negatives too.
 
     Raises:
         InvalidQuery: a phrase that scores cannot answer, or one of another form among several.
     """
-    source = table_of(encoder or scene.table)
+    source = table_of(encoder)
     is_word = None if source is None else source.vocabulary.has_word
     terms = list[tuple[bool, bool, int, str, Term]]()  # negative, example, index in the query, form, and the term
     for place, term in enumerate(query.terms):
@@ -72,14 +72,13 @@ def wordings(scene: Scene, query: Query, encoder: TextEncoder | None) -> dict[in
     Raises:
         InvalidQuery: no word of the table stands for a text; ``nearest`` has words that do.
     """
-    source = table_of(encoder or scene.table)
+    source = table_of(encoder)
     texts = {place: term for place, term in enumerate(query.terms) if isinstance(term, str)}
     if source is None:
         return {place: Wording(text, text, "") for place, text in texts.items()}
     by_place: dict[int, Wording] = {}
     for place, text in texts.items():
         with _errors_of(query, place):
-            check_texts([text])
             word = source.vocabulary.find(text)
             if word is None:
                 raise source.refusal(text, object_words(scene, source.words, source.embeddings))
@@ -87,27 +86,16 @@ def wordings(scene: Scene, query: Query, encoder: TextEncoder | None) -> dict[in
     return by_place
 
 
-def part_phrase(scene: Scene, query: Query, encoder: TextEncoder | None) -> PartPhrase | None:
-    """Return the part of an object that the only positive of a query names; None if it names no part.
+def part_phrase(text: str, encoder: TextEncoder) -> PartPhrase | None:
+    """Return the part of an object that a text names; None if it names no part.
 
     A text that a table has as a word names no part; nor does one of the shipped words, with any other encoder.
     """
-    encoder = encoder or scene.table
-    if encoder is None or len(query.positives) != 1 or not query.text:
-        return None
     source = table_of(encoder)
     if source is not None:
-        return source.vocabulary.find_part(query.text[0])
-    part = shipped_words().find_part(query.text[0])
-    return part or next((phrase for phrase in part_phrases(query.text[0]) if phrase.sure), None)
-
-
-def unknown_part(scene: Scene, query: Query, encoder: TextEncoder | None) -> PartPhrase | None:
-    """Return the part that the only positive of a query names and the table has no word for, as typed; else None."""
-    source = table_of(encoder or scene.table)
-    if source is None or len(query.positives) != 1 or not query.text:
-        return None
-    return source.vocabulary.unknown_part(query.text[0])
+        return source.vocabulary.find_part(text)
+    part = shipped_words().find_part(text)
+    return part or next((phrase for phrase in part_phrases(text) if phrase.sure), None)
 
 
 def askable_words(scene: Scene, encoder: TextEncoder, text: str, count: int) -> SuggestedWords:
@@ -145,12 +133,12 @@ def directions(
     scene: Scene,
     query: Query,
     encoder: TextEncoder | None,
-    asked_as: Mapping[int, Wording] | None = None,
+    asked_as: Mapping[int, Wording] = {},
 ) -> np.ndarray:
     """Return the unit vector of every term, [n, F] f32.
 
     Args:
-        asked_as: of the texts (`wordings`); None: computed here.
+        asked_as: of the texts (`wordings`).
 
     Raises:
         InvalidQuery: a text without an encoder or with one of another space, a text that it cannot encode, or an
@@ -180,24 +168,21 @@ def _errors_of(query: Query, place: int) -> Iterator[None]:
 
 
 def _encode(
-    scene: Scene, query: Query, encoder: TextEncoder | None, asked_as: Mapping[int, Wording] | None
+    scene: Scene, query: Query, encoder: TextEncoder | None, asked_as: Mapping[int, Wording]
 ) -> dict[int, np.ndarray]:
     """Return the unit vector of each text, by its index among the terms."""
     texts = {place: term for place, term in enumerate(query.terms) if isinstance(term, str)}
     if not texts:
         return {}
-    encoder = encoder or scene.table
+    space = scene.metadata.text_space or "not named"
     if encoder is None:
-        space = scene.metadata.text_space or "not named"
         expected = f"a text encoder (the lift's text space: {space})"
         hint = "name a text encoder of the lift's space, or ask by example"
         raise InvalidQuery("encoder", expected=expected, got="no encoder", hint=hint)
     if encoder.channels != scene.channels:
-        space = scene.metadata.text_space or "not named"
         expected = f"{scene.channels} channels as the lift has (its text space: {space})"
         hint = "query with the text encoder that belongs to the features' image encoder"
         raise InvalidQuery("encoder", expected=expected, got=f"{encoder.name} with {encoder.channels}", hint=hint)
-    asked_as = wordings(scene, query, encoder) if asked_as is None else asked_as
     rows = as_numpy(encoder.encode([asked_as[place].word for place in texts]))
     return {place: _unit(row, text) for row, (place, text) in zip(rows, texts.items(), strict=True)}
 
@@ -232,25 +217,17 @@ def _unit(vector: np.ndarray, name: str) -> np.ndarray:
 
 
 def read_example(notation: str, argument: str = "like") -> Example:
-    """Read an example by its notation, or the vector of a file that ends in .npy.
+    """Read an example by its notation, or the vector of a file that ends in .npy, [F] or [1, F] of any number type.
 
     Raises:
         InvalidQuery: it is none of them (the error names ``argument``), or an array that is no vector.
-        InvalidFeatures: no such file, or no array of numbers in it.
-    """
-    return read_vector(Path(notation)) if notation.endswith(".npy") else parse_example(notation, argument)
-
-
-def read_vector(path: Path) -> Vector:
-    """Read the vector of a ``.npy`` file, [F] or [1, F] of any number type.
-
-    Raises:
         InvalidFeatures: no such file, or no array of numbers in it; a pickle is never opened.
-        InvalidQuery: the array is no vector.
     """
+    if not notation.endswith(".npy"):
+        return parse_example(notation, argument)
     from liftcore.io.npy import open_array
 
-    values = open_array(path)
+    values = open_array(Path(notation))
     if values.shape not in ((values.size,), (1, values.size)):
-        raise InvalidQuery(str(path), expected="one vector, [F] or [1, F]", got=f"the shape {list(values.shape)}")
+        raise InvalidQuery(notation, expected="one vector, [F] or [1, F]", got=f"the shape {list(values.shape)}")
     return Vector(tuple(values.reshape(-1).astype(np.float64).tolist()))

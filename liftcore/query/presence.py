@@ -36,6 +36,7 @@ import numpy as np
 from liftcore.errors import InvalidQuery, InvalidTable, Unavailable
 from liftcore.query.question import Presence
 from liftcore.query.scene import Scene
+from liftcore.query.scores import spaced
 from liftcore.query.threshold import LEAST_SHARE
 from liftcore.runtime.folders import cache_folder
 from liftcore.text import LVIS_TABLE, CachingEncoder, TextEncoder
@@ -134,8 +135,7 @@ def estimate_presence(
 
 def _near_share(scene: Scene, direction: np.ndarray, references: np.ndarray, limit: int) -> float:
     """Return the share of a scene, by a sample of its splats, at which at most ``limit`` references are nearer."""
-    rows = np.flatnonzero(scene.has_feature)
-    rows = rows[:: -(-len(rows) // MOST_SPLATS) or 1]
+    rows = spaced(np.flatnonzero(scene.has_feature), MOST_SPLATS)
     own_cosines, reference_cosines = products(scene.features[rows], scene.norms[rows], direction[None], references)
     near = (reference_cosines >= own_cosines).sum(axis=1) <= limit
     return float(np.average(near, weights=scene.total_weight[rows] + np.float32(1e-30)))

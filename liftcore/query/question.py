@@ -296,6 +296,10 @@ class Value(PlainModel):
     def __hash__(self) -> int:
         return hash(repr(self))
 
+    def replace(self, **fields: Any) -> Self:
+        """Return a copy with other values of some fields, which are not checked."""
+        return self.model_copy(update=fields)
+
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
@@ -422,7 +426,7 @@ class Answer(SelectionSummary):
 
     def with_selected(self, selected: np.ndarray, query: Query, **fields: Any) -> Self:
         """Return the answer with other selected splats [P] bool, as that to another query, with other fields."""
-        answer = self.model_copy(update={"text": query.text, "count": int(selected.sum())} | fields)
+        answer = self.replace(**{"text": query.text, "count": int(selected.sum())} | fields)
         answer._query, answer._arrays = query, (self.scores, self.has_feature, selected)
         answer._objects = None
         return answer

@@ -83,12 +83,12 @@ def view_mask(scene: Scene, answer: Answer, view: str | Camera) -> ViewMask:
 
 def mask_png(mask: np.ndarray) -> bytes:
     """Write a mask [H, W] bool as a PNG of one 8-bit channel, white inside."""
-    return _png(mask.astype(np.uint8) * 255)
+    return png(mask.astype(np.uint8) * 255)
 
 
 def attention_png(in_view: ViewMask) -> bytes:
     """Write the attention in colours of the map as a PNG, RGB [H, W, 3]; black where the ray misses the scene."""
-    return _png(heat_colours(in_view.attention, in_view.row_sums > 0))
+    return png(heat_colours(in_view.attention, in_view.row_sums > 0))
 
 
 def render_png(scene: Scene, view: str | Camera, channel: str = "rgb") -> bytes:
@@ -103,8 +103,8 @@ def render_png(scene: Scene, view: str | Camera, channel: str = "rgb") -> bytes:
     if channel == "depth":
         levels, span = shown_depth(scene, view)
         text = {} if span is None else {"depth-near": repr(span[0]), "depth-far": repr(span[1])}
-        return _png(levels, text)
-    return _png(render(scene, view, channel))
+        return png(levels, text)
+    return png(render(scene, view, channel))
 
 
 def render(scene: Scene, view: str | Camera, channel: str = "rgb") -> np.ndarray:
@@ -217,7 +217,7 @@ def captioned_png(image: np.ndarray, lines: Sequence[tuple[str, np.ndarray]]) ->
         top = height + 2 * size * line + size // 2
         draw.rectangle((size // 2, top, 3 * size // 2, top + size), fill=tuple(colour.tolist()))
         draw.text((2 * size, top), text, fill="black", font=font)
-    return _png(np.asarray(canvas))
+    return png(np.asarray(canvas))
 
 
 def overlay(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -232,10 +232,13 @@ def overlay(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return picture
 
 
-def _png(pixels: np.ndarray, text: Mapping[str, str] | None = None) -> bytes:
-    """Write an image [H, W] or [H, W, 3] u8 as a PNG with text chunks."""
-    buffer, chunks = io.BytesIO(), PngInfo()
+def png(pixels: np.ndarray, text: Mapping[str, str] | None = None, palette: np.ndarray | None = None) -> bytes:
+    """Write an image [H, W] u8 or u16, or [H, W, 3] u8, as a PNG with text chunks, and a palette [n, 3] u8."""
+    content, chunks = io.BytesIO(), PngInfo()
     for name, value in (text or {}).items():
         chunks.add_text(name, value)
-    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, format="PNG", pnginfo=chunks)
-    return buffer.getvalue()
+    image = Image.fromarray(np.ascontiguousarray(pixels))
+    if palette is not None:
+        image.putpalette(palette.tobytes())
+    image.save(content, format="PNG", pnginfo=chunks)
+    return content.getvalue()

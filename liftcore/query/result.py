@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
     from liftcore.text import TextEncoder
-    from liftcore.values.lift import InputFile, LiftMetadata
+    from liftcore.values.lift import InputFile
 
 
 @dataclass(frozen=True, repr=False)
@@ -66,27 +66,20 @@ class LiftResult(Lift):
             positives: the target: a text or several, or [n, F] or [F], torch or numpy, rows of any length above zero.
             negatives: likewise; they reduce the scores.
             splats: that were lifted; with them the answer has its best splats and the box of its selection.
-            encoder: of texts, or the specification of one (`liftcore.open_encoder`), which is opened once. None: the
-                lift's own words (`table`), else the encoder of its text space, or its shipped table if the weights
-                are not available.
-            fields: the others of `liftcore.Query`.
+            encoder: of texts, as in `Scene.ask`. fields: the others of `liftcore.Query`.
 
         Raises:
-            InvalidQuery: a vector of another length, of zeros or not finite; a text that the encoder cannot encode,
-                or no encoder of the lift's text space; or an unknown threshold.
-            Unavailable: the encoder's weights are not on this machine.
+            InvalidQuery: a vector of another length, of zeros or not finite; or as `Scene.ask`, like Unavailable.
         """
         from liftcore.query.ask import ask_vectors
         from liftcore.query.question import Query
-        from liftcore.text import check_texts
 
         scene, words = self.scene(splats), [positives] if isinstance(positives, str) else positives
-        if not isinstance(words, list | tuple) or not words or not all(isinstance(word, str) for word in words):
-            answer = ask_vectors(scene, positives, negatives, **fields)
-            return answer if splats is None else scene.locate(answer)
-        against = [negatives] if isinstance(negatives, str) else negatives
-        check_texts([*words, *against])
-        return scene.ask(Query.of(words, against, **fields), encoder=encoder, places=splats is not None)
+        if isinstance(words, list | tuple) and words and all(isinstance(word, str) for word in words):
+            query = Query(text=list(words), negatives=negatives, **fields)
+            return scene.ask(query, encoder=encoder, places=splats is not None)
+        answer = ask_vectors(scene, positives, negatives, **fields)
+        return answer if splats is None else scene.locate(answer)
 
     def transferred(self, old: Splats, new: Splats | Path | str, *, matrix: Any = None) -> LiftResult:
         """Transfer the lift to an edited copy of its splats: cropped, reordered, compressed or thinned.
@@ -188,10 +181,25 @@ class LiftResult(Lift):
         Raises:
             InvalidInput: required splats or cameras are missing, or not those of the lift.
         """
-        inputs = {
-            "splats": _splats_file(self, splats, folder),
-            "cameras": _cameras_file(self.metadata, cameras, folder),
-        }
+        from liftcore.io.splats import write_splats
+        from liftcore.io.transforms import transforms_of
+        from liftcore.values.lift_file import camera_input, found_input, input_file
+
+        inputs: dict[str, InputFile] = {}
+        for role, values in (("splats", splats), ("cameras", cameras)):
+            record: InputFile = getattr(self.metadata, role)
+            path = found_input(role, record, self.metadata, None) if record.path else None
+            if values is None and path is None:
+                got = f"nothing, and they are not at {record.path}" if record.path else "nothing, of a lift in memory"
+                hint = f"give show({role}=...)"
+                raise InvalidInput(role, expected=f"the {role} of the lift", got=got, hint=hint)
+            if role == "cameras" and cameras is not None and path is None:  # a file has lenses and panoramas, too
+                (folder / "cameras.json").write_text(json.dumps(transforms_of(cameras)), encoding="utf-8")
+                inputs[role] = camera_input(folder / "cameras.json")
+        if splats is not None:
+            self.require_splats(splats)
+            write_splats(folder / "splats.ply", splats)
+            inputs["splats"] = input_file(folder / "splats.ply")
         path = folder / "lift.safetensors"
         save_lift(replace(self.cpu(), metadata=self.metadata.model_copy(update=inputs)), path)
         return path
@@ -227,36 +235,3 @@ def load_lift(path: Path | str) -> LiftResult:
         InvalidLift: the file is missing, is not a safetensors file, or is not a lift with a row a splat.
     """
     return LiftResult.of(open_lift(path))
-
-
-def _splats_file(lift: Lift, splats: Splats | None, folder: Path) -> InputFile:
-    if splats is None:
-        return _recorded_input("splats", lift.metadata)
-    from liftcore.io.splats import write_splats
-    from liftcore.values.lift_file import input_file
-
-    lift.require_splats(splats)
-    write_splats(folder / "splats.ply", splats)
-    return input_file(folder / "splats.ply")
-
-
-def _cameras_file(metadata: LiftMetadata, cameras: Mapping[str, Camera] | None, folder: Path) -> InputFile:
-    from liftcore.io.transforms import transforms_of
-    from liftcore.values.lift_file import camera_input, found_input
-
-    path = found_input("cameras", metadata.cameras, metadata, None) if metadata.cameras.path else None
-    if cameras is None or path is not None:  # a file has lenses and panoramas, too
-        return _recorded_input("cameras", metadata)
-    (folder / "cameras.json").write_text(json.dumps(transforms_of(cameras)), encoding="utf-8")
-    return camera_input(folder / "cameras.json")
-
-
-def _recorded_input(role: str, metadata: LiftMetadata) -> InputFile:
-    from liftcore.values.lift_file import found_input
-
-    record: InputFile = getattr(metadata, role)
-    path = found_input(role, record, metadata, None) if record.path else None
-    if path is None:
-        got = f"nothing, and they are not at {record.path}" if record.path else "nothing, of a lift in memory"
-        raise InvalidInput(role, expected=f"the {role} of the lift", got=got, hint=f"give show({role}=...)")
-    return record

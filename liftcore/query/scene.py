@@ -17,7 +17,7 @@ import numpy as np
 
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound
 from liftcore.io.splats import quick_count
-from liftcore.query.scores import Features
+from liftcore.query.scores import Features, cosines, norms_of, spaced
 from liftcore.runtime.progress import Progress, shown_progress
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.world import UNKNOWN, WorldFrame
@@ -46,6 +46,10 @@ Source: TypeAlias = (  # of a file
 )
 AnyEncoder: TypeAlias = "TextEncoder | str | Path | None"  # or the specification of one; None: that of the lift
 
+OF_SPLATS = (  # values that are computed once, of splats with a feature and their total weight
+    "has_feature", "all_have_features", "weights", "norms", "effective_count", "mean", "rough_mean", "distinct",
+    "object_numbers", "object_means", "principal",
+)  # fmt: skip
 MOST_SAMPLED = 1 << 14  # splats of which a rough mean is computed
 MOST_OF_OBJECT = 512  # splats of an object, likewise
 TRANSFER = (
@@ -82,7 +86,6 @@ class Scene:
     # The tensors of `liftcore.values.lift.Lift`, as arrays.
     total_weight: np.ndarray
     cluster: np.ndarray | None = None
-    cluster_features: np.ndarray | None = None
     confidence: np.ndarray | None = None
     object: np.ndarray | None = None
     object_views: np.ndarray | None = None
@@ -94,7 +97,7 @@ class Scene:
     embeddings: np.ndarray | None = None
     _has_feature: np.ndarray
     _metadata_json: str  # of a lift file
-    _new_paths: dict[str, Path | None]  # of files that were moved, by their roles
+    _new_paths: dict[str, Path]  # of files that were moved, by their roles
 
     def __init__(
         self,
@@ -110,16 +113,13 @@ class Scene:
         self.node_boxes: dict[tuple[int, int], Box] = {}  # of listed nodes, by their ids and numbers of splats
         self._encoders: dict[str | None, TextEncoder] = {}
         paths = {"splats": splats, "cameras": cameras}
-        self._new_paths = {role: Path(at) if isinstance(at, str | Path) else None for role, at in paths.items()}
+        self._new_paths = {role: Path(at) for role, at in paths.items() if isinstance(at, str | Path)}
         if isinstance(source, str | Path):
             self.path = Path(source)
             arrays, self._metadata_json = read_lift(self.path)
-            splats_path = self._new_paths["splats"]
-            cached: dict[str, Any] = {}
         else:
-            arrays = {name: as_numpy(tensor) for name, tensor in tensors_of(source).items()}
-            self.path, splats_path = Path("lift"), None
-            cached = {"lift": source, "metadata": self._with_places(source.metadata)}
+            self.path, arrays = Path("lift"), {name: as_numpy(tensor) for name, tensor in tensors_of(source).items()}
+            self.__dict__ |= {"lift": source, "metadata": self._with_places(source.metadata)}
         features, code = arrays.pop("features"), arrays.pop("code", None)
         self.features = Features(features if code is None else features.astype(np.float32), code)
         self._has_feature = arrays.pop("has_feature")
@@ -128,10 +128,10 @@ class Scene:
             parents = np.full(len(views), -1, np.int32)
             arrays |= {"node": arrays["object"], "node_parents": parents, "node_views": views}
         self.__dict__.update(arrays)
-        if splats_path is not None and splats_path.exists():
-            self._require_rows(quick_count(splats_path))
-        cached |= {"cameras": cameras} if cameras is not None and self._new_paths["cameras"] is None else {}
-        self.__dict__.update(cached)
+        if "splats" in self._new_paths and self._new_paths["splats"].exists():
+            self._require_rows(quick_count(self._new_paths["splats"]))
+        if cameras is not None and not isinstance(cameras, str | Path):
+            self.__dict__["cameras"] = cameras
         if splats is not None and not isinstance(splats, str | Path):
             self.lift.require_splats(splats)
             self.__dict__["splats"] = splats.cpu()
@@ -305,21 +305,27 @@ class Scene:
             example: or its notation, as in `Query.like`, or a vector [F].
             words: None: all words of the encoder, which is a table.
         """
-        from liftcore.query.question import Query
-        from liftcore.query.segment import best_words
+        from liftcore.query.directions import directions
+        from liftcore.query.question import BestWord, Query
 
         reader = self.encoder(encoder)
         words = self.words(reader) if words is None else words
         fields: dict[str, Any] = {"like": [example]}
         query = Query(**fields)
         vars(query)["places"] = ["example"]  # for errors
-        return best_words(self, query, words, reader.encode(words), top)
+        rows = np.asarray(as_numpy(reader.encode(words)), np.float32)
+        scores = cosines(rows, norms_of(rows), directions(self, query, None))[:, 0]
+        nearest = map(int, np.argsort(-scores, kind="stable")[:top])
+        return tuple(BestWord(word=words[row], score=float(scores[row])) for row in nearest)
 
     def words(self, encoder: AnyEncoder = None) -> list[str]:
         """Return all words of an encoder that is a table, each once; another encoder is an InvalidQuery."""
-        from liftcore.query.segment import words_of
-
-        return words_of(self.encoder(encoder))
+        reader = self.encoder(encoder)
+        words: Sequence[str] = getattr(reader, "words", ())
+        if not words:
+            expected, hint = f"words beside the encoder {reader.name}", "say what may be there"
+            raise InvalidQuery("words", expected=expected, got="none", hint=hint)
+        return list(dict.fromkeys(words))
 
     def askable(self, text: str = "", count: int = 8, *, encoder: AnyEncoder = None) -> SuggestedWords:
         """Suggest at most ``count`` words that complete a text, and words of the lift's objects.
@@ -457,7 +463,7 @@ class Scene:
 
         metadata = parse_metadata(self._metadata_json, self.path)
         splats = Path(metadata.splats.path)
-        if metadata.splats.path and self._new_paths["splats"] is None and splats.exists():
+        if metadata.splats.path and "splats" not in self._new_paths and splats.exists():
             count = quick_count(splats)
             # Another file may have this path now, whose number of rows does not matter.
             if count not in (None, len(self.features)) and input_file(splats).sha256 == metadata.splats.sha256:
@@ -469,9 +475,8 @@ class Scene:
         files = {
             name: getattr(metadata, name).model_copy(update={"path": str(place)})
             for name, place in self._new_paths.items()
-            if place is not None
         }
-        return metadata.model_copy(update=files) if files else metadata
+        return metadata.model_copy(update=files)
 
     @cached_property
     def world(self) -> WorldFrame:
@@ -555,10 +560,7 @@ class Scene:
         """The lift with a splat for each row of the features, of the row's total weight; itself if they are exact."""
         if self.features.code is None:
             return self
-        rows = copy(self)
-        for name in ("has_feature", "all_have_features", "weights", "norms"):
-            rows.__dict__.pop(name, None)
-        rows.__dict__ |= {"mean": self.mean, "rough_mean": self.rough_mean, "effective_count": self.effective_count}
+        rows = self._copy(mean=self.mean, rough_mean=self.rough_mean, effective_count=self.effective_count)
         rows.features = Features(self.features.rows)
         rows.features.__dict__["norms"] = self.features.norms
         rows.row_counts = self.features.of_rows(self.has_feature)
@@ -656,36 +658,31 @@ class Scene:
         scene.__dict__["splats"] = splats
         return scene
 
+    def _copy(self, **values: Any) -> Self:
+        """Return a copy of the lift with some values of its splats, and without the others that were computed."""
+        lift = copy(self)
+        for name in OF_SPLATS:
+            lift.__dict__.pop(name, None)
+        lift.__dict__ |= values
+        return lift
+
     def within(self, members: np.ndarray) -> Self:
         """Return a copy of the lift in which only some splats [P] bool have features, with nodes as its objects.
 
         Means and shares of total weight are those of these splats, so that a query distinguishes among them.
         """
-        inner = copy(self)
-        for name in (
-            "has_feature",
-            "all_have_features",
-            "weights",
-            "effective_count",
-            "mean",
-            "distinct",
-            "object_numbers",
-            "object_means",
-            "principal",
-        ):
-            inner.__dict__.pop(name, None)
-        inner._has_feature = self.has_feature & members
+        has_feature = self.has_feature & members
+        rows = spaced(np.flatnonzero(has_feature), MOST_SAMPLED)
+        inner = self._copy(rough_mean=self.features.mean(self.total_weight[rows], rows))
+        inner._has_feature = has_feature
         inner.total_weight = np.where(members, self.total_weight, np.float32(0.0))
-        rows = np.flatnonzero(inner._has_feature)
-        rows = rows[:: -(-len(rows) // MOST_SAMPLED) or 1]
-        inner.__dict__["rough_mean"] = self.features.mean(self.total_weight[rows], rows)
         inner.object, inner.object_views = self.node, self.node_views
         inner.node_features = None  # of all splats of the nodes
         return inner
 
     def mean_of(self, rows: np.ndarray) -> np.ndarray:
         """Compute the unit mean [F] f32 of the unit features of splats [n] by total weight; of many, by a sample."""
-        rows = rows[:: -(-len(rows) // MOST_OF_OBJECT) or 1]
+        rows = spaced(rows, MOST_OF_OBJECT)
         mean = self.features.mean(self.weights_of(rows), rows)
         return mean / max(float(np.linalg.norm(mean)), 1e-30)
 
@@ -711,7 +708,7 @@ class Scene:
             finalize(self, rmtree, folder, ignore_errors=True)
             write_splats(folder / "splats.ply", self.splats)
             return folder / "splats.ply"
-        path = self._verified_input("splats", self.metadata.splats)
+        path = self._verified_input("splats")
         self._require_rows(quick_count(path))
         return path
 
@@ -768,7 +765,7 @@ class Scene:
         """
         from liftcore.io.cameras import read_cameras
 
-        return read_cameras(self._verified_input("cameras", self.metadata.cameras))
+        return read_cameras(self._verified_input("cameras"))
 
     @cached_property
     def raster(self) -> Raster:
@@ -788,9 +785,20 @@ class Scene:
 
         Raises:
             NotFound: no camera has this name.
+            InvalidQuery: its image is larger than pictures may be.
             InvalidLift: the cameras moved or changed since the lift.
         """
-        return self.cameras[view] if isinstance(view, str) else view
+        from liftcore.scene.cameras import drawn_by
+
+        camera = self.cameras[view] if isinstance(view, str) else view
+        for width, height in (camera.photo_size, drawn_by(camera).photo_size):
+            if width * height > MOST_PIXELS:
+                raise InvalidQuery(
+                    "view", expected=f"an image of at most {MOST_PIXELS} pixels to draw",
+                    got=f"{width}x{height} in {camera.name!r}" + (", for its distorted photo" if camera.lens else ""),
+                    hint="give the scene a camera of that pose with width, height, fx, fy, cx and cy divided alike",
+                )  # fmt: skip
+        return camera
 
     def image(self, view: str | Camera, draw: Callable[[Camera], Tensor]) -> Tensor:
         """Render an image [H, W, ..] of a view in its photo's pixels, by a function for pinholes (`in_photo`).
@@ -799,42 +807,32 @@ class Scene:
             view: the name of a camera of the scene, or any camera in the frame of the splats.
 
         Raises:
-            NotFound: no camera has this name.
-            InvalidQuery: its image is larger than pictures may be.
-            InvalidLift: the cameras moved or changed since the lift.
+            NotFound, InvalidQuery, InvalidLift: as `camera`.
         """
-        from liftcore.scene.cameras import drawn_by
         from liftcore.scene.drawing import in_photo
 
-        camera = self.camera(view)
-        for width, height in (camera.photo_size, drawn_by(camera).photo_size):
-            if width * height > MOST_PIXELS:
-                raise InvalidQuery(
-                    "view", expected=f"an image of at most {MOST_PIXELS} pixels to draw",
-                    got=f"{width}x{height} in {camera.name!r}" + (", for its distorted photo" if camera.lens else ""),
-                    hint="give the scene a camera of that pose with width, height, fx, fy, cx and cy divided alike",
-                )  # fmt: skip
-        return in_photo(camera, draw)
+        return in_photo(self.camera(view), draw)
 
-    def _verified_input(self, role: str, record: InputFile) -> Path:
+    def _verified_input(self, role: Literal["splats", "cameras"]) -> Path:
         """Return the path of an input whose bytes are those that were lifted.
 
         Raises:
             InvalidLift: there is no such file.
         """
+        record: InputFile = getattr(self.metadata, role)
         if not record.path:
             raise InvalidLift(str(self.path), expected=f"a lift with a path of its {role}", got="values in memory",
                               hint=f"give the {role} that were lifted, {role}=")  # fmt: skip
         from liftcore.io.transforms import FRAME_FILE
         from liftcore.values.lift_file import found_input
 
-        path, is_moved = Path(record.path), self._new_paths.get(role) is not None
+        path, is_moved = Path(record.path), role in self._new_paths
         if role == "splats" and is_moved and not record.sha256 and path.exists():
             return path  # of values in memory, of which only the number is known
         verified_path = found_input(role, record, self.metadata, None if is_moved else self.path)
         if verified_path is not None:
             return verified_path
-        option = f"say where they are with --{role} (in Python {role}=), or " if role in ("splats", "cameras") else ""
+        option = f"say where they are with --{role} (in Python {role}=), or "
         if not path.exists():
             raise InvalidLift(
                 str(self.path), expected=f"its {role} at {path}, or beside the lift", got="nothing there",

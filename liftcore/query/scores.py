@@ -134,6 +134,11 @@ def rows_at_a_time(channels: int) -> int:
     return max(1, min(_BLOCK, _BLOCK_FLOATS // channels))
 
 
+def spaced(rows: np.ndarray, limit: int) -> np.ndarray:
+    """Return at most ``limit`` evenly spaced ones of rows [n]."""
+    return rows[:: -(-len(rows) // limit) or 1]
+
+
 def mean_direction(features: np.ndarray, norms: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Compute the weighted mean of the unit rows, [F] f32; zeros if all rows or weights are zero.
 

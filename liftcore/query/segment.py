@@ -12,7 +12,6 @@ The lift's tree corrects this: a word that names parts, where levels differ in m
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -23,12 +22,11 @@ import numpy as np
 from liftcore.errors import InvalidQuery
 from liftcore.query.areas import MINIMUM_ROW_SUM
 from liftcore.query.colours import cluster_colours
-from liftcore.query.directions import directions
 from liftcore.query.objects import trimmed_box
 from liftcore.query.presence import LEAST_WORDS, References, estimate_presence, references_of_space
-from liftcore.query.question import BestWord, LabelSummary, NamedSplats, Query
+from liftcore.query.question import LabelSummary, NamedSplats
 from liftcore.query.scene import Scene, as_numpy
-from liftcore.query.scores import cosines, norms_of
+from liftcore.query.scores import cosines
 from liftcore.query.selection import CompetingWords, levels_disagree, part_nodes
 from liftcore.query.threshold import find_threshold
 from liftcore.runtime.one_line import one_line
@@ -38,7 +36,6 @@ from liftcore.text import check_texts
 
 if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera
-    from liftcore.text import TextEncoder
 
 NO_WORD = -1
 LEAST_OWN = 0.25  # of a word's selection, by total weight, to which no other word is nearer
@@ -78,7 +75,7 @@ class Segmentation:
     @property
     def colours(self) -> np.ndarray:
         """[len(named_words) + 1, 3] u8 sRGB, by ``values``: grey, then a colour a word."""
-        return _palette(len(self.named_words))
+        return np.roll(cluster_colours(len(self.named_words)), 1, axis=0)
 
     @property
     def summary(self) -> LabelSummary:
@@ -87,25 +84,6 @@ class Segmentation:
         return LabelSummary(
             word_count=len(self.words), splats=len(self.labels), none=none, named_words=self.named_words
         )
-
-
-def _palette(words: int) -> np.ndarray:
-    """Return a colour a word after grey, [words + 1, 3] u8 sRGB."""
-    return np.roll(cluster_colours(words), 1, axis=0)
-
-
-def words_of(encoder: TextEncoder) -> list[str]:
-    """Return all words of a table, each once.
-
-    Raises:
-        InvalidQuery: the encoder is no table, and encodes any text.
-    """
-    table_words: Sequence[str] = getattr(encoder, "words", ())
-    words = list(dict.fromkeys(table_words))
-    if not words:
-        expected, hint = f"words beside the encoder {encoder.name}", "say what may be there"
-        raise InvalidQuery("words", expected=expected, got="none", hint=hint)
-    return words
 
 
 @one_thread()
@@ -183,13 +161,13 @@ def segment(
         if weights[members := np.flatnonzero(labels == row)].any()
     ]
     groups.sort(key=lambda group: -group[0])
-    palette = _palette(len(groups)).tolist()
+    colours = cluster_colours(len(groups)).tolist()
     summaries = tuple(
         NamedSplats(
             word=words[row],
             row=row,
             value=value,
-            colour=palette[value],
+            colour=colours[value - 1],
             splats=len(members),
             share=share,
             score=float(np.average(score[members], weights=weights[members])),
@@ -258,24 +236,6 @@ def _scores(scene: Scene, vectors: np.ndarray, rows: Sequence[int]) -> Iterator[
         yield from zip(block, np.ascontiguousarray(scores.T), strict=True)
 
 
-def best_words(
-    scene: Scene, example: Query, words: Sequence[str], vectors: Any, count: int = 5
-) -> tuple[BestWord, ...]:
-    """Return the words most similar to an example, the nearest first.
-
-    Args:
-        scene: an opened lift. example: a query of one example. words: n. vectors: [n, F], their text vectors.
-
-    Raises:
-        InvalidQuery, NotFound, InvalidLift: as `liftcore.query.directions.directions`.
-    """
-    rows = np.atleast_2d(np.asarray(as_numpy(vectors), np.float32))
-    feature = directions(scene, example, None)
-    scores = cosines(rows, norms_of(rows), feature)[:, 0]
-    nearest = map(int, np.argsort(-scores, kind="stable")[:count])
-    return tuple(BestWord(word=words[row], score=float(scores[row])) for row in nearest)
-
-
 def value_map(scene: Scene, values: np.ndarray, view: str | Camera) -> np.ndarray:
     """Render the splats' value [P] i32 with the most weight on each ray, [H, W] i32; 0 where it misses the scene.
 
@@ -295,21 +255,15 @@ def map_png(values: np.ndarray, segmentation: Segmentation) -> bytes:
 
     Above 255 words it is a grey image of 16 bits.
     """
-    from PIL import Image
-    from PIL.PngImagePlugin import PngInfo
+    from liftcore.query.render import png
 
-    text, content = PngInfo(), io.BytesIO()
     words = [label.word for label in segmentation.named_words]
-    text.add_text("legend", json.dumps(dict(enumerate(words, 1))))
+    text = {"legend": json.dumps(dict(enumerate(words, 1)))}
     if len(words) > 255:
-        picture = Image.fromarray(values.astype(np.uint16))
-    else:
-        picture = Image.fromarray(values.astype(np.uint8))
-        colours = segmentation.colours.copy()
-        colours[0] = 0
-        picture.putpalette(colours.tobytes())
-    picture.save(content, format="PNG", pnginfo=text)
-    return content.getvalue()
+        return png(values.astype(np.uint16), text)
+    colours = segmentation.colours.copy()
+    colours[0] = 0
+    return png(values.astype(np.uint8), text, colours)
 
 
 def picture_png(image: np.ndarray, values: np.ndarray, segmentation: Segmentation) -> bytes:

@@ -26,15 +26,14 @@ Then the objects of the region graph (`liftcore.solve.objects`) correct the sele
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from liftcore.query.presence import References, nearer_counts, products
+from liftcore.query.scores import spaced
 from liftcore.query.threshold import LEAST_SHARE
-from liftcore.runtime.cores import cores
 
 if TYPE_CHECKING:
     from liftcore.query.scene import Scene
@@ -44,7 +43,8 @@ SAMPLED = 256  # splats sampled from each octave of the ranking: a million splat
 MOSTLY_SELECTED = 2 / 3  # share of an object's total weight from which it is mostly selected
 PARTLY_SELECTED = 1 / 3  # share of an object's total weight below which its mean does not represent the selected part
 LEAST_FIRST = 0.1  # of the total weight at which the word is the nearest of all, that a clear answer selects
-LEVELS_AGREE = 0.9  # cosine of parts and wholes, about the mean, from which levels have one meaning; equal ones: .95
+LEVELS_AGREE = 0.9  # cosine of parts and wholes, about the mean, from which levels have one meaning; equal ones: .95.
+# Lifting separates levels below .8 alone: that costs a pass a level, and asking nodes in place of splats nothing.
 SAME_WORD = 1 - 1e-4  # cosine from which two words of a table are one
 _BLOCK = 1 << 10  # splats that are compared with a pack's words at once: as many as fit the CPU cache
 
@@ -84,7 +84,7 @@ class CompetingWords:
 
     def near_share(self, scene: Scene, rows: np.ndarray) -> float:
         """Return the share of the total weight of some splats, of a sample of them, that the words are near to."""
-        rows = rows[:: -(-len(rows) // _BLOCK) or 1]
+        rows = spaced(rows, _BLOCK)
         near = self.count_nearer(scene, rows) <= self.nearer_limit
         return float(np.average(near, weights=scene.total_weight[rows] + np.float32(1e-30)))
 
@@ -134,16 +134,12 @@ def nearest_to_query(scene: Scene, selected: np.ndarray, competitors: CompetingW
     """Return the selected splats [P] bool to which no competing word is nearer than the query's words, [P] bool."""
     mask = np.zeros_like(selected)
     rows = np.flatnonzero(selected)
-
-    def compare(first: int) -> None:
+    for first in range(0, len(rows), _BLOCK):
         block = rows[first : first + _BLOCK]
         own_cosines, other_cosines = products(
             scene.features[block], scene.norms[block], competitors.directions, competitors.vectors
         )
         mask[block] = other_cosines.max(axis=1) <= own_cosines.max(axis=1)
-
-    with ThreadPoolExecutor(cores()) as pool:
-        list(pool.map(compare, range(0, len(rows), _BLOCK)))
     return mask
 
 
@@ -156,7 +152,7 @@ def correct_by_objects(scene: Scene, selected: np.ndarray, competitors: Competin
     Returns:
         The corrected selection [P] bool, and a clause for the user on the changes, "" if there are none.
     """
-    if scene.object is None or scene.object_views is None or len(scene.object) != len(selected):
+    if scene.object is None:
         return selected, ""
     objects, totals = scene.object_numbers
     weights, rows = scene.total_weight, np.flatnonzero(selected & (objects >= 0))
@@ -212,69 +208,38 @@ def part_nodes(scene: Scene, queries: Iterable[CompetingWords]) -> Iterator[list
     if the word is among the nearest there and the node is a part of a whole of another meaning. Nodes whose score is
     more than halfway from that whole to that part have the same name.
     """
-    nodes = _NodeMeanings.of(scene)
+    parents, features = scene.node_parents, scene.node_features
+    if parents is None or features is None or not levels_disagree(scene):
+        yield from ([] for _ in queries)
+        return
+    vectors, paths = features.astype(np.float32), [scene.node_path(node) for node in range(len(parents))]
+    has_vector = np.linalg.norm(vectors, axis=1) > 0
+    from_the_largest = sorted(range(len(parents)), key=lambda node: len(paths[node]))
+    widest = np.arange(len(parents))  # the largest node of the same meaning above each, or itself
+    for node in from_the_largest:
+        parent = int(parents[node])
+        if parent >= 0 and _about(scene, vectors[parent][None], vectors[node])[0] >= LEVELS_AGREE:
+            widest[node] = widest[parent]
     for competitors in queries:
-        if nodes is None:
-            yield []
-            continue
-        scores = (nodes.vectors @ competitors.directions.T).max(axis=1)
-        nearer = competitors.count_nearer_means(scene, nodes.vectors)
-        yield nodes.select_parts(scores, nearer <= competitors.nearer_limit)
-
-
-@dataclass(frozen=True)
-class _NodeMeanings:
-    """Features of the nodes of a lift's tree, of a lift whose levels differ in meaning."""
-
-    scene: Scene
-    parents: np.ndarray  # [N] i32
-    vectors: np.ndarray  # [N, F] f32, unit; zeros for none
-    widest: np.ndarray  # [N] i64, the largest node of the same meaning above each, or itself
-
-    @classmethod
-    def of(cls, scene: Scene) -> _NodeMeanings | None:
-        """Return the meanings of a lift's nodes; None if its levels agree, or it has no tree."""
-        parents = scene.node_parents
-        if parents is None or scene.node_features is None or not levels_disagree(scene):
-            return None
-        vectors = scene.node_features.astype(np.float32)
-        widest = np.arange(len(parents))
-        for node in sorted(range(len(parents)), key=lambda n: len(scene.node_path(n))):
-            parent = int(parents[node])
-            if parent >= 0 and _about(scene, vectors[parent][None], vectors[node])[0] >= LEVELS_AGREE:
-                widest[node] = widest[parent]
-        return cls(scene, parents, vectors, widest)
-
-    def select_parts(self, scores: np.ndarray, sure: np.ndarray) -> list[int]:
-        """Return the parts that a word names (`part_nodes`).
-
-        Args:
-            scores: [N] f32, its cosine to each node. sure: [N] bool, nodes where it is among the nearest words.
-        """
-        has_vector = np.linalg.norm(self.vectors, axis=1) > 0
-        scores = np.where(has_vector, scores, -1.0)
-        node = int(self.widest[scores.argmax()])
-        parent = int(self.parents[node])
-        if parent < 0 or not has_vector[parent] or not (has_vector & sure)[node]:
-            return []
-        halfway = (scores[node] + scores[parent]) / 2
-        rows = np.flatnonzero(has_vector & sure & (scores > halfway) & (self.parents >= 0))
-        parts, path = [node], self.scene.node_path
-        for other in sorted(rows.tolist(), key=lambda n: len(path(n))):
-            if not any(n in path(other) or other in path(n) for n in parts):
-                parts.append(other)
-        return parts
+        scores = np.where(has_vector, (vectors @ competitors.directions.T).max(axis=1), -1.0)
+        sure = has_vector & (competitors.count_nearer_means(scene, vectors) <= competitors.nearer_limit)
+        node = int(widest[scores.argmax()])
+        parent, parts = int(parents[node]), list[int]()
+        if parent >= 0 and has_vector[parent] and sure[node]:
+            is_named = sure & (scores > (scores[node] + scores[parent]) / 2) & (parents >= 0)
+            for part in [node, *(other for other in from_the_largest if is_named[other])]:
+                if not any(part in paths[other] or other in paths[part] for other in parts):
+                    parts.append(part)
+        yield parts
 
 
 def objects_within(scene: Scene, selected: np.ndarray) -> np.ndarray:
     """Return the objects [N] bool of which `PARTLY_SELECTED` or more is among the selected splats [P] bool."""
-    if scene.object is None or scene.object_views is None or len(scene.object) != len(selected):
+    if scene.object is None:
         return np.zeros(0, np.bool_)
-    in_object, number = scene.has_feature & (scene.object >= 0), len(scene.object_views)
-    totals, inside = (
-        np.bincount(scene.object[rows], scene.total_weight[rows], number)
-        for rows in (in_object, in_object & selected)
-    )
+    objects, totals = scene.object_numbers
+    rows = np.flatnonzero(selected & (objects >= 0))
+    inside = np.bincount(objects[rows], scene.total_weight[rows], len(totals))
     return (inside > 0) & (inside >= PARTLY_SELECTED * totals)
 
 

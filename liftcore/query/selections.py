@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import binascii
-import math
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Self
 
@@ -15,7 +14,7 @@ from liftcore.query.ask import ask
 from liftcore.query.edits import Edit
 from liftcore.query.objects import MOST_SPLATS, object_box, objects
 from liftcore.query.question import Answer, Box, Query
-from liftcore.query.scene import MOST_PIXELS, Scene
+from liftcore.query.scene import Scene
 from liftcore.query.terms import Area
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.touching import REACH, spreads_along, touching_pairs
@@ -104,7 +103,10 @@ def _edit_of(scene: Scene, operation: str | Edit, source: Any, fields: dict[str,
     if isinstance(operation, Edit):
         return operation, answer
     if isinstance(source, np.ndarray):
-        fields["bits"] = base64.b64encode(bits_of(_booleans(scene, source))).decode()
+        if source.dtype != np.bool_ or source.shape != (len(scene.features),):
+            expected = f"a boolean for each of {len(scene.features)} splats"
+            raise InvalidQuery("splats", expected=expected, got=f"{source.dtype} {list(source.shape)}")
+        fields["bits"] = base64.b64encode(bits_of(source)).decode()
     elif source is not None:
         query = answer.query if answer else Query(sets=[f"object:{source}"]) if isinstance(source, int) else source
         fields["query"] = Query.of(query) if isinstance(query, str) else query
@@ -144,11 +146,7 @@ def _source(scene: Scene, edit: Edit, answer: Answer | None) -> np.ndarray:
         return objects(scene, answer).numbers >= 0 if answer.query.keeps_some else answer.selected
     if edit.area is not None:
         area = edit.parsed_area()
-        camera = scene.camera(area.view) if edit.camera is None else edit.camera.camera()
-        if np.prod(camera.photo_size) > MOST_PIXELS:
-            width, height = camera.photo_size
-            expected = f"an image of at most {MOST_PIXELS} pixels"
-            raise InvalidQuery("camera", expected=expected, got=f"{width}x{height}", hint="take a smaller camera")
+        camera = scene.camera(area.view if edit.camera is None else edit.camera.camera())
         return splats_under(scene, camera, area_mask(area, camera.photo_size, edit.radius), through=edit.through)
     if edit.box is not None:
         low, high = (np.array(corner)[:, None] for corner in edit.box)
@@ -180,17 +178,11 @@ def area_mask(area: Area, size: tuple[int, int], radius: float) -> np.ndarray:
         left, top = np.clip(np.ceil(np.minimum(begin, end) - reach), 0, size).astype(np.int64).tolist()
         right, bottom = np.clip(np.floor(np.maximum(begin, end) + reach) + 1, 0, size).astype(np.int64).tolist()
         along_x, along_y = (end - begin).tolist()
-        low, high = sorted((0.0, along_y))
-        for row in range(top, bottom):  # of which the segment is near to few columns
+        x = np.arange(left, right) - begin[0]
+        for row in range(top, bottom):
             y = row - begin[1]
-            feet = np.array([0.0, along_x])
-            if along_y:
-                feet = np.clip([y - reach, y + reach], low, high) * along_x / along_y
-            first = max(left, math.ceil(begin[0] + feet.min() - reach))
-            last = max(first, min(right, math.floor(begin[0] + feet.max() + reach) + 1))
-            x = np.arange(first, last) - begin[0]
             share = np.clip((x * along_x + y * along_y) / max(along_x**2 + along_y**2, 1.0), 0.0, 1.0)
-            mask[row, first:last] |= np.hypot(x - share * along_x, y - share * along_y) <= reach
+            mask[row, left:right] |= np.hypot(x - share * along_x, y - share * along_y) <= reach
     return mask
 
 
@@ -287,11 +279,3 @@ def _near(scene: Scene, splats: np.ndarray, steps: int) -> np.ndarray:
         expected = f"a selection with at most {MOST_SPLATS:,} splats around it"
         raise InvalidQuery("selection", expected=expected, got=f"{len(rows):,}", hint="take a smaller one")
     return rows
-
-
-def _booleans(scene: Scene, splats: Any) -> np.ndarray:
-    splats = np.asarray(splats)
-    if splats.dtype != np.bool_ or splats.shape != (len(scene.features),):
-        expected = f"a boolean for each of {len(scene.features)} splats"
-        raise InvalidQuery("splats", expected=expected, got=f"{splats.dtype} {list(splats.shape)}")
-    return splats

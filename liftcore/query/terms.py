@@ -94,8 +94,8 @@ def parse_example(notation: str, argument: str = "like") -> Example:
         return _splat_set(members)
     if area := _AREA.fullmatch(notation):
         kind, numbers = area[2] or "pixel", list(map(int, area[3].split(",")))
-        least, most = CORNERS[kind]
-        if len(numbers) % 2 == 0 and least <= len(numbers) // 2 <= most:
+        minimum, maximum = CORNERS[kind]
+        if len(numbers) % 2 == 0 and minimum <= len(numbers) // 2 <= maximum:
             return Area(area[1], kind, tuple(zip(numbers[::2], numbers[1::2], strict=True)))
     raise InvalidQuery(argument, expected=NOTATIONS, got=repr(notation[:120]))
 

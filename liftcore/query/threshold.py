@@ -197,13 +197,13 @@ def steady(histogram: Histogram, least: float = -math.inf) -> Result:
 def paper(histogram: Histogram) -> Result:
     """Find the largest peak, then the adjacent smaller valley above it; without one Otsu's split (Otsu 1979)."""
     smooth = histogram.smoothed()
-    peaks, valleys = _extrema(smooth)
-    peak = max(peaks, key=lambda place: smooth[place])
-    for place in valleys:
-        if place > peak and smooth[place] < smooth[peak]:
-            value = histogram.edge(place)
-            lies = f"lies at {histogram.edge(peak):.4g} and the next valley above it at {value:.4g}"
-            return value, f"The histogram's largest peak {lies}.", True
+    peak = int(smooth.argmax())
+    rises = peak + np.flatnonzero(np.diff(smooth[peak:]) > 0)
+    if rises.size:
+        equal_bins = int((smooth[peak : rises[0] + 1][::-1] > smooth[rises[0]]).argmax())
+        value = histogram.edge(int(rises[0]) - equal_bins // 2)  # the middle of a flat valley
+        lies = f"lies at {histogram.edge(peak):.4g} and the next valley above it at {value:.4g}"
+        return value, f"The histogram's largest peak {lies}.", True
     value = histogram.edge(_split(histogram.mass))
     lack = "no valley above its largest peak"
     return value, f"The histogram has {lack}; Otsu's split at {value:.4g} stands in.", False
@@ -220,17 +220,6 @@ def _split(mass: np.ndarray) -> int:
     # Empty bins between two groups tie: the middle of the best ones is farthest from both.
     best = np.flatnonzero(between >= between.max() * (1 - 1e-9))
     return int(best[len(best) // 2]) + 1
-
-
-def _extrema(curve: np.ndarray) -> tuple[list[int], list[int]]:
-    """Find local maxima (ends count) and the minima between each two of them; a plateau counts at its middle."""
-    starts = np.flatnonzero(np.concatenate([[True], curve[1:] != curve[:-1]]))
-    levels = curve[starts]
-    middles = (starts + np.append(starts[1:], len(curve)) - 1) // 2
-    rises = np.concatenate([[True], levels[1:] > levels[:-1]])
-    falls = np.append(levels[1:] < levels[:-1], True)
-    inner = (~rises & ~falls)[1:-1]
-    return middles[rises & falls].tolist(), middles[1:-1][inner].tolist()
 
 
 def _runs(mask: np.ndarray) -> list[np.ndarray]:

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound, SplatliftError
 from liftcore.io.splats import some_rows
 from liftcore.query.ask import ask, locate, resolve_query
-from liftcore.query.directions import directions, read_vector
+from liftcore.query.directions import directions, read_example
 from liftcore.query.question import Query
 from liftcore.query.result import load_lift
 from liftcore.query.scene import Scene
@@ -195,10 +195,10 @@ def test_an_area_without_its_corners_is_refused(scene: Scene, area: str) -> None
 
 def test_vectors_come_from_numpy_files(tmp_path: Path) -> None:
     np.save(tmp_path / "v.npy", np.arange(3, dtype=np.float16)[None])
-    assert read_vector(tmp_path / "v.npy") == Vector((0.0, 1.0, 2.0))
+    assert read_example(str(tmp_path / "v.npy")) == Vector((0.0, 1.0, 2.0))
     np.save(tmp_path / "v.npy", np.ones((2, 2)))
     with pytest.raises(InvalidQuery, match="one vector"):
-        read_vector(tmp_path / "v.npy")
+        read_example(str(tmp_path / "v.npy"))
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".splat"])

@@ -15,6 +15,7 @@ from liftcore.query.scene import Scene
 from liftcore.query.selection import CompetingWords, correct_by_objects, part_nodes
 from liftcore.text import LVIS_TABLE
 from liftcore.text.table import TableEncoder
+from liftcore.values.lift_file import NODE_TENSORS
 
 
 @pytest.fixture(scope="module")
@@ -28,8 +29,7 @@ def lifted(scene: Scene, features: np.ndarray, **fields: Any) -> Scene:
     defaults = {
         "total_weight": ones,
         "has_feature": ones > 0,
-        "object": None,
-        "object_views": None,
+        **dict.fromkeys(("object", "object_views", *NODE_TENSORS)),
     }
     return Scene(replace(scene.lift, features=torch.from_numpy(features.astype(np.float32)), **defaults | fields))
 
