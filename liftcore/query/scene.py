@@ -182,11 +182,7 @@ class Scene:
         return best_view(self, answer)
 
     def view_mask(
-        self,
-        query: Query | str | Answer,
-        view: str | Camera | None = None,
-        *,
-        encoder: AnyEncoder = None,
+        self, query: Query | str | Answer, view: str | Camera | None = None, *, encoder: AnyEncoder = None
     ) -> ViewMask:
         """Render an answer from a camera: its attention, and a mask of the objects that were found.
 
@@ -203,11 +199,7 @@ class Scene:
         return view_mask(self, answer, answer.query.seen_from() if view is None else view)
 
     def mask(
-        self,
-        query: Query | str | Answer,
-        view: str | Camera | None = None,
-        *,
-        encoder: AnyEncoder = None,
+        self, query: Query | str | Answer, view: str | Camera | None = None, *, encoder: AnyEncoder = None
     ) -> np.ndarray:
         """Return the pixels of a view with the answer's objects, [H, W] bool; arguments as in `view_mask`."""
         return self.view_mask(query, view, encoder=encoder).mask
@@ -339,10 +331,7 @@ class Scene:
         return askable_words(self, self.encoder(encoder), text, count)
 
     def colours(self, what: str) -> np.ndarray:
-        """Return [P, 3] u8 sRGB of splats by a layer.
-
-        Args:
-            what: pca, cluster, total_weight or confidence.
+        """Return [P, 3] u8 sRGB of splats by a layer: pca, cluster, total_weight or confidence.
 
         Raises:
             InvalidQuery: the lift has no such layer.
@@ -485,11 +474,7 @@ class Scene:
 
     @cached_property
     def table(self) -> TableEncoder | None:
-        """The words of its packs, as an encoder; None without any.
-
-        Raises:
-            InvalidTable: its words and their vectors do not fit together.
-        """
+        """The words of its packs, as an encoder; None without any. InvalidTable if its vectors are not theirs."""
         return own_words(self.metadata.words, self.embeddings)
 
     @cached_property
@@ -619,11 +604,7 @@ class Scene:
         )
 
     def members(self, number: int) -> np.ndarray:
-        """Return the splats of an object, or of another node of the tree with its parts, [P] bool.
-
-        Raises:
-            NotFound: the lift has no such object.
-        """
+        """Return the splats of an object, or of another node with its parts, [P] bool; NotFound if there is none."""
         nodes = 0 if self.node_parents is None else len(self.node_parents)
         if self.node is None or not 0 <= number < nodes:
             expected = f"a number from 0 to {nodes - 1}" if nodes else "a lift with objects"
@@ -696,11 +677,7 @@ class Scene:
 
     @cached_property
     def splat_file(self) -> Path:
-        """The file of the splats that were lifted; of values in memory a temporary one.
-
-        Raises:
-            InvalidLift: it moved, is another than the one that was lifted, or has another number of splats.
-        """
+        """The file of the splats that were lifted; of values in memory a temporary one; InvalidLift as `splats`."""
         if not self.metadata.splats.path and "splats" in self.__dict__:
             from liftcore.io.splats import write_splats
 
@@ -713,11 +690,7 @@ class Scene:
         return path
 
     def _require_rows(self, splats: int | None) -> None:
-        """Raise InvalidLift if the lift's rows are not those of its splats: answers would be of other splats.
-
-        Args:
-            splats: their number; None if it is not known yet.
-        """
+        """Raise InvalidLift if a lift of other rows would answer for other splats; ``splats`` None: not known yet."""
         if splats not in (None, len(self.features)):
             raise InvalidLift(
                 str(self.path), expected=f"a row for each of its {splats} splats", got=f"{len(self.features)} rows",
@@ -726,11 +699,7 @@ class Scene:
 
     @cached_property
     def splats(self) -> Splats:
-        """The splats that were lifted.
-
-        Raises:
-            InvalidLift: their file moved, or is another than the one that was lifted.
-        """
+        """The splats that were lifted; InvalidLift if their file moved or changed."""
         from liftcore.io.splats import read_splats
 
         splats = read_splats(self.splat_file, self.kernel)
@@ -758,11 +727,7 @@ class Scene:
 
     @cached_property
     def cameras(self) -> Cameras:
-        """The cameras of the scene, all of them, also those that the lift left out.
-
-        Raises:
-            InvalidLift: their file moved, or is another than the one that was lifted.
-        """
+        """All cameras of the scene, also those that the lift left out; InvalidLift if their file moved or changed."""
         from liftcore.io.cameras import read_cameras
 
         return read_cameras(self._verified_input("cameras"))
@@ -814,11 +779,7 @@ class Scene:
         return in_photo(self.camera(view), draw)
 
     def _verified_input(self, role: Literal["splats", "cameras"]) -> Path:
-        """Return the path of an input whose bytes are those that were lifted.
-
-        Raises:
-            InvalidLift: there is no such file.
-        """
+        """Return the path of an input whose bytes are those that were lifted; InvalidLift if there is none."""
         record: InputFile = getattr(self.metadata, role)
         if not record.path:
             raise InvalidLift(str(self.path), expected=f"a lift with a path of its {role}", got="values in memory",
