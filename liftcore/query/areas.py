@@ -100,11 +100,7 @@ def _rendered(scene: Scene, camera: Camera, area: Area | None, pixels: np.ndarra
 
 
 def area_splats(scene: Scene, area: Area) -> tuple[np.ndarray, np.ndarray]:
-    """Return the splats on the rays of an area's pixels, [n] i32 with repeats, and their weights there, [n] f32.
-
-    Raises:
-        NotFound, InvalidQuery, InvalidLift: as `area_feature`.
-    """
+    """Return the splats on the rays of an area's pixels, [n] i32 with repeats, and their weights there, [n] f32."""
     camera = scene.cameras[area.view]
     rays = _rays(scene, camera, area, _pixels(area, *camera.photo_size)[0])
     splats, weights = zip(*rays, strict=True)

@@ -23,11 +23,7 @@ ROOT_SHARE = 0.25  # of the weight at the click: less is visible through the obj
 
 
 def candidates(scene: Scene, query: Query) -> tuple[Candidate, ...]:
-    """Return the nested nodes that examples of places may mean, the smallest first; () for words and vectors.
-
-    Raises:
-        InvalidQuery, NotFound, InvalidLift: as `liftcore.query.areas.area_feature`.
-    """
+    """Return the nested nodes that examples of places may mean, the smallest first; () for words and vectors."""
     positives, negatives = query.positives, query.terms[len(query.positives) :]
     if (
         not positives

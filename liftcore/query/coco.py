@@ -25,10 +25,6 @@ def masks_json(scene: Scene, labels: Labels, views: Sequence[str] | None = None)
 
     Args:
         views: their names; None: the lifted ones.
-
-    Raises:
-        InvalidQuery: the labels have no instances.
-        InvalidLift: the cameras or splats moved or changed since the lift.
     """
     instances = {row["instance_id"]: row for row in labels.document["instances"]}
     if not instances:

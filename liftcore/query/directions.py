@@ -29,11 +29,7 @@ class ReadQuery(NamedTuple):
 
 
 def read_query(query: Query, encoder: TextEncoder | None) -> ReadQuery:
-    """Read the texts of a query (`liftcore.text.phrases`): a list is several, a negation has negatives too.
-
-    Raises:
-        InvalidQuery: a phrase that scores cannot answer, or one of another form among several.
-    """
+    """Read the texts of a query (`liftcore.text.phrases`): a list is several, a negation has negatives too."""
     source = table_of(encoder)
     is_word = None if source is None else source.vocabulary.has_word
     terms = list[tuple[bool, bool, int, str, Term]]()  # negative, example, index in the query, form, and the term
@@ -67,11 +63,7 @@ def read_query(query: Query, encoder: TextEncoder | None) -> ReadQuery:
 
 
 def wordings(scene: Scene, query: Query, encoder: TextEncoder | None) -> dict[int, Wording]:
-    """Return the wording of each text among the terms, by its index: the word of a table, else the text itself.
-
-    Raises:
-        InvalidQuery: no word of the table stands for a text; ``nearest`` has words that do.
-    """
+    """Return the wording of each text among the terms, by its index: the word of a table, else the text itself."""
     source = table_of(encoder)
     texts = {place: term for place, term in enumerate(query.terms) if isinstance(term, str)}
     if source is None:

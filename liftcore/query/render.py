@@ -96,9 +96,6 @@ def render_png(scene: Scene, view: str | Camera, channel: str = "rgb") -> bytes:
 
     ``depth`` is one 8-bit channel [H, W], near bright; the PNG has its range as text, ``depth-near`` and
     ``depth-far``, in decimals that read back exactly.
-
-    Raises:
-        NotFound, InvalidQuery, InvalidLift: as `render` does.
     """
     if channel == "depth":
         levels, span = shown_depth(scene, view)
@@ -156,9 +153,6 @@ def expected_depth(scene: Scene, view: str | Camera) -> tuple[np.ndarray, np.nda
 
     Returns:
         Depths [H, W] f32 in scene units, 0 where no splat covers the pixel; and the covered pixels, [H, W] bool.
-
-    Raises:
-        NotFound, InvalidQuery, InvalidLift: as `render` does.
     """
     pose = torch.from_numpy(scene.camera(view).about(scene.splats.origin).viewmat[2].copy())
     depths = (scene.splats.means.double() @ pose[:3] + pose[3]).to(torch.float32)
@@ -174,9 +168,6 @@ def shown_depth(scene: Scene, view: str | Camera) -> tuple[np.ndarray, tuple[flo
     Returns:
         Levels [H, W] u8: 1 is the far end or farther, 255 the near end or nearer, and 0 no depth; and the ends near
         and far, scene units, None when no pixel is covered.
-
-    Raises:
-        NotFound, InvalidQuery, InvalidLift: as `render` does.
     """
     depths, hit = expected_depth(scene, view)
     levels = np.zeros(depths.shape, dtype=np.uint8)
@@ -195,11 +186,7 @@ def _as_trained(scene: Scene) -> CompositingParams:
 def overlay_png(
     scene: Scene, in_view: ViewMask, view: str | Camera, name: str, photo: Image.Image | None = None
 ) -> bytes:
-    """Overlay an answer's mask on the photo of its view or else a render, with its share of the image as a caption.
-
-    Raises:
-        NotFound, InvalidQuery, InvalidLift: as `render` does.
-    """
+    """Overlay an answer's mask on the photo of its view or a render, with its share of the image as a caption."""
     height, width = in_view.mask.shape
     image = render(scene, view) if photo is None else np.asarray(photo.convert("RGB").resize((width, height)))
     caption = f"{name}: {in_view.mask.mean():.1%} of {in_view.view}"

@@ -237,11 +237,7 @@ def _scores(scene: Scene, vectors: np.ndarray, rows: Sequence[int]) -> Iterator[
 
 
 def value_map(scene: Scene, values: np.ndarray, view: str | Camera) -> np.ndarray:
-    """Render the splats' value [P] i32 with the most weight on each ray, [H, W] i32; 0 where it misses the scene.
-
-    Raises:
-        NotFound, InvalidQuery, InvalidLift: as `liftcore.query.render.view_mask`.
-    """
+    """Render the splats' value [P] i32 with the most weight on each ray, [H, W] i32; 0 where it misses the scene."""
     import torch
 
     labels, params = torch.from_numpy(values), scene.compositing

@@ -128,9 +128,6 @@ def apply_edit(scene: Scene, splats: np.ndarray, edit: Edit, answer: Answer | No
 
     Args:
         scene: an opened lift. answer: to the edit's query, if it has one.
-
-    Raises:
-        InvalidQuery, NotFound, InvalidLift, Unavailable: as `Selection.edit`.
     """
     if edit.operation == "grow":
         return _grow(scene, splats, edit.steps)
@@ -191,9 +188,6 @@ def splats_under(scene: Scene, camera: Camera, mask: np.ndarray, *, through: boo
 
     A splat is hidden if it lies completely, to `REACH` standard deviations, behind the splat at which the ray through
     its centre has an accumulated opacity of `SURFACE_OPACITY`. ``through`` selects hidden ones, too.
-
-    Raises:
-        InvalidLift: the splats moved or changed since the lift.
     """
     import torch
 
@@ -263,11 +257,7 @@ def _grow(scene: Scene, splats: np.ndarray, steps: int, core: np.ndarray | None 
 
 
 def _near(scene: Scene, splats: np.ndarray, steps: int) -> np.ndarray:
-    """Return the splats around some [P] bool among which neighbours are searched, [n] i64.
-
-    Raises:
-        InvalidQuery: there are too many.
-    """
+    """Return the splats around some [P] bool among which neighbours are searched, [n] i64."""
     if not splats.any():
         return np.zeros(0, np.int64)
     places = scene.axes[:, splats]

@@ -70,9 +70,6 @@ def find_threshold(
         weights: [n] f32, weight of each score, at least zero: the total weight of splats; None: equal ones, as of the
             pixels of a view.
         least: ``auto`` takes no lower score, unless too few lie above it.
-
-    Raises:
-        InvalidQuery: scores that are not finite.
     """
     if isinstance(method, int | float):
         return Threshold(value=float(method), method="fixed", explanation=f"The threshold {method:.4g} was given.")
