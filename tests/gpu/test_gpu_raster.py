@@ -25,9 +25,6 @@ pytestmark = [needs_triton, pytest.mark.usefixtures("every_kernel")]
 PARAMS = CompositingParams(opacity_logit_scale=1.2)
 
 
-FULL = RuntimeError("Triton Error [CUDA]: out of memory")  # the driver's word for it
-
-
 def as_parts(weights: RegionWeights) -> list[torch.Tensor]:
     return list(weights.tensors().values())
 

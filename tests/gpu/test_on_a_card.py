@@ -17,7 +17,7 @@ from tests.tiny_scene import WORDS, make_scene
 pytestmark = needs_triton
 FEW: dict[str, Any] = {"diagnostic_rays": 6}  # as the interpreter traces one in a thirtieth of a second
 CASES: list[tuple[bool, dict[str, Any]]] = [
-    *((False, {"preset": preset}) for preset in ("default", "argmax")),
+    (False, {"preset": "argmax"}),
     (False, {"aggregation": True, "objects": True}),
     (True, {}),  # maps of features in place of masks
 ]
