@@ -9,24 +9,20 @@ import runpy
 import shlex
 import shutil
 import sys
-import tempfile
 import zipfile
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
-import matplotlib
 import numpy as np
 import pytest
 import torch
-from matplotlib import pyplot
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import liftcore as lc
 from liftcore.cli import main
 from liftcore.io.cameras import read_cameras
-from service.commands.demo import read_truth
 from tests.tiny_scene import (
     FOCAL,
     HEIGHT,
@@ -201,32 +197,6 @@ def test_transform_of_gsplat_is_written_and_read(folder: Path, monkeypatch: pyte
     after = read_cameras(folder / "data/garden")
     for old, new in zip(before.values(), after.values(), strict=True):
         assert np.allclose(new.centre, (similarity() @ [*old.centre, 1])[:3])
-
-
-# The notebook: what is saved in it is what its cells say
-
-
-NOTEBOOK = ROOT / "docs" / "quickstart.ipynb"
-CELLS = [cell for cell in json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"] if cell["cell_type"] == "code"]
-
-
-def test_cells_run_in_order_and_print_what_is_saved(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    matplotlib.use("Agg")
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    monkeypatch.setattr(pyplot, "show", lambda: None)
-    names: dict[str, Any] = {}
-    for cell in CELLS:
-        exec(compile("".join(cell["source"]), str(NOTEBOOK), "exec"), names)
-        saved = "".join("".join(output.get("text", [])) for output in cell["outputs"])
-        assert capsys.readouterr().out.splitlines()[:1] == saved.splitlines()[:1]
-        pictures = [output for output in cell["outputs"] if "image/png" in output.get("data", {})]
-        assert len(pictures) == len(pyplot.get_fignums())
-        pyplot.close("all")
-    truth = read_truth(names["folder"])
-    overlap = truth.mean_iou(names["phrase"], {"view_030": names["mask"]})
-    assert overlap is not None and overlap > 0.8
 
 
 def test_five_lines_lift_the_tensors_of_a_training_loop() -> None:

@@ -1,34 +1,70 @@
-"""The demo end to end: the shipped scene through the real service, in a process of its own."""
+"""The demo and the notebook end to end: the shipped scene, lifted once, by the real service."""
 
 import argparse
 import json
+import tempfile
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
+from typing import Any
 
+import matplotlib
 import pytest
+from matplotlib import pyplot
 from PIL import Image
 
+import liftcore as lc
 from liftcore.errors import Unavailable
-from liftcore.query.result import load_lift
 from liftcore.text import LVIS_TABLE
 from service.commands import demo
-from service.commands.demo import SHIPPED
+from service.commands.demo import SHIPPED, read_truth
 
 pytestmark = pytest.mark.slow
+NOTEBOOK = Path(__file__).parents[3] / "docs" / "quickstart.ipynb"
+CELLS = [cell for cell in json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"] if cell["cell_type"] == "code"]
 
 
-def test_the_demo_finds_what_it_asks_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert demo.run(argparse.Namespace(out=tmp_path, json=True, ask=["penguin", "sofa"])) == 0
-    report = json.loads(capsys.readouterr().out)
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What the demo prints."""
+    out = tmp_path_factory.mktemp("demo")
+    with redirect_stdout(StringIO()) as printed:
+        assert demo.run(argparse.Namespace(out=out, json=True, ask=["penguin", "sofa"])) == 0
+    return json.loads(printed.getvalue())
+
+
+def test_the_demo_finds_what_it_asks_for(report: dict[str, Any]) -> None:
     assert (report["splats"], report["channels"], report["views"]) == (166_000, 512, 18)
     penguin, sofa = report["phrases"]
     assert (penguin["present"], sofa["present"], sofa["iou"]) == (True, False, None)
     assert penguin["iou"] > 0.8 and 0.2 < penguin["threshold"] < 0.4  # cosines as photos have them
-    assert load_lift(Path(report["lift_file"])).features.shape[0] == report["splats"]
+    assert lc.load_lift(report["lift_file"]).features.shape[0] == report["splats"]
     phrase_pictures = [name for phrase in report["phrases"] for name in phrase["pictures"].values()]
     assert len(phrase_pictures) == 4
     for name in (report["picture"], *phrase_pictures):
-        with Image.open(tmp_path / name) as picture:
+        with Image.open(Path(report["out"]) / name) as picture:
             assert picture.size == (640, 480) and picture.getextrema() != ((0, 0),) * 3
+
+
+def test_cells_run_in_order_and_print_what_is_saved(
+    report: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With the demo's lift, which is of the same files and settings."""
+    matplotlib.use("Agg")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(pyplot, "show", lambda: None)
+    monkeypatch.setattr(lc, "lift", lambda splats, cameras, views: lc.load_lift(report["lift_file"]))
+    names: dict[str, Any] = {}
+    for cell in CELLS:
+        exec(compile("".join(cell["source"]), str(NOTEBOOK), "exec"), names)
+        saved = "".join("".join(output.get("text", [])) for output in cell["outputs"])
+        assert capsys.readouterr().out.splitlines()[:1] == saved.splitlines()[:1]
+        pictures = [output for output in cell["outputs"] if "image/png" in output.get("data", {})]
+        assert len(pictures) == len(pyplot.get_fignums())
+        pyplot.close("all")
+    truth = read_truth(names["folder"])
+    overlap = truth.mean_iou(names["phrase"], {"view_030": names["mask"]})
+    assert overlap is not None and overlap > 0.8
 
 
 def test_shipped_scene_is_small_and_names_its_sources() -> None:

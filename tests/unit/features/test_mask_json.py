@@ -247,7 +247,6 @@ def test_masks_with_vectors_may_be_polygons_or_have_a_unit_axis(tmp_path: Path) 
     records = [{"segmentation": MUG_POLYGON}, {"segmentation": rle(BOWL)}]
     kinds: list[dict[str, Any]] = [
         {"a": {"height": HEIGHT, "width": WIDTH, "annotations": records}},
-        {"a_masks_as_npy": masks[:, None]},
         {"a_masks_as_npz": masks[None]},
         {"a_masks_as_npz": np.where(MUG, 0, np.where(BOWL, 1, -1))[None, None]},
     ]
