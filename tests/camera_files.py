@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from liftcore.scene.cameras import Cameras
+import liftcore as lc
 
 # Cameras by id (model id, model name, parameters); images (camera, quaternion, translation, name).
 CAMERAS = {1: (1, "PINHOLE", (500.0, 510.0, 320.5, 239.5)), 7: (0, "SIMPLE_PINHOLE", (400.0, 320.0, 240.0))}
@@ -59,7 +59,7 @@ def with_json(tmp_path: Path, document: Any) -> Path:
     return path
 
 
-def assert_same(actual: Cameras, expected: Cameras) -> None:
+def assert_same(actual: lc.Cameras, expected: lc.Cameras) -> None:
     assert list(actual) == list(expected)
     for a, b in zip(actual.values(), expected.values(), strict=True):
         assert (a.width, a.height) == (b.width, b.height)

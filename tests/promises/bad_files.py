@@ -151,37 +151,45 @@ def sample(name: str) -> bytes:
     return (SPLATS / name).read_bytes()
 
 
+def sog_with(name: str, change: Callable[[dict[str, Any]], object]) -> bytes:
+    """Return a SOG of the samples whose description was changed."""
+    with zipfile.ZipFile(SPLATS / name) as archive:
+        members = {member: archive.read(member) for member in archive.namelist()}
+    meta = json.loads(members["meta.json"])
+    change(meta)
+    return zipped(members | {"meta.json": json.dumps(meta).encode()})
+
+
 def sog(part: str, key: str, value: Any) -> Callable[[], bytes]:
     """Return a builder of a SOG whose description has another value."""
+    return lambda: sog_with("degree3.sog", lambda meta: (meta[part] if part else meta).update({key: value}))
 
-    def build() -> bytes:
-        with zipfile.ZipFile(SPLATS / "degree3.sog") as archive:
-            members = {name: archive.read(name) for name in archive.namelist()}
-        meta = json.loads(members["meta.json"])
-        (meta[part] if part else meta)[key] = value
-        return zipped(members | {"meta.json": json.dumps(meta).encode()})
 
-    return build
+def glb_parts(content: bytes) -> tuple[dict[str, Any], bytes]:
+    """Return the document and the buffer of a .glb."""
+    (length,) = struct.unpack_from("<I", content, 12)
+    return json.loads(content[20 : 20 + length]), content[28 + length :]
+
+
+def glb_of(document: dict[str, Any], binary: bytes) -> bytes:
+    """Return a .glb of a document and a buffer."""
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary)) + struct.pack("<I4s", len(text), b"JSON")
+    return head + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
 
 
 def glb(place: str, value: Any) -> Callable[[], bytes]:
-    """Return a builder of a .glb whose document has another value at a place, such as ``accessors.0.count``."""
+    """Return a builder of a .glb whose document has another value at a place, such as ``accessors/0/count``."""
 
     def build() -> bytes:
-        content = sample("degree3.glb")
-        (length,) = struct.unpack_from("<I", content, 12)
-        document, binary = json.loads(content[20 : 20 + length]), content[28 + length :]
+        document, binary = glb_parts(sample("degree3.glb"))
         node: Any = document
         *way, last = place.split("/")
         for step in way:
             node = node[int(step) if step.isdecimal() else step]
         node[last] = value
-        text = json.dumps(document).encode()
-        text += b" " * (-len(text) % 4)
-        start = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary)) + struct.pack(
-            "<I4s", len(text), b"JSON"
-        )
-        return start + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+        return glb_of(document, binary)
 
     return build
 

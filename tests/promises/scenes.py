@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -104,6 +105,16 @@ def write_pack(path: Path, views: dict[str, lc.Regions | lc.FeatureGrid], **meta
             tensors[f"{name}/grid"] = view.grid.numpy()
     save_file(tensors, path, metadata={"encoder": "random", **metadata})
     return path
+
+
+class ShuffledEngine(lc.LocalEngine):
+    """An engine that runs pieces in another order, and the first of them twice, as a cluster may."""
+
+    def run(self, work: Any, pieces: Any, count: int) -> Iterator[int]:
+        order = np.random.default_rng(count).permutation(count).tolist()
+        for piece in [*order, order[0]]:
+            work(pieces, piece, self.threads)
+        yield from order
 
 
 def arrays_of(result: lc.LiftResult) -> dict[str, tuple[Any, ...]]:

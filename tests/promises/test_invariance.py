@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import liftcore as lc
-import numpy as np
 import pytest
 
-from tests.promises.scenes import KERNELS, RandomScene, arrays_of, random_scene, write_pack
+from tests.promises.scenes import KERNELS, RandomScene, ShuffledEngine, arrays_of, random_scene, write_pack
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "row-sum": {"preset": "row-sum"},
@@ -25,16 +23,6 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "optimum": {"preset": "row-sum", "reference_channels": 2},
 }
 GRIDS = {"default", "smooth"}
-
-
-class ShuffledEngine(lc.LocalEngine):
-    """An engine that runs pieces in another order, and the first of them twice, as a cluster may."""
-
-    def run(self, work: Any, pieces: Any, count: int) -> Iterator[int]:
-        order = np.random.default_rng(count).permutation(count).tolist()
-        for piece in [*order, order[0]]:
-            work(pieces, piece, self.threads)
-        yield from order
 
 
 class Interruption(Exception):

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import json
 import math
-import struct
 import zipfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from liftcore import files
 from scipy.spatial.transform import Rotation
 
 from tests import tiny_scene
+from tests.camera_files import binary_files, text_files, write_files
 from tests.promises.bad_files import npy, png
 from tests.promises.scenes import CHANNELS, KERNELS, random_grid, random_scene, random_splats, regions_of, write_pack
 from tests.run_lengths import sam_records
@@ -229,7 +230,8 @@ POSES = {  # name of the photo -> quaternion w x y z and translation, from the w
     "left/b.png": ((0.5, 0.5, 0.5, 0.5), (1.0, 2.0, 3.0)),
     "c.0003.JPG": ((0.0, 0.0, 2.0, 0.0), (0.5, -0.5, 1.0)),  # no unit quaternion
 }
-SIZE, INTRINSICS = (64, 48), (50.0, 55.0, 32.0, 24.0)  # fx, fy and the principal point
+SIZE, INTRINSICS = (640, 480), (500.0, 510.0, 320.0, 240.0)  # fx, fy and the principal point
+PINHOLE = (1, "PINHOLE", INTRINSICS)  # COLMAP's number, name and parameters
 
 
 def viewmats() -> dict[str, np.ndarray]:
@@ -241,24 +243,9 @@ def viewmats() -> dict[str, np.ndarray]:
     return matrices
 
 
-def colmap_text() -> dict[str, bytes]:
-    lines = [
-        f"{number} {' '.join(map(str, (*q, *t)))} 1 {name}\n1.0 2.0 -1"
-        for number, (name, (q, t)) in enumerate(POSES.items())
-    ]
-    intrinsics = " ".join(map(str, INTRINSICS))
-    return {
-        "cameras.txt": f"# list\n1 PINHOLE {SIZE[0]} {SIZE[1]} {intrinsics}\n".encode(),
-        "images.txt": ("# list\n" + "\n".join(lines) + "\n").encode(),
-    }
-
-
-def colmap_binary() -> dict[str, bytes]:
-    images = struct.pack("<Q", len(POSES))
-    for number, (name, (q, t)) in enumerate(POSES.items()):
-        images += struct.pack("<I7dI", number, *q, *t, 1) + name.encode() + b"\0"
-        images += struct.pack("<Q", number) + struct.pack("<ddq", 1.0, 2.0, -1) * number
-    return {"cameras.bin": struct.pack("<QIiQQ4d", 1, 1, 1, *SIZE, *INTRINSICS), "images.bin": images}
+def colmap(write: Callable[..., dict[str, bytes]], camera: tuple[Any, ...] = PINHOLE) -> dict[str, bytes]:
+    """Return the files of a model whose images have one camera."""
+    return write({1: camera}, [(1, *pose, name) for name, pose in POSES.items()])
 
 
 def transforms() -> dict[str, bytes]:
@@ -282,7 +269,10 @@ def inria() -> dict[str, bytes]:
     return {"cameras.json": json.dumps(records).encode()}
 
 
-CAMERA_FILES = {"text": colmap_text, "binary": colmap_binary, "transforms": transforms, "inria": inria}
+CAMERA_FILES = {
+    "text": lambda: colmap(text_files), "binary": lambda: colmap(binary_files),
+    "transforms": transforms, "inria": inria,
+}  # fmt: skip
 
 
 def assert_cameras(cameras: lc.Cameras) -> None:
@@ -297,9 +287,7 @@ def assert_cameras(cameras: lc.Cameras) -> None:
 @pytest.mark.parametrize("kind", CAMERA_FILES)
 def test_cameras_of_every_format_are_the_same(kind: str, tmp_path: Path) -> None:
     folder = tmp_path / ("sparse/0" if kind in ("text", "binary") else "")
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, content in CAMERA_FILES[kind]().items():
-        (folder / name).write_bytes(content)
+    write_files(folder, CAMERA_FILES[kind]())
     assert_cameras(lc.read_cameras(tmp_path))
 
 
@@ -338,16 +326,11 @@ LENSES = {  # COLMAP's number, and parameters behind fx fy cx cy
 @pytest.mark.parametrize("model", LENSES)
 def test_text_and_binary_models_say_the_same_lens(model: str, tmp_path: Path) -> None:
     number, parameters = LENSES[model]
-    text, binary = colmap_text(), colmap_binary()
-    values = (*INTRINSICS, *parameters)
-    text["cameras.txt"] = f"1 {model} {SIZE[0]} {SIZE[1]} {' '.join(map(str, values))}\n".encode()
-    binary["cameras.bin"] = struct.pack(f"<QIiQQ{len(values)}d", 1, 1, number, *SIZE, *values)
     read = []
-    for name, model_files in {"text": text, "binary": binary}.items():
-        (tmp_path / name).mkdir()
-        for file, content in model_files.items():
-            (tmp_path / name / file).write_bytes(content)
-        read.append(lc.read_cameras(tmp_path / name))
+    for write in (text_files, binary_files):
+        folder = tmp_path / write.__name__
+        write_files(folder, colmap(write, (number, model, (*INTRINSICS, *parameters))))
+        read.append(lc.read_cameras(folder))
     for camera, twin in zip(read[0].values(), read[1].values(), strict=True):
         assert camera.lens is not None and camera.lens == twin.lens
         np.testing.assert_array_equal(camera.viewmat, twin.viewmat)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import zipfile
 from pathlib import Path
@@ -14,6 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.promises.bad_files import npy
 from tests.tiny_scene import PROPERTIES, ply, splat_rows
 
 PANORAMA = "1 EQUIRECTANGULAR 64 32 32 16\n"
@@ -116,12 +116,6 @@ def coco(counts: str) -> bytes:
     mask = {"image_id": 1, "category_id": 1, "segmentation": {"size": [2, 3], "counts": counts}}
     images = [{"id": 1, "file_name": "é.png", "height": 2, "width": 3}]
     return json.dumps({"images": images, "annotations": [mask], "categories": [{"id": 1, "name": "mug"}]}).encode()
-
-
-def npy(array: np.ndarray) -> bytes:
-    content = io.BytesIO()
-    np.save(content, array)
-    return content.getvalue()
 
 
 MAP = np.arange(60, dtype=np.float32).reshape(5, 3, 4)  # [F, h, w]

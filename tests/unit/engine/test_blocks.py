@@ -17,26 +17,14 @@ import liftcore as lc
 from liftcore.lifting import pipeline
 from liftcore.lifting.engines import LocalEngine, blocks
 from liftcore.lifting.planning.plan import Plan
-from liftcore.values.lift_file import SCHEMA
 from liftcore.values.pack import write_pack
 from liftcore.values.settings import LiftSettings
-from tests.promises.scenes import look_at, random_grid, regions_of
+from tests.promises.scenes import ShuffledEngine, arrays_of, look_at, random_grid, regions_of
 from tests.scenes import random_splats
 
 ROWS = 1 << 11  # of a block
 COUNT = 2 * ROWS + 500
 VIEWS = 10  # two pieces
-
-
-class Shuffled(LocalEngine):
-    """An engine that runs pieces in any order, some of them twice."""
-
-    def run(self, work: Any, pieces: Any, count: int) -> Iterator[int]:
-        order = np.random.default_rng(count).permutation(count).tolist()
-        for piece in order:
-            work(pieces, piece, self.threads)
-        work(pieces, order[0], self.threads)
-        yield from order
 
 
 @pytest.fixture(scope="module")
@@ -63,12 +51,7 @@ def in_blocks(
 
 
 def assert_same(left: lc.LiftResult, right: lc.LiftResult) -> None:
-    for name in SCHEMA:
-        first, second = getattr(left, name), getattr(right, name)
-        assert (first is None) == (second is None), name
-        if first is not None:
-            assert (first.dtype, first.shape) == (second.dtype, second.shape), name
-            assert first.numpy().tobytes() == second.numpy().tobytes(), name
+    assert arrays_of(left) == arrays_of(right)
 
 
 def test_lift_goes_on_from_the_pieces_in_its_folder(scene: dict[str, Any], tmp_path: Path) -> None:
@@ -171,9 +154,9 @@ def test_other_engines_go_on_from_the_pieces_of_each_stage(scene: dict[str, Any]
                 raise InterruptedError
 
         with pytest.raises(InterruptedError):
-            in_blocks((LocalEngine(1), Shuffled(2))[number % 2], stored, settings, folder=folder, progress=stop)
+            in_blocks((LocalEngine(1), ShuffledEngine(2))[number % 2], stored, settings, folder=folder, progress=stop)
     assert stopped_stages == ["geometry", "gather", "objects", "consensus", "reweight", "solve"]
-    result = in_blocks(Shuffled(2), stored, settings, folder=folder)
+    result = in_blocks(ShuffledEngine(2), stored, settings, folder=folder)
     expected = lc.lift(**scene, preset=settings)
     assert_same(result, expected)
     assert result.diagnostics["reweighting"] == pytest.approx(expected.diagnostics["reweighting"], rel=1e-12)

@@ -23,7 +23,7 @@ MASKS = np.stack([k == LABELS for k in range(3)])
 VECTORS = np.arange(15, dtype=np.float32).reshape(3, 5)
 
 
-GREY, VALUES_255 = (LABELS + 1).astype(np.uint8), np.where(LABELS < 0, 255, LABELS).astype(np.uint8)
+GREY = (LABELS + 1).astype(np.uint8)
 PALETTE = Image.fromarray(GREY)
 PALETTE.putpalette([255, 0, 0, 0, 255, 0, 0, 0, 255])
 

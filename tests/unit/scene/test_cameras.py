@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from camera_files import CAMERAS, binary_files, text_files, with_json, write_files
 
 from liftcore.errors import InvalidCameras, InvalidFeatures
 from liftcore.evaluate.inspect import inspect_file
 from liftcore.io.cameras import read_cameras
 from liftcore.scene.views import require_pairs
+from tests.camera_files import CAMERAS, binary_files, text_files, with_json, write_files
 
 DISTORTED = {**CAMERAS, 1: (2, "SIMPLE_RADIAL", (500.0, 320.0, 240.0, 0.1))}
 TRANSFORMS = {

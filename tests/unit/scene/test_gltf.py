@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-import json
-import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +20,7 @@ from liftcore.io.quantised import gaussian_rows
 from liftcore.io.splats import labelled, read_splats, write_splats
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
+from tests.promises.bad_files import glb_of, glb_parts
 from tests.scenes import random_splats
 
 FILES = Path(__file__).parents[2] / "data" / "splats"
@@ -58,16 +57,11 @@ def write(path: Path, splats: Splats) -> Path:
 
 
 def parts_of(path: Path) -> tuple[dict[str, Any], bytes]:
-    content = path.read_bytes()
-    (length,) = struct.unpack_from("<I", content, 12)
-    return json.loads(content[20 : 20 + length]), content[28 + length :]
+    return glb_parts(path.read_bytes())
 
 
 def join(path: Path, document: dict[str, Any], binary: bytes) -> Path:
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary)) + struct.pack("<I4s", len(text), b"JSON")
-    path.write_bytes(head + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary)
+    path.write_bytes(glb_of(document, binary))
     return path
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import zipfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +13,6 @@ from plyfile import PlyData
 
 import liftcore as lc
 from liftcore.evaluate.inspect import describe_cameras
-from liftcore.io.splat import splat_blocks
 from liftcore.io.splats import read_places, read_splats
 from liftcore.io.spz import spz_blocks
 from liftcore.lifting.planning.views import visibility
@@ -34,6 +31,7 @@ from liftcore.scene.kernel import Kernel
 from liftcore.scene.origin import FILE_ORIGIN
 from liftcore.scene.splats import Splats
 from liftcore.values.settings import LiftSettings
+from tests.promises.bad_files import sog_with
 from tests.scenes import random_camera, random_regions, random_splats, splats_at
 
 UTM = np.array([500_000.25, 5_400_000.5, 300.125])
@@ -103,11 +101,6 @@ def test_scenes_about_their_own_origin_keep_it_and_their_bits() -> None:
         assert np.array_equal(copy.positions(), splats.means.numpy())
 
 
-def splat(path: Path, splats: Splats, offset: np.ndarray) -> None:
-    shifted = (splats.means.double() + torch.from_numpy(offset)).float()
-    path.write_bytes(b"".join(splat_blocks(replace(splats, means=shifted))))
-
-
 QUANTISED = Path(__file__).parents[2] / "data" / "splats"  # as splat-transform wrote them
 PLACE = np.array([65_536.0, 40_960.0, 512.0])  # scene units; an .spz reaches no further with a hundredth of one
 
@@ -130,21 +123,17 @@ def compressed_ply(path: Path) -> np.ndarray:
 
 def sog(path: Path) -> np.ndarray:
     """Write a SOG with translated bounds; return the positions in it, [P, 3] f64."""
-    source = QUANTISED / "degree1.sog"
-    positions = read_splats(source).positions().astype(np.float64)
-    with zipfile.ZipFile(source) as archive, zipfile.ZipFile(path, "w") as output:
-        for name in archive.namelist():
-            content = archive.read(name)
-            if name == "meta.json":
-                meta = json.loads(content)
-                low, high = (np.array(meta["means"][key]) for key in ("mins", "maxs"))
-                unit = (np.sign(positions) * np.log1p(np.abs(positions)) - low) / (high - low)
-                low, high = np.log1p(PLACE - 2), np.log1p(PLACE + 2)
-                meta["means"] |= {"mins": low.tolist(), "maxs": high.tolist()}
-                positions = np.expm1(low + unit * (high - low))
-                content = json.dumps(meta).encode()
-            output.writestr(name, content)
-    return positions
+    positions, places = read_splats(QUANTISED / "degree1.sog").positions().astype(np.float64), list[np.ndarray]()
+
+    def translate(meta: dict[str, Any]) -> None:
+        low, high = (np.array(meta["means"][key]) for key in ("mins", "maxs"))
+        unit = (np.sign(positions) * np.log1p(np.abs(positions)) - low) / (high - low)
+        low, high = np.log1p(PLACE - 2), np.log1p(PLACE + 2)
+        meta["means"] |= {"mins": low.tolist(), "maxs": high.tolist()}
+        places.append(np.expm1(low + unit * (high - low)))
+
+    path.write_bytes(sog_with("degree1.sog", translate))
+    return places[0]
 
 
 def spz(path: Path) -> np.ndarray:

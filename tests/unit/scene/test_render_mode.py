@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +18,7 @@ from liftcore.io.splats import labelled, read_splats, some_rows, write_splats
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
 from liftcore.values.settings import LiftSettings
+from tests.promises.bad_files import sog_with
 from tests.scenes import observed, random_camera, random_splats
 
 FILES = Path(__file__).parents[2] / "data" / "splats"
@@ -55,12 +54,7 @@ def spz_saying(folder: Path, version: int, flags: int) -> Path:
 
 
 def sog_saying(folder: Path, model: Any) -> Path:
-    with zipfile.ZipFile(FILES / "degree1.sog") as source, zipfile.ZipFile(folder / "s.sog", "w") as copy:
-        for name in source.namelist():
-            content = source.read(name)
-            if name == "meta.json":
-                content = json.dumps(json.loads(content) | {"model": model}).encode()
-            copy.writestr(name, content)
+    (folder / "s.sog").write_bytes(sog_with("degree1.sog", lambda meta: meta.update(model=model)))
     return folder / "s.sog"
 
 

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from camera_files import assert_same, binary_files, with_json, write_files
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -23,6 +22,7 @@ from liftcore.io.transforms import FRAME_FILE, transforms_of
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.distortion import Brown, Fisheye, Lens
 from liftcore.values.lift_file import camera_input
+from tests.camera_files import assert_same, binary_files, with_json, write_files
 from tests.inria_file import write_inria_cameras
 
 
@@ -179,7 +179,7 @@ def test_frame_that_is_none_is_refused(file: str, key: str, value: Any, message:
         read_cameras(run)
 
 
-def test_inria_cameras_are_in_the_frame_of_their_splats(run: Path, tmp_path: Path) -> None:
+def test_inria_cameras_are_in_the_frame_of_their_splats(run: Path) -> None:
     camera = Camera.pinhole("a", 9, 9, 5, 5, 4.5, 4.5, np.eye(4))
     (run / "transforms.json").unlink()
     write_inria_cameras(Cameras((camera,)), run / "cameras.json")
@@ -294,7 +294,7 @@ def exported(cameras: Cameras, path: Path, **fields: Any) -> Path:
     return path
 
 
-def test_an_export_without_intrinsics_is_refused_as_what_it_is(run: Path, expected: Cameras, tmp_path: Path) -> None:
+def test_an_export_without_intrinsics_is_refused_as_what_it_is(expected: Cameras, tmp_path: Path) -> None:
     path = exported(expected, tmp_path / "transforms_train.json")
     with pytest.raises(
         InvalidCameras, match=r"export \(ns-export cameras\), which has poses alone; put the transforms"

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from camera_files import IMAGES, binary_files, text_files, with_json, write_files
 
 from liftcore.errors import InvalidCameras, NotFound
 from liftcore.io.cameras import read_cameras
@@ -19,6 +18,7 @@ from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
 from liftcore.scene.views import view_names
+from tests.camera_files import IMAGES, binary_files, text_files, with_json, write_files
 from tests.inria_file import write_inria_cameras
 
 K = np.array([[50.0, 0.0, 32.0], [0.0, 51.0, 24.0], [0.0, 0.0, 1.0]])

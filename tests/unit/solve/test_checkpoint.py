@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 from liftcore.lifting.files import lift_files
 from liftcore.query.result import LiftResult
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.runtime.device import CPU, Device
-from liftcore.values.lift_file import TENSORS
 from liftcore.values.settings import LiftSettings
+from tests.promises.scenes import arrays_of
 from tests.scenes import write_scene
 
 pytestmark = pytest.mark.slow
@@ -51,10 +50,7 @@ def killing(stage: str, at: int) -> Callable[..., None]:
 
 
 def assert_same(left: LiftResult, right: LiftResult) -> None:
-    for name in TENSORS:
-        first, second = getattr(left, name), getattr(right, name)
-        assert first.dtype == second.dtype
-        assert torch.equal(first.view(torch.uint8), second.view(torch.uint8)), name
+    assert arrays_of(left) == arrays_of(right)
     assert left.metadata.diagnostics == right.metadata.diagnostics
 
 
