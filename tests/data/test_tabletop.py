@@ -103,9 +103,9 @@ def test_the_objects_of_hard_masks_are_the_things_of_the_scene(
     scene = truth.open_scene(row_sum)
     ious, means = [], scene.splats.means.numpy()
     for number in OBJECTS:
-        (found,) = objects(scene, ask(scene, truth.words[number], encoder)).objects
+        (item,) = objects(scene, ask(scene, truth.words[number], encoder)).objects
         inside = means[truth.objects.numpy() == number]
-        ious.append(box_iou(np.array([*found.box]), np.stack([inside.min(axis=0), inside.max(axis=0)])))
+        ious.append(box_iou(np.array([*item.box]), np.stack([inside.min(axis=0), inside.max(axis=0)])))
     assert np.mean(ious) > 0.93 and min(ious) > 0.85  # .059 around all selected splats
 
 

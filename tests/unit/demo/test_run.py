@@ -26,11 +26,11 @@ CELLS = [cell for cell in json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cell
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What the demo prints."""
+    """The report of the demo, in JSON."""
     out = tmp_path_factory.mktemp("demo")
-    with redirect_stdout(StringIO()) as printed:
+    with redirect_stdout(StringIO()) as output:
         assert demo.run(argparse.Namespace(out=out, json=True, ask=["penguin", "sofa"])) == 0
-    return json.loads(printed.getvalue())
+    return json.loads(output.getvalue())
 
 
 def test_the_demo_finds_what_it_asks_for(report: dict[str, Any]) -> None:
