@@ -54,7 +54,7 @@ NARROWED = {  # columns that take two bytes in the file, where that loses nothin
     "total_weight": np.float32, CONFIDENCE: np.float32, "cluster": np.int32, "object": np.int32, "node": np.int32,
 }  # fmt: skip
 SCHEMA = {  # types, and axes: P splats, K rows, F channels, C clusters, O objects, V views, N nodes, W words
-    "features": ("f2 f4", "K F"), "code": ("u2", "P"), "total_weight": ("f2 f4", "P"), "has_feature": ("?", "P"),
+    "features": ("f2 f4", "K F"), "code": ("u2", "P"), "total_weight": ("f2 f4", "P"), "has_feature": ("b1", "P"),
     CONFIDENCE: ("f2 f4", "P"), "cluster": ("i2 i4", "P"), "cluster_features": ("f2 f4", "C F"),
     "object": ("i2 i4", "P"), "object_views": ("i4", "O V"),
     "node": ("i2 i4", "P"), "node_parents": ("i4", "N"), "node_views": ("i4", "N V"), "node_confidence": ("f4", "N"),
