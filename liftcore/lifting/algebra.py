@@ -22,7 +22,6 @@ from liftcore.solve.objects import (
     RegionObjects,
     add_regions,
     choose_nodes,
-    node_numbering,
     number_objects,
 )
 from liftcore.solve.region_tree import RegionTree, region_tree
@@ -97,7 +96,7 @@ class Algebra:
         self._label(1, tree)
         labels, total_weight = pieces.column("labels-1", "labels"), pieces.column("rows", "total_weight")
         view_weights = pieces.table("labels-1", (1, number * groups.views)).reshape(number, groups.views)
-        objects = number_objects(labels, tree, node_numbering(labels, total_weight, tree), view_weights)
+        objects = number_objects(labels, total_weight, tree, view_weights)
         return objects, NodeVectors.of(pieces.codebook, self._region_totals(), objects)
 
     def _label(self, turn: int, tree: RegionTree) -> None:

@@ -153,6 +153,7 @@ class SomeRows:
     rows: np.ndarray  # [r] i32 or i64 ascending, row numbers in the block
     starts: np.ndarray  # [r + 1] i64, offsets of the rows in the values; the first need not be 0
     values: Sequence[np.ndarray]  # each [n]
+    base: int = 0  # that is added to the first of them: the number of the part's first region or tuple
 
 
 def row_starts(parts: Iterable[SomeRows], count: int) -> np.ndarray:
@@ -168,8 +169,8 @@ def fill_rows(parts: Iterable[SomeRows], starts: np.ndarray, targets: Sequence[n
     cursors = starts[:-1].copy()
     for part in parts:
         at = cursors[part.rows]
-        for source, target in zip(part.values, targets, strict=True):
-            copy_rows(part.starts, at, source, target)
+        for source, target, base in zip(part.values, targets, (part.base, 0), strict=False):
+            copy_rows(part.starts, at, source, source.dtype.type(base), target)
         cursors[part.rows] += np.diff(part.starts)
 
 
@@ -179,26 +180,32 @@ def values_of(count: int, dtype: torch.dtype) -> Tensor:
 
 
 def gather_rows(
-    parts: Callable[[], Iterable[SomeRows]], count: int, dtypes: Sequence[torch.dtype]
+    parts: Callable[[int, int], Iterable[SomeRows]], count: int, dtypes: Sequence[torch.dtype], threads: int | None
 ) -> tuple[np.ndarray, list[Tensor]]:
     """Return the offsets [count + 1] i64 of a block's rows, and their values, of the given dtypes.
 
     Args:
-        parts: returns an iterator over the parts, one in memory at a time; called twice.
+        parts: ``parts(first, last)`` returns an iterator over the parts of some rows, one in memory at a time.
     """
-    starts = row_starts(parts(), count)
+    starts = row_starts(parts(0, count), count)
     targets = [values_of(int(starts[-1]), dtype) for dtype in dtypes]
-    fill_rows(parts(), starts, [target.numpy() for target in targets])
+
+    def fill(first: int, last: int) -> None:
+        fill_rows(parts(first, last), starts[first : last + 1], [target.numpy() for target in targets])
+
+    # Each block reads all parts.
+    run_each(fill, row_blocks(np.diff(starts), max(count, 1), max(1 << 20, int(starts[-1]) >> 5)), threads)
     return starts, targets
 
 
-def part_of(splats: np.ndarray, starts: np.ndarray, values: Iterable[np.ndarray], ends: tuple[int, int]) -> SomeRows:
+def part_of(
+    splats: np.ndarray, starts: np.ndarray, values: Iterable[np.ndarray], ends: tuple[int, int], base: int = 0
+) -> SomeRows:
     """Select the rows of a part that are in a block, and their values."""
     first, last = np.searchsorted(splats, ends)
     span = slice(int(starts[first]), int(starts[last]))
-    return SomeRows(
-        splats[first:last] - ends[0], starts[first : last + 1] - span.start, [part[span] for part in values]
-    )
+    rows, begins = splats[first:last] - ends[0], starts[first : last + 1] - span.start
+    return SomeRows(rows, begins, [part[span] for part in values], base)
 
 
 def region_offsets(counts: Iterable[int]) -> np.ndarray:
@@ -222,20 +229,13 @@ def stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None = N
         for part in parts[first : first + PIECE_VIEWS]:
             sums[part.total_weight_splats.numpy()] += part.total_weight.numpy()
         total_weight += sums
-    starts = row_starts((SomeRows(part.splats.numpy(), part.indptr.numpy(), ()) for part in parts), splats)
-    region, weight = (values_of(int(starts[-1]), dtype) for dtype in (torch.int32, torch.float32))
 
-    def fill(first: int, last: int) -> None:
-        def rows() -> Iterator[SomeRows]:
-            for part, base in zip(parts, offsets[:-1], strict=True):
-                values = part.region.numpy(), part.weight.numpy()
-                block = part_of(part.splats.numpy(), part.indptr.numpy(), values, (first, last))
-                yield SomeRows(block.rows, block.starts, (block.values[0] + np.int32(base), block.values[1]))
+    def rows(first: int, last: int) -> Iterator[SomeRows]:
+        for part, base in zip(parts, offsets[:-1], strict=True):
+            values = part.region.numpy(), part.weight.numpy()
+            yield part_of(part.splats.numpy(), part.indptr.numpy(), values, (first, last), base)
 
-        fill_rows(rows(), starts[first : last + 1], (region.numpy(), weight.numpy()))
-
-    # Each block reads all views.
-    run_each(fill, row_blocks(np.diff(starts), max(splats, 1), max(1 << 20, int(starts[-1]) >> 5)), threads)
+    starts, (region, weight) = gather_rows(rows, splats, (torch.int32, torch.float32), threads)
     hit_splats = np.flatnonzero(total_weight)
     tensors = (
         np.arange(splats, dtype=np.int32),
@@ -244,9 +244,9 @@ def stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None = N
         total_weight[hit_splats],
         offsets,
     )
-    rows, begins, hits, sums, bases = map(torch.from_numpy, tensors)
+    numbers, begins, hits, sums, bases = map(torch.from_numpy, tensors)
     names = tuple(name for part in parts for name in part.views)
-    return RegionWeights(rows, begins, region, weight, hits, sums, bases, names)
+    return RegionWeights(numbers, begins, region, weight, hits, sums, bases, names)
 
 
 def take_rows(starts: np.ndarray, rows: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -258,12 +258,12 @@ def take_rows(starts: np.ndarray, rows: np.ndarray, values: np.ndarray) -> tuple
 
 
 @kernel
-def copy_rows(starts, at, source, target):
-    """Copy row i of the source, from ``starts[i]`` on, to ``at[i]`` of the target."""
+def copy_rows(starts, at, source, base, target):
+    """Copy row i of the source, from ``starts[i]`` on, to ``at[i]`` of the target, plus ``base``."""
     for i in range(at.size):
         shift = at[i] - starts[i]
         for k in range(starts[i], starts[i + 1]):
-            target[k + shift] = source[k]
+            target[k + shift] = source[k] + base
 
 
 @kernel

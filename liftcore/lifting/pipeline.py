@@ -103,13 +103,13 @@ def lift(
     if on_plan is not None and not callable(on_plan):
         raise InvalidSettings("on_plan", expected="a function of the plan, or None", got=repr(on_plan)[:80])
     stored = None if checkpoint is None else Checkpoint(as_path(checkpoint, "checkpoint"))
-    logged = set[str]()
+    reported_warnings = set[str]()
 
     def log_once(warnings: Iterable[str]) -> None:
         for warning in warnings:
-            if warning not in logged:
+            if warning not in reported_warnings:
                 log.warning(warning)
-                logged.add(warning)
+                reported_warnings.add(warning)
 
     show_plan = on_plan or (lambda plan: log_once(plan.warnings))
     with shown_progress(progress) as reporter, one_thread():
@@ -148,8 +148,8 @@ def _run(
                 on_plan(plan)
                 pieces, statistics = weigh_in_files(engine, folder, inputs, plan, timings)
         lift = _solve(pieces, engine or LocalEngine(threads), inputs, statistics, timings, threads)
-        room = plan.features_room
-        is_mapped = folder is not None or (room is not None and lift.features.nbytes > room)
+        limit = plan.features_room
+        is_mapped = folder is not None or (limit is not None and lift.features.nbytes > limit)
         return lift if is_mapped else lift.to(plan.device.place)
 
 

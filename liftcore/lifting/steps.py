@@ -47,7 +47,6 @@ from liftcore.solve.objects import (
     node_containers,
     node_labels,
     node_shares,
-    node_splats,
     sample_splats,
     view_shares,
 )
@@ -166,8 +165,7 @@ def contain(pieces: Pieces, piece: int, threads: int | None) -> Saved:
     is_sampled[rows] = True
     local, numbers = np.flatnonzero(is_sampled), (np.cumsum(is_sampled) - 1)[rows]
     tuples, totals = tuples_of(pieces, block.splats[local])
-    table = node_splats(begins, numbers, tuples, totals, nodes, groups.view.size)
-    return {"container": node_containers(table, nodes, groups, threads)}, (), None
+    return {"container": node_containers(begins, numbers, tuples, totals, nodes, groups, threads)}, (), None
 
 
 @saved_as("share")
@@ -184,9 +182,9 @@ def share(pieces: Pieces, piece: int, threads: int | None) -> Saved:
     tuples, totals = tuples_of(pieces, block.splats[visible])
     tuples = SplatTuples(*take_rows(tuples.starts, order, tuples.tuples), tuples.parents, tuples.members)
     arguments = block.W, own_region, groups, visible[order], totals[order], tuples
-    shares = region_shares(*arguments, base=block.base, threads=threads)
-    arrays = {"splats": block.splats, "starts": block.W.indptr, "sums": shares.sums, "views": shares.views}
-    return arrays | {"shares": np.array([shares.share_sum, shares.share_count])}, (), None
+    sums, views, share_sum = region_shares(*arguments, base=block.base, threads=threads)
+    arrays = {"splats": block.splats, "starts": block.W.indptr, "sums": sums, "views": views}
+    return arrays | {"shares": np.array([share_sum, views.sum(dtype=np.int64)])}, (), None
 
 
 # ---- blocks of splats
@@ -221,15 +219,14 @@ def splat_block(pieces: Pieces, piece: int) -> SplatBlock:
 @saved_as("join")
 def join(pieces: Pieces, piece: int, threads: int | None) -> Saved:
     """Save the tuples of a block of splats in all views, and the sums of its rows of W."""
-    bases, ends = pieces.load("tuples")["bases"], pieces.bounds(piece)
+    bases, (first, last) = pieces.load("tuples")["bases"], pieces.bounds(piece)
 
-    def parts() -> Iterator[SomeRows]:
+    def parts(begin: int, end: int) -> Iterator[SomeRows]:
         for number, base in enumerate(bases):
             arrays = pieces.load("relate", number)
-            part = part_of(arrays["splats"], arrays["starts"], [arrays["tuples"]], ends)
-            yield SomeRows(part.rows, part.starts, [part.values[0] + np.int32(base)])
+            yield part_of(arrays["splats"], arrays["starts"], [arrays["tuples"]], (first + begin, first + end), base)
 
-    starts, (tuples,) = gather_rows(parts, ends[1] - ends[0], (torch.int32,))
+    starts, (tuples,) = gather_rows(parts, last - first, (torch.int32,), threads)
     return {"starts": starts, "tuples": tuples, "totals": pieces.load("rows", piece)["sums"]}, (), None
 
 

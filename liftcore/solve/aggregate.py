@@ -38,19 +38,6 @@ class Aggregation:
     facts: dict[str, Any]  # for the diagnostics
 
 
-@dataclass
-class KeptRegionSums:
-    """Sums over the kept regions of all views, by cluster."""
-
-    sums: np.ndarray  # [K, F] f64, of their codebook rows
-    counts: np.ndarray  # [K] i64, numbers of kept regions
-    regions: int = 0  # of all views, kept or not
-
-    def means(self) -> Tensor:
-        """Return the mean of each cluster's kept rows, [K, F] f64; zero if there is none."""
-        return torch.from_numpy(self.sums / np.maximum(self.counts, 1)[:, None])
-
-
 def aggregate(
     features: Tensor,
     total_weight: np.ndarray,
@@ -74,9 +61,8 @@ def aggregate(
     if clustering.count == 0:
         merged = torch.zeros(0, features.shape[1], dtype=features.dtype)
     elif any(views.features.is_regions(name) for name in views.names):
-        region_sums = filter_regions(clustering, features.shape[1], raster, views, settings, progress)
-        merged, kept_count = region_sums.means().to(features.dtype), int(region_sums.counts.sum())
-        facts = {"filter": "iou", "regions": region_sums.regions, "kept_regions": kept_count}
+        means, regions, kept_count = filter_regions(clustering, features.shape[1], raster, views, settings, progress)
+        merged, facts = means.to(features.dtype), {"filter": "iou", "regions": regions, "kept_regions": kept_count}
     else:
         merged = weighted_means(features, total_weight, clustering)
         facts = {"filter": "none: grids have no regions"}
@@ -103,9 +89,14 @@ def filter_regions(
     views: LiftViews,
     settings: LiftSettings,
     progress: Progress,
-) -> KeptRegionSums:
-    """Render the clusters to every lifted view and keep the regions that match one by ``aggregation_iou``."""
-    region_sums = KeptRegionSums(np.zeros((clustering.count, channels)), np.zeros(clustering.count, np.int64))
+) -> tuple[Tensor, int, int]:
+    """Render the clusters to every lifted view and keep the regions that match one by ``aggregation_iou``.
+
+    Returns:
+        The mean of each cluster's kept rows of codebooks [K, F] f64, zero if there is none; the number of regions of
+        all views, and of those that are kept.
+    """
+    sums, counts, regions = np.zeros((clustering.count, channels)), np.zeros(clustering.count, np.int64), 0
     params = settings.compositing
     for number, name in enumerate(views.names):
         camera, features = views[number]
@@ -116,11 +107,11 @@ def filter_regions(
             codebook = observation.codebook.double().numpy()
             areas, clusters, ious = match_regions(observation.labels.numpy(), kappa, len(codebook), clustering.count)
             rows = np.flatnonzero((clusters != NO_CLUSTER) & (ious >= settings.aggregation_iou))
-            np.add.at(region_sums.sums, clusters[rows], codebook[rows])
-            np.add.at(region_sums.counts, clusters[rows], 1)
-            region_sums.regions += int((areas > 0).sum())
+            np.add.at(sums, clusters[rows], codebook[rows])
+            np.add.at(counts, clusters[rows], 1)
+            regions += int((areas > 0).sum())
         progress("aggregate", number + 1, len(views), "views")
-    return region_sums
+    return torch.from_numpy(sums / np.maximum(counts, 1)[:, None]), regions, int(counts.sum())
 
 
 def weighted_means(features: Tensor, total_weight: np.ndarray, clustering: Clustering) -> Tensor:

@@ -106,20 +106,6 @@ class SplatTuples:
     members: np.ndarray  # [T] i32, the last region of a tuple
 
 
-@dataclass(frozen=True)
-class RegionShares:
-    """Sums of q over the other views, of the entries of some regions."""
-
-    sums: np.ndarray  # [nnz] f32, of q over the observing views
-    views: np.ndarray  # [nnz] u8, the number of observing views
-    share_sum: int  # the sum of all q, in STEPS
-
-    @property
-    def share_count(self) -> int:
-        """The number of all q."""
-        return int(self.views.sum(dtype=np.int64))
-
-
 def along_curve(points: Tensor, bounds: Tensor | None = None) -> np.ndarray:
     """Return the order [n] i64 of points along a space-filling curve; equal points keep their order.
 
@@ -135,7 +121,7 @@ def mean_share(share_sum: int, share_count: int) -> float:
 
 
 def with_mean(sums: np.ndarray, views: np.ndarray, mean: float, threads: int | None = None) -> np.ndarray:
-    """Replace sums of q [nnz] f32 (`RegionShares`) by c_jm, in place."""
+    """Replace sums of q [nnz] f32 (`region_shares`) by c_jm, in place."""
     step = BLOCK_ENTRIES >> 3
     blocks = [(first, min(first + step, sums.size)) for first in range(0, sums.size, step)]
     run_each(lambda first, last: blend_with_mean(first, last, sums, views, mean), blocks, threads)
@@ -161,13 +147,16 @@ def region_shares(
     *,
     base: int = 0,
     threads: int | None = None,
-) -> RegionShares:
-    """Return the sums of q of all entries of W, which has all splats of its regions.
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return the sums of q over the other views, of all entries of W, which has all splats of its regions.
 
     Args:
         W, own_region: of the regions ``base..base + offsets[-1]`` (`memberships`).
         rows: [n] i64, rows of W with entries, in the order in which splats are read.
         totals: [n] f64, t_j of these rows. tuples: of these rows, in all views.
+
+    Returns:
+        [nnz] f32, and the number of observing views [nnz] u8; the sum of all q, in STEPS.
     """
     indptr, region = W.indptr.numpy(), W.region.numpy()
     pieces = [
@@ -195,7 +184,7 @@ def region_shares(
         back = [base + first, cursors, next_cursors, region, at, sums, views, consensus, witnesses]
         run_each(lambda *ends, back=back: return_to_rows(*ends, *back), pieces, threads)
         share_sum, cursors = share_sum + int(shares.sum()), next_cursors
-    return RegionShares(consensus, witnesses, share_sum)
+    return consensus, witnesses, share_sum
 
 
 def _edges(lengths: np.ndarray, entries: int) -> list[tuple[int, int]]:

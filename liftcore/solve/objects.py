@@ -49,17 +49,6 @@ BLOCK_ENTRIES = 1 << 18
 
 
 @dataclass(frozen=True)
-class NodeSplats:
-    """The splats of some nodes, and all nodes to which each of these splats belongs."""
-
-    begins: np.ndarray  # [n + 1], offsets of each node's splats
-    splats: np.ndarray  # i32, ascending in a node
-    starts: np.ndarray  # [s + 1], offsets of each splat's nodes
-    members: np.ndarray  # u16 (fewer bytes to read), numbers of nodes, ascending in a splat
-    counts: np.ndarray  # [s] f64, weight of each splat, sqrt(t_j)
-
-
-@dataclass(frozen=True)
 class RegionObjects:
     """Objects and parts of a scene: N nodes, of which the first K are objects."""
 
@@ -73,15 +62,6 @@ class RegionObjects:
     def views(self) -> np.ndarray:
         """The best views of objects, [K, BEST_VIEWS] i32."""
         return self.node_views[: self.count]
-
-
-@dataclass(frozen=True)
-class NodeNumbers:
-    """Final numbers of the nodes of a tree, from their splats: [N + 1] i32 each, the last -1."""
-
-    node: np.ndarray  # its number, or that of its whole if merged into it; -1 without splats
-    object: np.ndarray  # its object; -1 for none
-    count: int  # objects
 
 
 def choose_nodes(groups: RegionGroups, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -132,42 +112,38 @@ def sample_splats(
     return begins, rows
 
 
-def node_splats(
-    begins: np.ndarray, splats: np.ndarray, tuples: SplatTuples, totals: np.ndarray, nodes: np.ndarray, regions: int
-) -> NodeSplats:
-    """Return the splats of the nodes of some views, from the tuples of their sampled splats.
-
-    Args:
-        begins, splats: offsets of each node's splats, and their numbers among the tuples and totals.
-        tuples: of these splats in all views. totals: [s] f64, t_j. regions: M.
-    """
-    number, starts = node_numbers(nodes, regions), np.zeros(tuples.starts.size, np.int64)
-    parts = tuples.starts, tuples.tuples, tuples.parents, tuples.members, number
-    count_tuple_nodes(*[*parts, starts])
-    np.cumsum(starts, out=starts)
-    members = np.empty(starts[-1], np.uint16)
-    list_tuple_nodes(*[*parts, starts, members])
-    return NodeSplats(begins, splats.astype(np.int32), starts, members, np.sqrt(totals))
-
-
 def node_containers(
-    table: NodeSplats, nodes: np.ndarray, groups: RegionGroups, threads: int | None = None
+    begins: np.ndarray,
+    splats: np.ndarray,
+    tuples: SplatTuples,
+    totals: np.ndarray,
+    nodes: np.ndarray,
+    groups: RegionGroups,
+    threads: int | None = None,
 ) -> np.ndarray:
-    """Return for each node of a table and each level the node that contains it, SPLIT or UNSEEN.
+    """Return for each node of some views and each level the node that contains it, SPLIT or UNSEEN.
 
     Args:
-        nodes: [N] i64, all nodes, in the numbering of the table's members.
+        begins: [n + 1], offsets of each node's sampled splats. splats: their numbers among the tuples and totals,
+            ascending in a node.
+        tuples: of these splats in all views. totals: [s] f64, t_j. nodes: [N] i64, all nodes.
 
     Returns:
         [n, views * levels] i32.
     """
+    number, starts = node_numbers(nodes, groups.view.size), np.zeros(tuples.starts.size, np.int64)
+    parts = tuples.starts, tuples.tuples, tuples.parents, tuples.members, number
+    count_tuple_nodes(*[*parts, starts])
+    np.cumsum(starts, out=starts)
+    members = np.empty(starts[-1], np.uint16)  # fewer bytes to read
+    list_tuple_nodes(*[*parts, starts, members])
     _, group, views = node_groups(nodes, groups)
-    size = table.begins.size - 1
+    size = begins.size - 1
     containers = np.full((size, groups.levels * views), UNSEEN, np.int32)
-    arrays = table.begins, table.splats, table.starts, table.members, table.counts
+    arrays = begins, splats.astype(np.int32), starts, members, np.sqrt(totals), group, containers
     run_each(
-        lambda a, b: containing_nodes(a, b, *arrays, group, containers),
-        row_blocks(np.diff(table.begins), max(size, 1), BLOCK_ENTRIES >> 3) if nodes.size else [],
+        lambda a, b: containing_nodes(a, b, *arrays),
+        row_blocks(np.diff(begins), max(size, 1), BLOCK_ENTRIES >> 3) if nodes.size else [],
         threads,
     )
     return containers
@@ -250,11 +226,17 @@ def view_shares(
     return piece_sums(add, labels.size, (1, number * groups.views), threads)
 
 
-def node_numbering(labels: np.ndarray, total_weight: np.ndarray, tree: RegionTree) -> NodeNumbers:
-    """Number the nodes, objects first.
+def node_numbering(
+    labels: np.ndarray, total_weight: np.ndarray, tree: RegionTree
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Number the nodes of a tree, objects first.
 
     Args:
         labels: [P] i32, the smallest node of each splat. total_weight: [P].
+
+    Returns:
+        The number of each node, or that of its whole if merged into it, and its object, [N + 1] i32 each, the last
+        -1; -1 without splats or object. The number of objects.
     """
     number, assigned = tree.parents.size, labels >= 0
     above = tree.lineage().T.astype(np.float64)
@@ -283,29 +265,28 @@ def node_numbering(labels: np.ndarray, total_weight: np.ndarray, tree: RegionTre
     order = np.concatenate([first, later[(is_distinct & (objects != np.arange(number)))[later]]])
     place = np.full(number + 1, NO_NODE, np.int32)
     place[order] = np.arange(order.size)
-    return NodeNumbers(place[np.append(alias, NO_NODE)], place[np.append(objects[alias], NO_NODE)], first.size)
+    return place[np.append(alias, NO_NODE)], place[np.append(objects[alias], NO_NODE)], first.size
 
 
 def number_objects(
-    labels: np.ndarray, tree: RegionTree, numbers: NodeNumbers, view_weights: np.ndarray
+    labels: np.ndarray, total_weight: np.ndarray, tree: RegionTree, view_weights: np.ndarray
 ) -> RegionObjects:
     """Return the objects of a scene, with the tree in their numbering.
 
     Args:
-        labels: [P] i32, the smallest node of each splat. numbers: of the tree's nodes (`node_numbering`).
+        labels: [P] i32, the smallest node of each splat. total_weight: [P].
         view_weights: [N, V] f64, the weight of each label in each view.
     """
-    new = numbers.node[:-1]
+    node, of_object, count = node_numbering(labels, total_weight, tree)
+    new = node[:-1]
     first = np.unique(new, return_index=True)[1]  # a whole comes before parts merged into it
     order = first[int((new < 0).any()) :]
     above = tree.parents[order]
     new_tree = RegionTree(
-        numbers.node[tree.region], np.where(above >= 0, new[above], NO_NODE).astype(np.int32), tree.confidence[order]
+        node[tree.region], np.where(above >= 0, new[above], NO_NODE).astype(np.int32), tree.confidence[order]
     )
     node_weights = np.asarray(tree.lineage().T.astype(np.float64) @ view_weights)[order]
-    return RegionObjects(
-        numbers.object[labels], numbers.node[labels], new_tree, _best_views(node_weights), numbers.count
-    )
+    return RegionObjects(of_object[labels], node[labels], new_tree, _best_views(node_weights), count)
 
 
 @dataclass(frozen=True)

@@ -91,7 +91,7 @@ def compare_with_optimum(
         steps, is_converged = max(steps, iterations), is_converged and reason < 7  # 7: STEPS were too few
         progress("reference", c + 1, axes.shape[1], "channels")
     books = [torch.from_numpy(_project(book, axes)).float() for book in codebooks]
-    facts = {
+    return {
         "channels": axes.shape[1],
         "steps": steps,
         "converged": is_converged,
@@ -100,7 +100,6 @@ def compare_with_optimum(
         "ratio": residual / least if least > 0 else None,
         **_bounds(measure_samples(samples, torch.from_numpy(optimum).float(), books)),
     }
-    return facts | {"message": _message(facts)}
 
 
 def _system(
@@ -158,17 +157,3 @@ def _bounds(measures: ViewMeasures) -> dict[str, Any]:
         "bound": None if beta["max"] is None else 1.0 + beta["max"],
         "surrogate_bound": float(surrogate / residual) if residual > 0 and np.isfinite(surrogate) else None,
     }
-
-
-def _message(facts: dict[str, Any]) -> str:
-    """Return the result in a sentence for the user."""
-    if facts["ratio"] is None:
-        return "The residual of the optimum is zero: there is no ratio."
-    end = "converged" if facts["converged"] else "not converged, so it is at least that"
-    sentence = f"L(x') is {facts['ratio']:.3f} times L(x^) after {facts['steps']} steps ({end})"
-    if facts["bound"] is None or facts["surrogate_bound"] is None:
-        return f"{sentence}; no bound, as no row was sampled or the residual of one is zero."
-    return (
-        f"{sentence}; on the sampled rays J(x^) / L(x^) is {facts['surrogate_bound']:.3f} and 1 + beta is "
-        f"{facts['bound']:.3g}. Both bound the ratio for weights of power 1."
-    )

@@ -20,10 +20,6 @@ class Readout:
     columns: np.ndarray  # [rows, taps] i64, codebook rows
     shares: np.ndarray  # [rows, taps] f64, sum to one
 
-    def rows(self, indices: np.ndarray) -> "Readout":
-        """Return some rows, by their indices [n] i64; indices of rays do not change."""
-        return Readout(self.rays[indices], self.columns[indices], self.shares[indices])
-
     def observed(self, codebook: Tensor) -> Tensor:
         """Return B [rows, F] f32 of the rays."""
         vectors = codebook[torch.from_numpy(self.columns)].to(torch.float32)

@@ -268,9 +268,8 @@ def _weight_rows(pieces: PiecesInFiles, ends: tuple[int, int]) -> Iterator[SomeR
     """Iterate over the rows of W of a block in each piece of views, with one file open at a time."""
     offsets = pieces.load("regions")["offsets"]
     for piece in range(pieces.view_pieces):
-        arrays, base = pieces.load("weights", piece), np.int32(offsets[pieces.views_of(piece).start])
-        part = part_of(arrays["splats"], arrays["starts"], (arrays["region"], arrays["weight"]), ends)
-        yield SomeRows(part.rows, part.starts, [part.values[0] + base, part.values[1]])
+        arrays, base = pieces.load("weights", piece), offsets[pieces.views_of(piece).start]
+        yield part_of(arrays["splats"], arrays["starts"], (arrays["region"], arrays["weight"]), ends, base)
 
 
 def _total_weight(pieces: PiecesInFiles, ends: tuple[int, int]) -> Tensor:
@@ -287,6 +286,10 @@ def _total_weight(pieces: PiecesInFiles, ends: tuple[int, int]) -> Tensor:
 def gather(pieces: PiecesInFiles, piece: int, threads: int | None) -> Saved:
     """Save W of a block of splats in all views, its sums and total weight."""
     ends = first, last = pieces.bounds(piece)
-    starts, values = gather_rows(lambda: _weight_rows(pieces, ends), last - first, (torch.int32, torch.float32))
+
+    def parts(begin: int, end: int) -> Iterator[SomeRows]:
+        return _weight_rows(pieces, (first + begin, first + end))
+
+    starts, values = gather_rows(parts, last - first, (torch.int32, torch.float32), threads)
     W = weights_of(starts, values[0], values[1], pieces.load("regions")["offsets"])
     return row_arrays(pieces, W, pieces.means[first:last], _total_weight(pieces, ends), threads)

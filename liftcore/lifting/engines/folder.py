@@ -91,14 +91,14 @@ def _open_pieces(folder: Path, identity: str) -> Path:
 
     Each lift has a folder of its own, so that a worker of a killed lift cannot write into another lift's files.
     """
-    own = folder / f"blocks-{identity}"
+    lift_folder = folder / f"blocks-{identity}"
     for other in folder.glob("blocks-*"):
-        if other != own and PIECES.fullmatch(other.name):
+        if other != lift_folder and PIECES.fullmatch(other.name):
             shutil.rmtree(other, ignore_errors=True)
-    own.mkdir(exist_ok=True)
-    for draft in own.rglob(".*.part"):
+    lift_folder.mkdir(exist_ok=True)
+    for draft in lift_folder.rglob(".*.part"):
         draft.unlink(missing_ok=True)
-    return own
+    return lift_folder
 
 
 def _facts(camera: Camera) -> list[Any]:

@@ -67,8 +67,8 @@ class RayEngine:
         task, pieces_ref = ray.remote(**needs)(work), ray.put(pieces)
         numbers, waiting = iter(range(count)), dict[Any, int]()
 
-        def send(most: int) -> None:
-            for number, _ in zip(numbers, range(most), strict=False):
+        def send(limit: int) -> None:
+            for number, _ in zip(numbers, range(limit), strict=False):
                 waiting[task.remote(pieces_ref, number, self._cpus)] = number
 
         try:

@@ -180,10 +180,10 @@ def plan_lift(
     phases = memory_phases(splats, visible, cameras, features, names, settings, entries)
     free, in_files = None if in_blocks else free_memory(), max(0, weights - MEMORY_LIMIT)
     if in_blocks:  # W by views, W by splats, and X
-        room = check_room(2 * weights + phases["solve"]["features"], folder) if folder else []
+        disk_warnings = check_room(2 * weights + phases["solve"]["features"], folder) if folder else []
         phases, in_files = worker_phases(phases, weights, visible, settings), 0
     else:
-        room = check_room(in_files, None)
+        disk_warnings = check_room(in_files, None)
     lifted, antialiased = set(names), settings.compositing.antialiased
     return Plan(
         kernel=str(splats.kernel),
@@ -202,7 +202,7 @@ def plan_lift(
         in_files=in_files,
         device=device,
         features_room=features_room(phases, free),
-        machine_warnings=(*short, *check_memory(phases, free), *room),
+        machine_warnings=(*short, *check_memory(phases, free), *disk_warnings),
         input_warnings=(
             *scene_warnings(splats, views.cameras, cameras, settings),
             *shape_warnings(features, cameras),
