@@ -10,8 +10,8 @@ from liftcore.io.json_file import finite as finite
 from liftcore.io.kinds import identify as identify
 from liftcore.io.kinds import page_table as page_table
 from liftcore.io.kinds import wrong_kind as wrong_kind
-from liftcore.io.photo_zip import PhotoIndexes as PhotoIndexes
 from liftcore.io.photo_zip import in_camera_orientation as in_camera_orientation
+from liftcore.io.photo_zip import photo_index as photo_index
 from liftcore.io.safetensors_file import with_metadata as with_metadata
 from liftcore.scene.views import cameras_of_views as cameras_of_views
 from liftcore.scene.views import require_pairs as require_pairs

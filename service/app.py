@@ -25,7 +25,6 @@ from starlette.middleware.gzip import GZipMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from liftcore import __version__
-from liftcore.files import PhotoIndexes
 from service import errors
 from service.auth import Auth, with_keys
 from service.errors import METHODS, PROBLEM, REQUEST_ID, answer_to
@@ -63,7 +62,7 @@ def create_app(settings: ServiceSettings, store: Store) -> FastAPI:
         runner = Runner(store, children, settings)
         limiter = anyio.CapacityLimiter
         app.state.parts = parts = Parts(
-            settings, store, children, runner, queries, PhotoIndexes(), checks=limiter(4), writing=limiter(8)
+            settings, store, children, runner, queries, checks=limiter(4), writing=limiter(8)
         )
         add_gauges(app.state.registry, parts)
         runner.start()

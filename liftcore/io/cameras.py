@@ -7,10 +7,9 @@ COLMAP writes several models (``sparse/0``, ``sparse/1``, ...) where photos do n
 frame of its own. Only the user knows which is that of the splats, so a folder of several is refused.
 """
 
-import errno
 import os
+import re
 import shutil
-import tempfile
 import zipfile
 from collections.abc import Iterable
 from contextlib import suppress
@@ -18,9 +17,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from liftcore.errors import InvalidCameras, Unavailable, naming, reading
+from liftcore.errors import InvalidCameras, naming, reading
 from liftcore.io.colmap import MODEL_FILES, has_model, is_whole, model_files, read_colmap, read_image_names
-from liftcore.io.files import BROKEN_ZIP, first_bytes, is_system_file, is_zip, open_regular, open_zip
+from liftcore.io.files import BROKEN_ZIP, files_in_zip, first_bytes, is_zip, open_regular, open_zip
 from liftcore.io.json_file import FORMATS as JSON_FORMATS
 from liftcore.io.json_file import matrix, number, pixels, read_json
 from liftcore.io.kinds import wrong_kind
@@ -32,7 +31,6 @@ from liftcore.scene.cameras import (
     Camera,
     Cameras,
     InvalidPose,
-    check_count,
     read_views,
     viewmat_of,
 )
@@ -43,6 +41,7 @@ JSON_FILES = (TRANSFORMS, "cameras.json", TRAINED_ON)
 FORMATS = "a COLMAP sparse model (folder or .zip), a transforms.json or a cameras.json"
 # Places where trainers, COLMAP's reconstructor and its undistorter put models; N is a number.
 MODEL_PLACES = (".", "sparse/N", "sparse", "colmap/sparse/N", "N", "dense/N/sparse", "dense/sparse")
+_PLACE = re.compile(r"(^|/)((colmap/)?sparse/\d+|dense/(\d+/)?sparse|sparse|\d+)$")  # the same, at a path's end
 MAX_UNZIPPED_BYTES = 512 * 1024 * 1024
 MAX_ZIP_MEMBERS = 100_000
 MAX_LISTED = 3  # models in an error
@@ -108,7 +107,6 @@ def read_cameras(path: Path | str) -> Cameras:
 
     Raises:
         InvalidCameras: no camera format is recognised, several models are, or the content is malformed.
-        Unavailable: the temporary folder has no free space for the files of a zip.
     """
     path = as_path(path)
     try:
@@ -238,15 +236,7 @@ def _frame_in(folder: Path) -> Path | None:
 
 def _scene_of(model: PurePosixPath) -> PurePosixPath:
     """Return the outermost folder in which a model has one of MODEL_PLACES; its own folder at least."""
-    parts = [*model.parts]
-    for place in sorted(MODEL_PLACES[1:], key=len, reverse=True):
-        names = place.split("/")
-        ends = parts[len(parts) - len(names) :]
-        if len(ends) == len(names) and all(
-            end.isdecimal() if name == "N" else end == name for end, name in zip(ends, names, strict=True)
-        ):
-            return PurePosixPath(*parts[: len(parts) - len(names)])
-    return model
+    return PurePosixPath(_PLACE.sub("", model.as_posix()))
 
 
 def _parse_inria(document: list[Any], source: str) -> Cameras:
@@ -257,7 +247,6 @@ def _parse_inria(document: list[Any], source: str) -> Cameras:
             hint = "a COLMAP model, or poses as a transforms.json, are read too"
             raise ValueError(f"{JSON_FORMATS}, got a list with {repr(foreign[0])[:60]}; {hint}")
         names = view_names([str(record["img_name"]) for record in document])
-        check_count(len(names), source)
 
     def cameras(name: str, record: dict[str, Any]) -> list[Camera]:
         with reading(f"{source} camera {name!r}", InvalidCameras, "a camera"):
@@ -279,21 +268,27 @@ def _parse_inria(document: list[Any], source: str) -> Cameras:
 def _from_zip(path: Path, frame_file: Path | None) -> Cameras:
     """Read the cameras of a zip as those of the folder; ``frame_file`` lies beside the zip."""
     try:
-        archive = open_zip(path)
+        with open_zip(path) as archive, scratch_folder("splatlift-") as root:
+            return _from_unzipped(archive, path, root, frame_file)
     except BROKEN_ZIP as error:
-        raise _broken_zip(path, error) from None
-    with archive, scratch_folder("splatlift-") as root:
-        names = _unzip(archive, path, root)
-        try:
-            source = _source_in_zip(names, root, frame_file)
-            if source.file is not None:
-                inner = source.file.parent.relative_to(root).as_posix()
-                source = replace(source, photos=zipfile.Path(archive, "" if inner == "." else f"{inner}/"))
-            return source.read()
-        except InvalidCameras as error:
-            argument, got = (text.replace(str(root), str(path)) for text in (error.argument, error.got))
-            hint = "unzip it, and " + error.hint.replace(f"{root}/", "") if str(root) in error.hint else error.hint
-            raise InvalidCameras(argument, expected=error.expected, got=got, hint=hint) from None
+        if ", got " in str(error):
+            raise
+        raise ValueError(f"a zip of cameras, got one that does not open ({str(error)[:120]})") from None
+
+
+def _from_unzipped(archive: zipfile.ZipFile, path: Path, root: Path, frame_file: Path | None) -> Cameras:
+    """Read the cameras of a zip through a folder ``root``, and name the zip in errors of its files."""
+    names = _unzip(archive, root)
+    try:
+        source = _source_in_zip(names, root, frame_file)
+        if source.file is not None:
+            inner = source.file.parent.relative_to(root).as_posix()
+            source = replace(source, photos=zipfile.Path(archive, "" if inner == "." else f"{inner}/"))
+        return source.read()
+    except InvalidCameras as error:
+        argument, got = (text.replace(str(root), str(path)) for text in (error.argument, error.got))
+        hint = "unzip it, and " + error.hint.replace(f"{root}/", "") if str(root) in error.hint else error.hint
+        raise InvalidCameras(argument, expected=error.expected, got=got, hint=hint) from None
 
 
 def _source_in_zip(names: list[str], root: Path, frame_file: Path | None) -> CameraSource:
@@ -317,48 +312,20 @@ def _source_in_zip(names: list[str], root: Path, frame_file: Path | None) -> Cam
     return source
 
 
-def _files(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    """Return the files by their normalised names, with slashes: some programs write backslashes or ``./``.
-
-    Hidden files and folders are left out, as in folders.
-    """
-    files = {}
-    for member in archive.infolist():
-        if member.is_dir():
-            continue
-        parts = PurePosixPath(member.filename.replace("\\", "/")).parts
-        inner = [part for part in parts if part not in ("/", "..")]
-        if inner and not is_system_file(PurePosixPath(*inner)):
-            files["/".join(inner)] = member
-    return files
-
-
-def _unzip(archive: zipfile.ZipFile, path: Path, folder: Path) -> list[str]:
+def _unzip(archive: zipfile.ZipFile, folder: Path) -> list[str]:
     """Unzip the camera files to ``folder``, and return the names of all files in the zip."""
     if (count := len(archive.infolist())) > MAX_ZIP_MEMBERS:
         raise ValueError(f"at most {MAX_ZIP_MEMBERS} files, got {count}")
-    files = _files(archive)
+    files = files_in_zip(archive)
     of_cameras = {name: member for name, member in files.items() if _is_of_cameras(PurePosixPath(name).name)}
     if (size := sum(member.file_size for member in of_cameras.values())) > MAX_UNZIPPED_BYTES:
         hint = "leave the points out of the zip"
         raise ValueError(f"at most {MAX_UNZIPPED_BYTES} bytes unzipped, got {size} bytes; {hint}")
-    try:
-        for name, member in of_cameras.items():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            with archive.open(member) as source, (folder / name).open("wb") as sink:
-                shutil.copyfileobj(source, sink)  # no more than the size that was added up
-    except BROKEN_ZIP as error:
-        raise _broken_zip(path, error) from None
+    for name, member in of_cameras.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        with archive.open(member) as source, (folder / name).open("wb") as sink:
+            shutil.copyfileobj(source, sink)  # no more than the size that was added up
     return list(files)
-
-
-def _broken_zip(path: Path, error: Exception) -> InvalidCameras | Unavailable:
-    """Return the error of a zip that does not open, or does not fit on the disk."""
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        expected, hint = f"free space in {tempfile.gettempdir()} for the zip's files", "free some, or set TMPDIR"
-        return Unavailable(str(path), expected=expected, got="a full disk", hint=hint)
-    got = f"one that does not open ({str(error)[:120]})"
-    return InvalidCameras(str(path), expected="a zip of a COLMAP sparse model", got=got)
 
 
 def _is_of_cameras(name: str) -> bool:

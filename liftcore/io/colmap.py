@@ -11,13 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from liftcore.errors import InvalidCameras, naming, reading
-from liftcore.io.files import refuse_pointer
+from liftcore.io.files import open_regular, refuse_pointer
 from liftcore.scene.cameras import (
     Camera,
     Cameras,
     InvalidPose,
     behind_lens,
-    check_count,
     read_views,
 )
 from liftcore.scene.distortion import Brown, Distortion, Fisheye
@@ -148,6 +147,8 @@ def _read_images(path: Path) -> list[_Image]:
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
     with reading(path, InvalidCameras, "a file of a sparse model", "export the sparse model again"):
+        with open_regular(path) as handle:
+            refuse_pointer(str(path), handle.read(64))
         try:
             yield
         except struct.error:
@@ -176,15 +177,19 @@ def _mapped(path: Path) -> Any:
     with path.open("rb") as handle:
         is_empty = not handle.seek(0, 2)  # which cannot be mapped
         data: Any = b"" if is_empty else mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ)
-    refuse_pointer(str(path), bytes(data[:64]))
     return data
+
+
+def _row_count(data: Any) -> int:
+    (count,) = struct.unpack_from("<Q", data)
+    if count > len(data):
+        raise ValueError(f"no more rows than the file has bytes, {len(data)}, got {count}")
+    return count
 
 
 def _binary_sensors(path: Path) -> Iterator[tuple[int, _Sensor]]:
     data, offset = _mapped(path), 8
-    (count,) = struct.unpack_from("<Q", data)
-    check_count(count, str(path))
-    for _ in range(count):
+    for _ in range(_row_count(data)):
         number, model, width, height = struct.unpack_from("<IiQQ", data, offset)
         if not 0 <= model < len(COLMAP_MODELS):
             raise ValueError(f"a camera of {READ_MODELS}, got camera model id {model}; {UNDISTORT}")
@@ -195,9 +200,7 @@ def _binary_sensors(path: Path) -> Iterator[tuple[int, _Sensor]]:
 
 def _binary_images(path: Path) -> Iterator[_Image]:
     data, offset = _mapped(path), 8
-    (count,) = struct.unpack_from("<Q", data)
-    check_count(count, str(path))
-    for _ in range(count):
+    for _ in range(_row_count(data)):
         _, *pose, camera = struct.unpack_from("<I7dI", data, offset)
         end = data.find(b"\0", offset + 64, offset + 64 + MAX_NAME_BYTES)
         if end < 0:
@@ -212,8 +215,6 @@ def _binary_images(path: Path) -> Iterator[_Image]:
 
 def _text_lines(path: Path) -> Iterator[str]:
     with path.open("rb") as handle:
-        refuse_pointer(str(path), handle.read(64))
-        handle.seek(0)
         while line := handle.readline(MAX_TEXT_LINE):
             if len(line) == MAX_TEXT_LINE:
                 raise ValueError(f"lines under {MAX_TEXT_LINE} bytes, got a longer one")
@@ -221,7 +222,6 @@ def _text_lines(path: Path) -> Iterator[str]:
 
 
 def _text_sensors(path: Path) -> Iterator[tuple[int, _Sensor]]:
-    count = 0
     for line in _text_lines(path):
         if not line or line.startswith("#"):
             continue
@@ -231,14 +231,12 @@ def _text_sensors(path: Path) -> Iterator[tuple[int, _Sensor]]:
             camera, size = int(number), (int(width), int(height))
         except ValueError:
             raise _bad_line("CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", line) from None
-        count += 1
-        check_count(count, str(path))
         unknown = CameraModel(model[:60], len(parameters), 0, None)
         yield camera, _Sensor(*size, MODELS_BY_NAME.get(model, unknown), parameters)
 
 
 def _text_images(path: Path) -> Iterator[_Image]:
-    lines, count = _text_lines(path), 0
+    lines = _text_lines(path)
     for line in lines:
         if not line or line.startswith("#"):
             continue
@@ -247,8 +245,6 @@ def _text_images(path: Path) -> Iterator[_Image]:
             pose = tuple(float(number) for number in numbers)
             if len(pose) != 7:
                 raise ValueError(line)
-            count += 1
-            check_count(count, str(path))
             yield _Image(name, int(camera), pose[:4], pose[4:])
         except ValueError:
             raise _bad_line("IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line) from None

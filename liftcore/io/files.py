@@ -11,7 +11,7 @@ import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from io import BufferedReader
-from pathlib import Path, PurePath
+from pathlib import Path, PurePath, PurePosixPath
 from typing import IO
 
 from liftcore.errors import InvalidCameras, InvalidInput, Unavailable, reading
@@ -96,6 +96,20 @@ def open_zip(path: Path) -> zipfile.ZipFile:
     """Open a zip that is a regular file."""
     open_regular(path).close()
     return zipfile.ZipFile(path)
+
+
+def files_in_zip(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    """Return the files of a zip by their names with slashes: some programs write backslashes or ``./``.
+
+    Those of the operating system are left out, as in folders.
+    """
+    files = {}
+    for member in archive.infolist():
+        parts = PurePosixPath(member.filename.replace("\\", "/")).parts
+        inner = [part for part in parts if part not in ("/", "..")]
+        if inner and not member.is_dir() and not is_system_file(PurePosixPath(*inner)):
+            files["/".join(inner)] = member
+    return files
 
 
 @contextmanager

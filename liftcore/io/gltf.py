@@ -25,18 +25,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liftcore.errors import InvalidInput, InvalidSplats
+from liftcore.errors import InvalidSplats
 from liftcore.io.files import open_regular
 from liftcore.io.labels import COLUMN, IDS, stored_columns
 from liftcore.io.ply import MODEL
-from liftcore.io.quantised import MOST_GROWTH, Fields, gaussians_in, joined_fields, logits
+from liftcore.io.quantised import MOST_GROWTH, Fields, gaussians_in, logits
 from liftcore.runtime.version import __version__
 from liftcore.scene.harmonics import band_rotation
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.origin import FILE_ORIGIN
 from liftcore.scene.quaternions import product_matrix, rotation_matrices
 from liftcore.scene.render_mode import mode_of_word
-from liftcore.scene.similarity import Similarity
+from liftcore.scene.similarity import similarity_of
 from liftcore.scene.world import UPRIGHT, world_of
 
 if TYPE_CHECKING:
@@ -77,7 +77,26 @@ def read_gltf(path: Path, *, colour: bool = True) -> Fields:
         parts = [asset.fields(matrix, primitive, colour=colour) for matrix, primitive in asset.splats()]
     except (AttributeError, LookupError, TypeError) as error:
         raise ValueError(f"a document of glTF 2.0, got one with parts that do not fit ({error})") from None
-    return joined_fields(parts) | {"world": asset.world}
+    return (parts[0] if len(parts) == 1 else _join_primitives(parts)) | {"world": asset.world}
+
+
+def _join_primitives(parts: Sequence[Fields]) -> Fields:
+    """Concatenate the splats of several primitives, in the render mode of the first.
+
+    Harmonics have the largest degree, and further columns are 0 where a primitive has none.
+    """
+    warnings = dict.fromkeys(text for part in parts for text in part["warnings"])
+    fields: Fields = {"render_mode": parts[0]["render_mode"], "warnings": tuple(warnings), "extras": {}}
+    for name in dict.fromkeys(name for part in parts for name in part["extras"]):
+        columns = [part["extras"].get(name, np.zeros(len(part["means"]), np.int32)) for part in parts]
+        fields["extras"][name] = np.concatenate(columns)
+    for name in parts[0].keys() - fields.keys():
+        arrays = [part[name] for part in parts]
+        if name == "sh":
+            sh_rows = max(sh.shape[1] for sh in arrays)
+            arrays = [np.pad(sh, ((0, 0), (0, sh_rows - sh.shape[1]), (0, 0))) for sh in arrays]
+        fields[name] = np.concatenate(arrays)
+    return fields
 
 
 def _hint_of(extension: str) -> str:
@@ -143,10 +162,9 @@ class _Asset:
         attributes, warnings = primitive["attributes"], _kernel_warnings(primitive)
         count = self._count(primitive)
         try:
-            move = Similarity.of(matrix)
-        except InvalidInput as error:
-            hint = "apply the node's transform to its splats in the program that made it"
-            raise ValueError(f"a node's transform of {error.expected}, got {error.got}; {hint}") from None
+            move = similarity_of(matrix)
+        except ValueError as error:
+            raise ValueError(f"a node's transform of {error}") from None
         rotation = TO_FILE @ move.rotation
 
         def read(name: str, width: int) -> np.ndarray:

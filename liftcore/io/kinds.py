@@ -24,6 +24,7 @@ from liftcore.io.files import (
     BROKEN_ZIP,
     LFS_HINT,
     LFS_POINTER,
+    files_in_zip,
     first_bytes,
     is_system_file,
     is_zip,
@@ -82,6 +83,7 @@ class FileKind:
 _WEB_PAGE = FileKind(
     None, "a web page", f"{DOWNLOAD}; of a viewer export the splats as .ply or .sog, from SuperSplat's editor"
 )
+_PICKLE = FileKind(None, "a Python pickle, which may run code when it is opened", EXPORT_PLY)
 _GLTF = FileKind(None, "a glTF model without splats (KHR_gaussian_splatting)", f"a mesh has none: {NOT_CONVERTED}")
 _USD = FileKind(
     None,
@@ -121,6 +123,7 @@ _MAGIC: tuple[tuple[int, bytes, FileKind], ...] = (
         b"\x1f\x8b", b"7z\xbc\xaf\x27\x1c", b"Rar!\x1a\x07", b"\xfd7zXZ\x00", b"BZh", b"\x28\xb5\x2f\xfd",
     )),
     (257, b"ustar", _ARCHIVE),
+    *((0, bytes((0x80, protocol)), _PICKLE) for protocol in (2, 3, 4, 5)),
     (0, b"\x93NUMPY", _ARRAY),
     (0, b"glTF", _GLTF),
     (0, b"PXR-USDC", _USD),
@@ -141,16 +144,27 @@ _BY_SUFFIX: dict[str, FileKind] = {
     **dict.fromkeys((".obj", ".fbx", ".stl"), _MESH),
     **dict.fromkeys((".las", ".laz", ".e57", ".pcd", ".xyz"), _CLOUD),
     **dict.fromkeys((".mp4", ".mov", ".avi", ".mkv", ".webm"), _VIDEO),
-    **dict.fromkeys(
-        (".pkl", ".pickle"),
-        FileKind(None, "a Python pickle, which may run code when it is opened", EXPORT_PLY),
-    ),
+    **dict.fromkeys((".pkl", ".pickle"), _PICKLE),
     **dict.fromkeys((".gz", ".tgz", ".bz2", ".xz", ".zst", ".tar", ".7z", ".rar"), _ARCHIVE),
 }
+# By keys of a JSON object. Of two that fit the first counts.
+_BY_KEYS = (
+    ({"tree", "filenames"}, _STREAMED),
+    ({"frames"}, FileKind("cameras", "cameras")),
+    (
+        {"transform", "scale"},
+        FileKind(None, f"the frame of a nerfstudio run ({FRAME_FILE})", "give the cameras that it belongs to"),
+    ),
+    ({"asset", "accessors"}, FileKind(None, "a .gltf, which is not one file", "make one .glb of it")),
+    ({"root", "geometricError"}, _TILES),
+    (
+        {"annotations", "images"},
+        FileKind(None, "masks as JSON (COCO)", "'splatlift pack prompts' makes a feature pack of its folder"),
+    ),
+)
 _COLMAP_POINTS = ("points3D.bin", "points3D.txt", "frames.bin", "rigs.bin", "frames.txt", "rigs.txt")
 _STEP = re.compile(r"(?:iteration|point_cloud|export|step|ckpt|splat)s?[_-]?0*([0-9]+)")
-_CHECKPOINT = re.compile(r"(^|/)(ckpt_[0-9]+[^/]*\.pt|step-[0-9]+\.ckpt)$")
-_OF_FEATURES = re.compile(r"(_features|_filtered|_labels)\.pt$")  # of splat-distiller, beside the checkpoint
+_CHECKPOINT = re.compile(r"(^|/)(ckpt_[0-9]+(_rank[0-9]+)?\.pt|step-[0-9]+\.ckpt)$")
 Fault = TypeVar("Fault", bound=InvalidInput)
 
 
@@ -289,8 +303,6 @@ def _safetensors(path: Path) -> FileKind:
 
 def _by_magic(head: bytes) -> FileKind | None:
     identified = next((kind for place, magic, kind in _MAGIC if head.startswith(magic, place)), None)
-    if identified is None and head[:1] == b"\x80" and head[1:2] in b"\x02\x03\x04\x05":
-        identified = FileKind(None, "a Python pickle, which may run code when it is opened", EXPORT_PLY)
     if identified is _GLTF and b"KHR_gaussian_splatting" in head:
         return _splats_as(SplatFormat.GLTF)
     return identified
@@ -329,7 +341,7 @@ def _json(path: Path, size: int) -> FileKind:
     return _document(document, path)
 
 
-def _document(document: Any, path: Path) -> FileKind:  # noqa: PLR0911 - a rule each
+def _document(document: Any, path: Path) -> FileKind:
     """Return the kind of a JSON document, by its keys."""
     if isinstance(document, list):
         first = document[0] if document and isinstance(document[0], dict) else {}
@@ -341,27 +353,12 @@ def _document(document: Any, path: Path) -> FileKind:  # noqa: PLR0911 - a rule 
         return FileKind(None, "a JSON list of something else", recognised=False)
     if not isinstance(document, dict):
         return FileKind(None, f"JSON ({str(document)[:TEXT_SHOWN]!r})", recognised=False)
-    keys = document.keys()
     if is_sog_document(document):
         return _splats_as(SplatFormat.SOG)
-    if keys >= {"tree", "filenames"}:
-        return _STREAMED
-    if "frames" in keys:
-        return FileKind("cameras", "cameras")
-    if keys >= {"transform", "scale"}:
-        name = f"the frame of a nerfstudio run ({FRAME_FILE})"
-        return FileKind(None, name, "give the cameras that it belongs to")
-    if "asset" in keys and keys & {"buffers", "accessors", "scenes", "meshes"}:
-        has_splats = "KHR_gaussian_splatting" in str(document.get("extensionsUsed", ""))
-        single = FileKind(None, "a .gltf, whose splats lie beside it", "make one .glb of it")
-        return single if has_splats else _GLTF
-    if keys >= {"root", "geometricError"}:
-        return _TILES
-    if keys >= {"annotations", "images"}:
-        return FileKind(None, "masks as JSON (COCO)", "'splatlift pack prompts' makes a feature pack of its folder")
-    listing = ", ".join(map(str, list(keys)[:5]))[:TEXT_SHOWN]
+    listing = ", ".join(map(str, list(document)[:5]))[:TEXT_SHOWN]
     unknown = FileKind(None, f"a JSON object with {listing or 'nothing'}", recognised=False)
-    return _BY_SUFFIX.get(path.suffix.lower(), unknown)
+    by_suffix = _BY_SUFFIX.get(path.suffix.lower(), unknown)
+    return next((kind for keys, kind in _BY_KEYS if document.keys() >= keys), by_suffix)
 
 
 def _is_sog(path: Path) -> bool:
@@ -376,17 +373,11 @@ def _is_sog(path: Path) -> bool:
 def _zip(path: Path) -> FileKind:
     try:
         with open_zip(path) as archive:
-            names = _user_files(archive.namelist())
-            splats = _splat_files(names, lambda name: _begins_with_splats(archive.open(name)))
-            return _of_names_in_zip(names, splats)
+            files = files_in_zip(archive)
+            splats = _splat_files(files, lambda name: _begins_with_splats(archive.open(files[name])))
+            return _of_names_in_zip([*files], splats)
     except BROKEN_ZIP as error:
         return FileKind(None, f"a zip that does not open ({str(error)[:120]})", recognised=False)
-
-
-def _user_files(names: Iterable[str]) -> list[str]:
-    """Return the files without those of the operating system."""
-    files = [name for name in names if not name.endswith("/")]
-    return [name for name in files if not is_system_file(PurePosixPath(name.replace("\\", "/")))]
 
 
 def _of_names_in_zip(names: list[str], splats: tuple[str, ...]) -> FileKind:  # noqa: PLR0911 - a rule each
@@ -404,7 +395,7 @@ def _of_names_in_zip(names: list[str], splats: tuple[str, ...]) -> FileKind:  # 
         return _USD
     if suffixes == {".npy"}:
         return _ARRAYS
-    if any(CAMERA_FILES.search(name.replace("\\", "/")) for name in names):
+    if any(CAMERA_FILES.search(name) for name in names):
         return FileKind("cameras", "a zip of cameras", splats=splats)
     if not splats and suffixes & IMAGE_SUFFIXES:
         return FileKind("photos", "photos")
@@ -436,11 +427,7 @@ def _splat_files(names: Iterable[str], has_splats: Callable[[str], bool]) -> tup
         steps = [int(step) for step in _STEP.findall(name.lower())] or [-1]
         return -max(steps), name.lower().endswith(PICKLED), name.count("/"), name
 
-    likely = [
-        name
-        for name in names
-        if name.lower().endswith(HTTP_SUFFIXES) or (_CHECKPOINT.search(name) and not _OF_FEATURES.search(name))
-    ]
+    likely = [name for name in names if name.lower().endswith(HTTP_SUFFIXES) or _CHECKPOINT.search(name)]
     likely.sort(key=order)
     plys = [name for name in likely if name.lower().endswith(".ply")]
     wrong = {name for name in plys[:MOST_HEADERS] if not has_splats(name)}
@@ -517,6 +504,6 @@ def page_table() -> dict[str, Any]:
         "cameras": CAMERA_FILES.pattern,
         "others": {
             suffix: {"got": kind.name, "hint": kind.hint}
-            for suffix, kind in sorted((_BY_SUFFIX | dict.fromkeys(PICKLED, _BY_SUFFIX[".pkl"])).items())
+            for suffix, kind in sorted((_BY_SUFFIX | dict.fromkeys(PICKLED, _PICKLE)).items())
         },
     }  # fmt: skip

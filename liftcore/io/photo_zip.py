@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import struct
-import threading
 import zipfile
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -14,14 +13,13 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from liftcore.errors import InvalidCameras, InvalidPhotos, NotFound
-from liftcore.io.files import BROKEN_ZIP, is_system_file, open_zip
+from liftcore.io.files import BROKEN_ZIP, files_in_zip, open_zip
 from liftcore.io.photos import UPRIGHT, read_header
 from liftcore.scene.views import cameras_of_views, view_names
 
 MAX_PHOTOS = 10_000  # photos
 DIRECTORY_BYTES = 8 << 20  # of the list of what is in a zip: of 20,000 files with long names
 KEPT_ZIPS = 4  # whose directories stay in memory
-LOCAL_HEADER = struct.Struct("<26x2H")  # before a member: the lengths of its name and its extra field
 LARGEST_BYTES = 64 << 20  # of a photo: 100 million pixels as a good JPEG
 SIDE = 20_000  # pixels: what browsers decode ends there
 SPARE_BYTES = 1 << 20  # beside twice the archive: photos hardly shrink in a zip, bombs grow a thousandfold out of it
@@ -39,38 +37,34 @@ def describe_photos(path: Path) -> dict[str, Any]:
             if (size := path.stat().st_size - archive.start_dir) > DIRECTORY_BYTES:
                 expected = f"a zip with a directory of at most {DIRECTORY_BYTES} bytes"
                 raise InvalidPhotos("photos", expected=expected, got=f"{size}", hint="shorter names, and no comments")
-            entries = archive.infolist()
-            members = _members(entries)
-            _require_bounds(entries, members, path.stat().st_size)
+            members, count = _members(archive), len(archive.infolist())
+            _require_bounds(count, members, path.stat().st_size)
             for member in members.values():
                 _require_photo(archive, member)
     except InvalidCameras as error:  # of names, which are those of views
         raise InvalidPhotos("image name", expected=error.expected, got=error.got) from None
     except BROKEN_ZIP as error:
         raise InvalidPhotos("photos", expected=EXPECTED, got=f"{error}"[:200] or "a damaged one") from None
-    other_count = len(entries) - len(members)
+    other_count = count - len(members)
     warnings = [f"{other_count} entries are no .jpg, .jpeg or .png and are left alone"] if other_count else []
     return {"photos": len(members), "names": list(members), "warnings": warnings}
 
 
-def _members(entries: Collection[zipfile.ZipInfo]) -> dict[str, zipfile.ZipInfo]:
-    """Return view -> photo, by suffix, without files of the operating system (``__MACOSX``, dot files)."""
-    entry_paths = [(entry, PurePosixPath(entry.filename.replace("\\", "/"))) for entry in entries]
-    photos = [entry for entry, path in entry_paths if _media_type(entry.filename) and not is_system_file(path)]
-    return dict(zip(view_names([photo.filename for photo in photos]), photos, strict=True))
+def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    """Return view -> photo, by suffix."""
+    photos = {name: file for name, file in files_in_zip(archive).items() if _media_type(name)}
+    return dict(zip(view_names([*photos]), photos.values(), strict=True))
 
 
 def _media_type(name: str) -> str:
     return MEDIA_TYPES.get(PurePosixPath(name).suffix.lower(), "")
 
 
-def _require_bounds(entries: Collection[zipfile.ZipInfo], members: Mapping[str, zipfile.ZipInfo], size: int) -> None:
+def _require_bounds(count: int, members: Mapping[str, zipfile.ZipInfo], size: int) -> None:
     unpacked = sum(member.file_size for member in members.values())
     largest = max((member.file_size for member in members.values()), default=0)
-    if not 0 < len(members) <= MAX_PHOTOS or len(entries) > 2 * MAX_PHOTOS:
-        raise InvalidPhotos(
-            "photos", expected=f"1 to {MAX_PHOTOS} photos", got=f"{len(members)} among {len(entries)} files"
-        )
+    if not 0 < len(members) <= MAX_PHOTOS or count > 2 * MAX_PHOTOS:
+        raise InvalidPhotos("photos", expected=f"1 to {MAX_PHOTOS} photos", got=f"{len(members)} among {count} files")
     if largest > LARGEST_BYTES or unpacked > 2 * size + SPARE_BYTES:
         expected = f"photos of at most {LARGEST_BYTES} bytes, and together at most twice the zip"
         raise InvalidPhotos("photos", expected=expected, got=f"{largest} bytes in one, {unpacked} in a zip of {size}")
@@ -96,9 +90,9 @@ def _require_photo(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> None:
 
 @dataclass(frozen=True)
 class PhotoIndex:
-    """Positions of the photos in a checked zip."""
+    """The photos of a checked zip, which stays open: its directory is read once."""
 
-    path: Path
+    archive: zipfile.ZipFile
     members: Mapping[str, zipfile.ZipInfo]  # by their views
 
     def names(self, views: Collection[str]) -> set[str]:
@@ -118,30 +112,17 @@ class PhotoIndex:
         return _media_type(member.filename), member.file_size, chain([first], blocks)
 
     def _blocks(self, member: zipfile.ZipInfo) -> Iterator[bytes]:
-        # To open the zip would read its whole directory again.
-        with self.path.open("rb") as file:
-            file.seek(member.header_offset)
-            name, extra = LOCAL_HEADER.unpack(file.read(LOCAL_HEADER.size))
-            file.seek(name + extra, io.SEEK_CUR)
-            with zipfile.ZipExtFile(file, "r", member) as photo:
-                while block := photo.read(BLOCK_BYTES):
-                    yield block
+        with self.archive.open(member) as photo:
+            while block := photo.read(BLOCK_BYTES):
+                yield block
 
 
-class PhotoIndexes:
-    """A cache of the indexes of the zips that were used last; concurrent callers read each zip once."""
-
-    def __init__(self) -> None:
-        self._turn = threading.Lock()
-        self._of = lru_cache(KEPT_ZIPS)(_index)
-
-    def of(self, path: Path) -> PhotoIndex:
-        """Return the index of a zip."""
-        try:
-            with self._turn:
-                return self._of(path, path.stat().st_mtime_ns)  # an upload replaces a damaged one in place
-        except BROKEN_ZIP as error:
-            raise _damaged(error) from None
+def photo_index(path: Path) -> PhotoIndex:
+    """Return the index of a zip; those of the last few stay in memory."""
+    try:
+        return _index(path, path.stat().st_mtime_ns)  # an upload replaces a damaged one in place
+    except BROKEN_ZIP as error:
+        raise _damaged(error) from None
 
 
 def _damaged(error: Exception) -> NotFound:
@@ -150,9 +131,10 @@ def _damaged(error: Exception) -> NotFound:
     return NotFound("photos", expected="their zip in the data directory", got=got, hint=hint)
 
 
+@lru_cache(KEPT_ZIPS)
 def _index(path: Path, modified_ns: int) -> PhotoIndex:
-    with open_zip(path) as archive:
-        return PhotoIndex(path, _members(archive.infolist()))
+    archive = open_zip(path)
+    return PhotoIndex(archive, _members(archive))
 
 
 def in_camera_orientation(

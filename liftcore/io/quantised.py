@@ -7,7 +7,7 @@ splats as 3D Gaussians (`gaussian_rows`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -54,35 +54,6 @@ def field_shapes(sh_rows: int) -> dict[str, tuple[int, ...]]:
     """Return field -> shape behind P, of splats with K rows of harmonics; without them if K is 0."""
     shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": ()}
     return shapes | ({"sh": (sh_rows, 3)} if sh_rows else {})
-
-
-def joined_fields(parts: Sequence[Fields]) -> Fields:
-    """Concatenate the fields of several sets of splats.
-
-    Harmonics have the largest degree, and further columns are 0 where a part has none. The render mode is that of the
-    first part.
-    """
-    fields: Fields = {}
-    for name in parts[0]:
-        values = [part[name] for part in parts]
-        if name == "warnings":
-            fields[name] = tuple(dict.fromkeys(text for texts in values for text in texts))
-        elif name == "render_mode":
-            fields[name] = values[0]
-        elif name == "extras":
-            counts = [len(part["means"]) for part in parts]
-            names = dict.fromkeys(key for columns in values for key in columns)
-            zeros = [np.zeros(count, np.int32) for count in counts]
-            fields[name] = {
-                key: np.concatenate([columns.get(key, none) for columns, none in zip(values, zeros, strict=True)])
-                for key in names
-            }
-        else:
-            if name == "sh":
-                sh_rows = max(sh.shape[1] for sh in values)
-                values = [np.pad(sh, ((0, 0), (0, sh_rows - sh.shape[1]), (0, 0))) for sh in values]
-            fields[name] = values[0] if len(values) == 1 else np.concatenate(values)
-    return fields
 
 
 def logits(alpha: np.ndarray) -> np.ndarray:

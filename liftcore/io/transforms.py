@@ -25,12 +25,11 @@ from liftcore.scene.cameras import (
     Cameras,
     InvalidPose,
     behind_lens,
-    check_count,
     read_views,
     viewmat_of,
 )
 from liftcore.scene.distortion import Distortion
-from liftcore.scene.similarity import Similarity
+from liftcore.scene.similarity import similarity_of
 from liftcore.scene.views import cameras_of_views, view_names
 from liftcore.scene.world import UNKNOWN, WorldFrame
 
@@ -68,7 +67,7 @@ EXPORTED = ("file_path", "transform")  # of each camera of an export
 FOCALS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 
 
-def parse_transforms(document: Any, source: str, photos: PhotosBeside | None = None) -> Cameras:
+def parse_transforms(document: Any, source: str, photos: PhotosBeside) -> Cameras:
     """Return the cameras of a transforms.json document, in the frame that its poses are in.
 
     A frame's own intrinsics come before the shared ones. A scene trained in another frame (nerfstudio
@@ -76,16 +75,16 @@ def parse_transforms(document: Any, source: str, photos: PhotosBeside | None = N
 
     Args:
         document: as JSON has it. source: its file, for errors.
-        photos: source of sizes that the document does not have; None: none.
+        photos: source of sizes that the document does not have.
     """
     with reading(source, InvalidCameras, FORMATS):
-        names, frames = _named_frames(document["frames"], source)
+        names, frames = _named_frames(document["frames"])
     views = zip(names, [ChainMap(frame, document) for frame in frames], strict=True)
     cameras, warnings = read_views(views, lambda name, keys: _cameras(name, keys, source, photos))
     of_nerfstudio = any(key in document for key in OF_NERFSTUDIO)
     warnings += [OWN_FRAME] if of_nerfstudio else []
     world = nerfstudio_world(cameras) if of_nerfstudio else UNKNOWN
-    return Cameras(cameras, of_nerfstudio=of_nerfstudio, world=world, warnings=warnings)
+    return Cameras(cameras, world=world, warnings=warnings)
 
 
 def is_export(document: Any) -> bool:
@@ -94,13 +93,13 @@ def is_export(document: Any) -> bool:
     return bool(records) and all(isinstance(record, dict) and {*EXPORTED} <= record.keys() for record in records[:1])
 
 
-def parse_export(records: Any, source: str, data: Any = None, photos: PhotosBeside | None = None) -> Cameras:
+def parse_export(records: Any, source: str, data: Any, photos: PhotosBeside) -> Cameras:
     """Return the cameras of nerfstudio's camera export, in the frame of its splats."""
     shared, frames = data if isinstance(data, dict) else {}, {}
     with reading(source, InvalidCameras, "a camera export"):
-        names, poses = _named_frames(records, source)
+        names, poses = _named_frames(records)
         if isinstance(shared.get("frames"), list):
-            frames = dict(zip(*_named_frames(shared["frames"], "transforms.json"), strict=True))
+            frames = dict(zip(*_named_frames(shared["frames"]), strict=True))
         pairs = cameras_of_views(names, frames)
         scoped = []
         for name, record in zip(names, poses, strict=True):
@@ -118,11 +117,10 @@ def parse_export(records: Any, source: str, data: Any = None, photos: PhotosBesi
     return Cameras(cameras, world=nerfstudio_world(cameras), warnings=warnings)
 
 
-def _named_frames(frames: Any, source: str) -> tuple[list[str], list[dict[str, Any]]]:
+def _named_frames(frames: Any) -> tuple[list[str], list[dict[str, Any]]]:
     """Return the names of views, and their records."""
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise ValueError(f"a list of objects as frames, got {repr(frames)[:60]}")
-    check_count(len(frames), source)
     return view_names([str(frame["file_path"]) for frame in frames]), frames
 
 
@@ -151,7 +149,7 @@ def transforms_of(cameras: Mapping[str, Camera]) -> dict[str, Any]:
     return {"frames": frames}
 
 
-def _cameras(name: str, keys: ChainMap[str, Any], source: str, photos: PhotosBeside | None) -> list[Camera]:
+def _cameras(name: str, keys: ChainMap[str, Any], source: str, photos: PhotosBeside) -> list[Camera]:
     """Return the view of a frame."""
     location = f"{source} frame {name!r}"
     with reading(location, InvalidCameras, "a camera"):
@@ -168,19 +166,19 @@ def _cameras(name: str, keys: ChainMap[str, Any], source: str, photos: PhotosBes
     return [camera if distortion is None else behind_lens(camera, distortion)]
 
 
-def _size(keys: Mapping[str, Any], photos: PhotosBeside | None) -> tuple[int, int]:
+def _size(keys: Mapping[str, Any], photos: PhotosBeside) -> tuple[int, int]:
     """Return width and height in pixels, of the frame or else of its photo."""
     if "w" in keys and "h" in keys:
         return pixels(keys["w"], "w"), pixels(keys["h"], "h")
     file_path, hint = str(keys["file_path"]), 'add the size of the photos as "w" and "h" at the top level of the file'
     try:
-        header = photos.header(file_path) if photos else None
+        header = photos.header(file_path)
     except InvalidInput as error:
         raise ValueError(f"an image size, w and h, or a photo, got {error.got} ({error.argument}); {hint}") from None
     if header is not None:
         return _size_of_photo(header, keys)
-    place = f", and no photo {photos.missing(file_path)}" if photos else ""
-    raise ValueError(f"an image size, w and h, got none{place}; put the photos where file_path has them, or {hint}")
+    got = f"none, and no photo {photos.missing(file_path)}"
+    raise ValueError(f"an image size, w and h, got {got}; put the photos where file_path has them, or {hint}")
 
 
 def _size_of_photo(header: PhotoHeader, keys: Mapping[str, Any]) -> tuple[int, int]:
@@ -287,9 +285,9 @@ def read_frame(path: Path, applied: Mapping[str, Any], source: str) -> np.ndarra
 
 def _require_similarity(matrix: np.ndarray, name: str) -> None:
     try:
-        Similarity.of(matrix)
-    except InvalidInput as error:
-        raise ValueError(f"{name} of {error.expected}, got {error.got}; {error.hint}") from None
+        similarity_of(matrix)
+    except ValueError as error:
+        raise ValueError(f"{name} of {error}") from None
 
 
 def _affine(value: Any, name: str) -> np.ndarray:

@@ -15,7 +15,7 @@ from liftcore.runtime.one_line import join_names, one_line
 from liftcore.scene.compositing import MAX_SIDE
 from liftcore.scene.distortion import Distortion, Lens, Rectangle, shared_lens
 from liftcore.scene.origin import FILE_ORIGIN, MAP_REACH, Origin
-from liftcore.scene.similarity import Similarity
+from liftcore.scene.similarity import NEAR, Similarity, similarity_of
 from liftcore.scene.views import cameras_of_views, composed, without_image_suffix
 from liftcore.scene.world import UNKNOWN, WorldFrame
 
@@ -34,12 +34,10 @@ CAMERA_AXES = {  # convention -> the signs that turn a camera's axes into OpenCV
     "blender": np.array([1.0, -1.0, -1.0]),
 }
 NAME_SHOWN = 40  # characters of a name, of its end, in what prints of a camera
-ROUNDING = 1e-6  # of the last row of a pose
 MIN_PIXELS = 8  # of a side, from which intrinsics of shares of the size are told from those in pixels
 OFF_CENTRE, SAME_CENTRE = 1.25, 0.05  # of principal points off the middle, and the spread of their places
 MIN_FOCAL, MAX_FOCAL = 1e-3, 1e9  # pixels; float64 squares of what they project stay finite
 MAX_OFF_CENTRE = 1e9  # pixels of the principal point
-MAX_REACH = 1e12  # scene units from the origin; float32 has no detail left long before
 MAX_VIEWS = 100_000  # of a scene: far more than real ones have, and still read and checked in seconds
 FEWER_VIEWS = "lift fewer photos, such as every second one"
 NEAREST = 3  # views in the error of an unknown one
@@ -124,11 +122,10 @@ class Camera:
         cx: float,
         cy: float,
         viewmat: Matrix,
-        lens: Lens | None = None,
     ) -> Camera:
         """Make a camera of intrinsics in pixels, the principal point from the left and top edge of the image."""
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        return cls(viewmat, K, width, height, lens=lens, name=name)
+        return cls(viewmat, K, width, height, name=name)
 
     @classmethod
     def from_camera_to_world(
@@ -286,31 +283,11 @@ def _check_matrix(K: np.ndarray) -> None:
 
 def _check_pose(pose: np.ndarray) -> None:
     """Refuse a matrix that is no rigid motion."""
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+    if pose.shape != (4, 4):
         raise ValueError(f"a finite 4x4 matrix, got shape {list(pose.shape)}")
-    if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > ROUNDING:
-        raise ValueError(f"0 0 0 1 as the last row, got {' '.join(f'{value:g}' for value in pose[3])}")
-    rotation = pose[:3, :3]
-    # Large entries are refused before the product, which they could overflow.
-    error = float(np.abs(rotation).max())
-    if error <= 2:
-        error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if error > 1e-3 or np.linalg.det(rotation) < 0:
-        raise ValueError(f"a proper rotation, got {_what_it_is(rotation, error)}")
-    reach = float(np.abs(pose[:3, 3]).max())
-    if reach > MAX_REACH:
-        raise ValueError(f"a translation within {MAX_REACH:g}, got {reach:.2g}")
-
-
-def _what_it_is(matrix: np.ndarray, error: float) -> str:
-    """Describe a matrix that is no proper rotation, and say what to do."""
-    if error <= 1e-3:
-        hint = "negate one axis of the transform that was applied, such as a normalisation, for cameras and splats"
-        return f"a matrix that mirrors (determinant -1); {hint}"
-    scale = float(np.cbrt(np.linalg.det(matrix))) if np.abs(matrix).max() < MAX_REACH else 0.0
-    if scale > 0 and np.abs(matrix @ matrix.T / scale**2 - np.eye(3)).max() < 1e-3:
-        return f"a rotation scaled by {scale:.3g}"
-    return f"a matrix off by {error:.2g}"
+    scale = similarity_of(pose).scale
+    if abs(scale**2 - 1) > NEAR:
+        raise ValueError(f"a proper rotation, got a rotation scaled by {scale:.3g}")
 
 
 def intrinsics_factor(cameras: Sequence[Camera]) -> float | None:
@@ -335,7 +312,6 @@ class Cameras(Mapping[str, Camera]):
     Args:
         views: a mapping of names to cameras, whose names win over those of the cameras; or named cameras.
         frame: the name of the file with the transform that was applied, to the frame of the splats; None: none.
-        of_nerfstudio: written by nerfstudio's own converter, and not transformed.
         world: the up axis, if their file has it.
         warnings: of their reader, also shown by plans and lifts: views that were skipped, files that were not read.
 
@@ -348,12 +324,10 @@ class Cameras(Mapping[str, Camera]):
         views: Mapping[str, Camera] | Iterable[Camera],
         *,
         frame: str | None = None,
-        of_nerfstudio: bool = False,
         world: WorldFrame = UNKNOWN,
         warnings: Iterable[str] = (),
     ) -> None:
         self.frame = frame
-        self.of_nerfstudio = of_nerfstudio
         self.world = world
         self.warnings = tuple(warnings)
         if not isinstance(views, Mapping):
@@ -364,7 +338,9 @@ class Cameras(Mapping[str, Camera]):
             named_views = [*views.items()]
         if not named_views:
             raise InvalidCameras("cameras", expected="at least one view", got="none")
-        check_count(len(named_views), "cameras")
+        if len(named_views) > MAX_VIEWS:
+            expected, got = f"at most {MAX_VIEWS} views", str(len(named_views))
+            raise InvalidCameras("cameras", expected=expected, got=got, hint=FEWER_VIEWS)
         self._by_name: dict[str, Camera] = {}
         for name, view in named_views:
             if not isinstance(view, Camera) or not isinstance(name, str):
@@ -453,13 +429,6 @@ def read_views(
     listing = join_names(list(map(repr, broken)), MAX_LISTED)
     count = f"{len(broken)} cameras were skipped for broken poses and {len(cameras)} read"
     return cameras, [f"{count}: {listing}, the first with {first.got} in place of {first.expected}"]
-
-
-def check_count(count: int, source: str) -> None:
-    """Refuse more views than a scene may have, by their number alone."""
-    if count > MAX_VIEWS:
-        limit = f"at most {MAX_VIEWS} views"
-        raise InvalidCameras(source, expected=limit, got=f"{count} or more", hint=FEWER_VIEWS)
 
 
 def behind_lens(camera: Camera, distortion: Distortion) -> Camera:

@@ -36,26 +36,33 @@ class Similarity:
         Raises:
             InvalidInput: it is none, such as a reflection, a shear or a scale for each axis.
         """
-        numbers: Any = matrix
-        values = np.array(numbers.detach().cpu().numpy() if hasattr(numbers, "detach") else numbers, np.float64)
-        if values.shape not in ((4, 4), (3, 4)):
-            raise ValueError(f"shape {list(values.shape)}")
-        if not np.abs(values).max() <= LARGEST:
-            raise ValueError(f"numbers that are none or beyond {LARGEST:g}")
-        linear = values[:3, :3]
-        if len(values) == 4 and np.abs(values[3] - (0.0, 0.0, 0.0, 1.0)).max() > NEAR**2:
-            last_row = " ".join(f"{value:g}" for value in values[3])
-            raise ValueError(f"0 0 0 1 as the last row, got {last_row}; is it transposed?")
-        scale = float(np.cbrt(np.linalg.det(linear)))
-        if not 1 / LARGEST <= scale <= LARGEST:
-            raise ValueError(f"a rotation times a scale, no reflection, got a determinant of {scale**3:.3g}")
-        off = float(np.abs(linear @ linear.T / scale**2 - np.eye(3)).max())
-        if off > NEAR:
-            hint = "a scale for each axis, or a shear, would make no Gaussians of Gaussians"
-            raise ValueError(f"a proper rotation, got a matrix off by {off:.2g}; {hint}")
-        left, _, right = np.linalg.svd(linear)  # the nearest rotation
-        return cls(scale, left @ right, values[:3, 3].copy())
+        return similarity_of(matrix)
 
     def points(self, points: np.ndarray) -> np.ndarray:
         """Transform points [n, 3] f64 to the new frame."""
         return self.scale * (points @ self.rotation.T) + self.translation
+
+
+def similarity_of(matrix: Numbers) -> Similarity:
+    """Return a similarity of its matrix, as `Similarity.of` does; a ValueError says what another matrix is."""
+    numbers: Any = matrix
+    values = np.array(numbers.detach().cpu().numpy() if hasattr(numbers, "detach") else numbers, np.float64)
+    if values.shape not in ((4, 4), (3, 4)):
+        raise ValueError(f"shape {list(values.shape)}")
+    if not (reach := np.abs(values).max()) <= LARGEST:
+        raise ValueError(f"finite numbers within {LARGEST:g}, got {reach:.2g}")
+    linear = values[:3, :3]
+    if len(values) == 4 and np.abs(values[3] - (0.0, 0.0, 0.0, 1.0)).max() > NEAR**2:
+        last_row = " ".join(f"{value:g}" for value in values[3])
+        raise ValueError(f"0 0 0 1 as the last row, got {last_row}; is it transposed?")
+    scale = float(np.cbrt(np.linalg.det(linear)))
+    if not 1 / LARGEST <= scale <= LARGEST:
+        kind = "a matrix that mirrors" if scale < 0 else "a matrix of no size"
+        hint = "negate one axis of the transform that was applied, such as a normalisation, for cameras and splats"
+        raise ValueError(f"a rotation times a scale, no reflection, got {kind} (determinant {scale**3:.3g}); {hint}")
+    off = float(np.abs(linear @ linear.T / scale**2 - np.eye(3)).max())
+    if off > NEAR:
+        hint = "a scale for each axis, or a shear, would make no Gaussians of Gaussians"
+        raise ValueError(f"a proper rotation, got a matrix off by {off:.2g}; {hint}")
+    left, _, right = np.linalg.svd(linear)  # the nearest rotation
+    return Similarity(scale, left @ right, values[:3, 3].copy())

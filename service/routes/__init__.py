@@ -15,7 +15,6 @@ from fastapi.responses import FileResponse
 from pydantic import BaseModel, create_model
 from starlette.convertors import Convertor
 
-from liftcore.files import PhotoIndexes
 from service.models import CURSOR, PAGE, Key, Next
 from service.process import Children
 from service.query_client import QueryClient
@@ -52,7 +51,6 @@ class Parts:
     children: Children
     runner: Runner
     queries: QueryClient
-    photos: PhotoIndexes
     checks: anyio.CapacityLimiter  # uploads and plans that are checked at the same time
     writing: anyio.CapacityLimiter  # uploads that are written: a stalled disk blocks them and no other route
 

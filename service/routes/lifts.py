@@ -11,7 +11,7 @@ from fastapi.responses import StreamingResponse
 from starlette.convertors import register_url_convertor
 
 from liftcore.errors import NotFound
-from liftcore.files import in_camera_orientation
+from liftcore.files import in_camera_orientation, photo_index
 from service import models, results
 from service.models import Lift
 from service.routes import (
@@ -164,7 +164,7 @@ def get_photo(lift: str, view: View, request: Request, deps: Deps, owner: Caller
 
     record = deps.store.lift(owner, lift)
     photos = None if record.photos is None else deps.store.asset(SERVICE, record.photos)
-    photo = None if photos is None else deps.photos.of(photos.file).open(view)
+    photo = None if photos is None else photo_index(photos.file).open(view)
     if photos is None or photo is None:
         got, hint = f"none of {view!r}"[:200], "PUT /assets/photos, then PATCH /lifts/{lift} with its id"
         raise NotFound("view", expected="a view of which the lift has a photo", got=got, hint=hint)
@@ -183,7 +183,7 @@ def list_views(lift: str, deps: Deps, owner: Caller, limit: Limit = models.PAGE,
     names = [view["name"] for view in value["views"]]
     photos: set[str] = set()
     if record.photos is not None:
-        photos = deps.photos.of(deps.store.asset(SERVICE, record.photos).file).names(names)
+        photos = photo_index(deps.store.asset(SERVICE, record.photos).file).names(names)
     views = [models.View(**view | {"photo": view["name"] in photos}) for view in value["views"]]
     return models.Views(views=views, next=value["next"])
 

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from liftcore.errors import InvalidInput, InvalidPhotos, NotFound
-from liftcore.io.photo_zip import PhotoIndexes, describe_photos
+from liftcore.io.photo_zip import describe_photos, photo_index
 from liftcore.io.photos import PhotosBeside
 
 METHODS = {
@@ -62,16 +62,15 @@ def test_mutated_zip_is_read_or_refused_as_photos(method: str, tmp_path: Path) -
 def test_photo_of_a_zip_that_broke_since_its_upload_is_not_found(method: str, tmp_path: Path) -> None:
     path = tmp_path / "photos.zip"
     path.write_bytes(photos_zip(method))
-    index = PhotoIndexes().of(path)
-    file = index.open("a")
+    file = photo_index(path).open("a")
     assert file is not None and b"".join(file[2]) == photo()
     path.write_bytes(path.read_bytes()[:20])
     with pytest.raises(NotFound, match="photos"):
-        index.open("a")
+        photo_index(path).open("a")
     for seed in range(60):
         path.write_bytes(mutated(photos_zip(method), seed))
         try:
-            PhotoIndexes().of(path).open("a")
+            photo_index(path).open("a")
         except NotFound as error:
             assert error.argument == "photos"
 
