@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from liftcore.io.npy import is_stored, load_tensors
 from liftcore.io.ply import EXPORT_PLY, TRAINED
 from liftcore.io.quantised import Fields
 from liftcore.runtime.one_line import join_names
@@ -31,14 +32,14 @@ def _require_whole(path: Path) -> None:
     match = _RANK.fullmatch(path.name)
     if match is None:
         return
-    others = [
+    other_ranks = [
         file.name
         for file in sorted(path.parent.glob("*_rank*"))
         if (other := _RANK.fullmatch(file.name)) and other["step"] == match["step"] and file.name != path.name
     ]
-    if int(match["rank"]) or others:
+    if int(match["rank"]) or other_ranks:
         got = f"{path.name}, the splats of one of several GPUs" + (
-            f" beside {join_names(others, 3)}" if others else ""
+            f" beside {join_names(other_ranks, 3)}" if other_ranks else ""
         )
         hint = "join the tensors of all ranks in one checkpoint, or export the scene as .ply"
         raise ValueError(f"a checkpoint of the complete scene, got {got}; {hint}")
@@ -53,13 +54,8 @@ def read_checkpoint(path: Path, *, colour: bool = True) -> Fields:
     scalar: Any = np.float64(0).__reduce__()[0]
     numbers = [np.dtype, *(type(np.dtype(kind)) for kind in (np.float64, np.float32, np.int64))]
     numbers += [(scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
-    try:
-        with torch.serialization.safe_globals(numbers):
-            stored = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except Exception as error:  # unpickling raises errors of many types
-        got = f"one that holds more than tensors, or is damaged ({str(error).splitlines()[0][:100]})"
-        raise ValueError(f"a checkpoint of tensors, got {got.replace(';', ',')}; {EXPORT_PLY}") from None
-    tensors, names = _splats(stored)
+    with torch.serialization.safe_globals(numbers):
+        tensors, names = _splats(load_tensors(path))
     fields: Fields = {field: _array(tensors, name) for field, name in GSPLAT.items()}
     fields["opacity_logits"] = fields["opacity_logits"].reshape(len(fields["opacity_logits"]), -1)[:, 0]
     if colour and names[0] in tensors:
@@ -95,19 +91,10 @@ def _array(tensors: dict[str, Any], name: str) -> np.ndarray:
     tensor = tensors.get(name)
     got = "none"
     if isinstance(tensor, torch.Tensor):
-        if tensor.is_floating_point() and tensor.ndim and len(tensor) and _is_stored(tensor):
+        if tensor.is_floating_point() and tensor.ndim and len(tensor) and is_stored(tensor):
             # Map coordinates need more digits than float32 has.
             is_double = name == GSPLAT["means"] and tensor.dtype == torch.float64
             return tensor.detach().to(torch.float64 if is_double else torch.float32).numpy()
         got = f"{str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape)}"
-        got += "" if _is_stored(tensor) else ", which is not stored completely"
+        got += "" if is_stored(tensor) else ", which is not stored completely"
     raise ValueError(f"floats as {name!r}, a row a splat, got {got}; {EXPORT_PLY}")
-
-
-def _is_stored(tensor: Any) -> bool:
-    """Return True if the file stores every number of a tensor: no strides of zero, no sparse or meta tensor."""
-    import torch
-
-    if tensor.layout is not torch.strided or tensor.device.type != "cpu" or tensor.is_quantized:
-        return False
-    return tensor.numel() * tensor.element_size() <= tensor.untyped_storage().nbytes()

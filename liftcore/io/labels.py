@@ -78,10 +78,3 @@ def stored_columns(splats: Splats) -> dict[str, np.ndarray]:
 def document_bytes(labels: Labels) -> bytes:
     """Return the document as a JSON file."""
     return json.dumps(labels.document, ensure_ascii=False, indent=1).encode() + b"\n"
-
-
-def rows_by_id(document: dict[str, Any], kind: str) -> list[dict[str, Any]]:
-    """Return the rows of one of KINDS, indexed by their ids; an empty row for an id without one."""
-    name = IDS[KINDS.index(kind)]
-    rows = {row[name]: row for row in document.get(kind, [])}
-    return [rows.get(place, {}) for place in range(max(rows, default=0) + 1)]

@@ -89,23 +89,36 @@ def _zipped(path: Path, kinds: str) -> np.ndarray:
 def _tensor(path: Path, kinds: str) -> np.ndarray:
     import torch
 
-    with open_regular(path):
-        pass
-    try:
-        tensor = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except Exception as error:  # unpickling raises errors of many types
-        got = f"one that holds more than tensors, or is damaged ({str(error).splitlines()[0][:100]})"
-        raise ValueError(f"a file of one tensor, got {got}".replace("; ", ", ")) from None
+    tensor = load_tensors(path)
     if not isinstance(tensor, torch.Tensor):
         raise ValueError(f"a file of one tensor, got {type(tensor).__name__}")
-    # A tensor may repeat a few numbers of the file without end.
-    if tensor.untyped_storage().nbytes() < tensor.numel() * tensor.element_size() or not tensor.numel():
-        got = f"{list(tensor.shape)} of {tensor.untyped_storage().nbytes()} bytes"
-        raise ValueError(f"a tensor with all of its numbers, got {got}")
+    if not is_stored(tensor) or not tensor.numel():
+        raise ValueError(f"a tensor with all of its numbers, got {list(tensor.shape)} without them")
     array = (tensor.float() if tensor.dtype == torch.bfloat16 else tensor).detach().numpy()
     if array.dtype.kind not in kinds:
         raise ValueError(f"an array of numbers, got {tensor.dtype}")
     return array
+
+
+def load_tensors(path: Path) -> Any:
+    """Load a file of torch for weights alone, which builds tensors and runs no code of the file."""
+    import torch
+
+    open_regular(path).close()
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except Exception as error:  # unpickling raises errors of many types
+        got = f"one that holds more than tensors, or is damaged ({str(error).splitlines()[0][:100]})"
+        raise ValueError(f"a file of tensors alone, got {got}".replace("; ", ", ")) from None
+
+
+def is_stored(tensor: "Tensor") -> bool:
+    """Return True if the file stores every number of a tensor: no strides of zero, no sparse or meta tensor."""
+    import torch
+
+    if tensor.layout is not torch.strided or tensor.device.type != "cpu" or tensor.is_quantized:
+        return False
+    return tensor.numel() * tensor.element_size() <= tensor.untyped_storage().nbytes()
 
 
 def without_unit_axes(stored: Values, dimensions: int) -> Values:

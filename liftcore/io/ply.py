@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
 
 MAX_HEADER_BYTES = 256 * 1024
-MAX_HEADER_LINES = 4096
 BLOCK_ROWS = 16_384  # rows converted at a time: a few MB, so that memory stays near the file's size
 MAX_SH_DEGREE = 4
 LOBE_CHANNELS = 6  # of a spherical beta lobe: r g b theta phi beta
@@ -75,7 +74,7 @@ _REMARKS = ("comment", "obj_info")  # lines that are kept, and not parsed
 PADDING = b"\0 \t\r\n"  # bytes that some programs end a file with
 MAX_PADDING_BYTES = 4096  # that are read
 FLOAT_BYTES = 4  # of a column that a header may lack
-_ELEMENT = re.compile(r"\s*element\s+(\S+)\s+([0-9]{1,18})\s*")
+_ELEMENT = re.compile(r"(element \S+) ([0-9]{1,18})")
 
 # ---- splats
 
@@ -522,16 +521,15 @@ def parse_elements(head: bytes) -> tuple[tuple[str, ...], list[Element], int]:
     )  # imported here: processes that read no PLY start faster
 
     lines, offset = _header_lines(head)
+    stated_lines = [" ".join(line.split()) for line in lines if line.split() and not line.startswith(_REMARKS)]
     counts: list[int] = []
-    empty: list[str] = []  # the same header of no rows, which plyfile reads without any data
-    for line in lines:
-        words, element = line.split(), _ELEMENT.fullmatch(line)
-        if words[:1] == ["element"] and element is None:
-            expected = "the name of an element and a count of zero or more"
-            raise _header_error(expected, repr(" ".join(words)[:60]))
-        counts += [int(element[2])] if element else []
-        if words and not line.startswith(_REMARKS):
-            empty.append(f"element {element[1]} 0" if element else " ".join(words))
+    for line in stated_lines:
+        if line.startswith("element "):
+            if (match := _ELEMENT.fullmatch(line)) is None:
+                raise _header_error("the name of an element and a count of zero or more", repr(line[:60]))
+            counts.append(int(match[2]))
+    # The same header of no rows, which plyfile reads without any data.
+    empty = [_ELEMENT.sub(r"\1 0", line) for line in stated_lines]
     try:
         ply = PlyData.read(io.BytesIO(header_bytes(empty)))
     except (PlyParseError, ValueError) as error:
@@ -570,9 +568,6 @@ def _header_lines(head: bytes) -> tuple[tuple[str, ...], int]:
     if not all(line.isascii() or line.startswith(_REMARKS) for line in lines):
         expected, got = "ASCII characters in all lines but comments", "other characters in it"
         raise _header_error(expected, got)
-    if len(lines) > MAX_HEADER_LINES:
-        limit, hint = f"at most {MAX_HEADER_LINES} header lines", "leave out properties that are no splat's"
-        raise ValueError(f"{limit}, got {len(lines)}; {hint}")
     if cloud := cloud_without_splats(lines):
         expected = "splats (properties such as 'opacity', 'scale_0', 'rot_0')"
         raise ValueError(f"{expected}, got {cloud[0]} without any of them; {cloud[1]}")

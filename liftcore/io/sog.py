@@ -12,8 +12,7 @@ import io
 import json
 import warnings
 import zipfile
-from collections.abc import Callable, Iterable
-from functools import partial
+from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -39,10 +38,10 @@ def read_sog(path: Path, *, colour: bool = True) -> Fields:
         if not is_bundled(path):
             meta = _meta_of(path)
             size = sum(file.stat().st_size for file in sog_files(path))
-            return _Pictures(_in_folder(meta.parent), meta.name, size).fields(colour=colour)
+            return _Pictures(meta.parent, meta.name, size).fields(colour=colour)
         with open_zip(path) as archive:
-            member = partial(_read_in_archive, archive, sog_folder(archive.namelist()) or "")
-            return _Pictures(member, META, path.stat().st_size).fields(colour=colour)
+            folder = zipfile.Path(archive, sog_folder(archive.namelist()) or "")
+            return _Pictures(folder, META, path.stat().st_size).fields(colour=colour)
     except (*BROKEN_ZIP, AttributeError, LookupError, TypeError) as error:
         if ", got " in str(error):
             raise
@@ -94,35 +93,15 @@ def _meta_of(path: Path) -> Path:
     return path / META if path.is_dir() else path
 
 
-def _in_folder(folder: Path) -> Callable[[str, int], bytes | None]:
-    def read(name: str, limit: int) -> bytes | None:
-        if not (folder / name).is_file():
-            return None
-        with open_regular(folder / name) as file:
-            return file.read(limit)
-
-    return read
-
-
-def _read_in_archive(archive: zipfile.ZipFile, prefix: str, name: str, limit: int) -> bytes | None:
-    """Return the first bytes of a member of an archive, below a folder with a slash; None where there is none."""
-    try:
-        with archive.open(prefix + name) as member:
-            return member.read(limit)
-    except KeyError:
-        return None
-
-
 class _Pictures:
-    """Decoder of an open file, or a folder.
+    """Decoder of a folder, on the disk or in an open zip.
 
     Args:
-        read_member: name, limit in bytes -> the first bytes of that member; None if it does not exist. meta: the name
-        of its description. size: bytes of all members as they are stored.
+        folder: of the pictures. meta: the name of their description. size: bytes of all of them as they are stored.
     """
 
-    def __init__(self, read_member: Callable[[str, int], bytes | None], meta: str, size: int) -> None:
-        self.read_member, self.size = read_member, size
+    def __init__(self, folder: Path | zipfile.Path, meta: str, size: int) -> None:
+        self.folder, self.size = folder, size
         document = self._member(meta, MAX_META_BYTES)
         try:
             self.meta: Any = json.loads(document)
@@ -215,9 +194,11 @@ class _Pictures:
         raise _broken(f"{least} pixels in {name!r}", f"{pixels}")
 
     def _member(self, name: str, limit: int) -> bytes:
-        content = self.read_member(name, limit + 1) if PurePosixPath(name).name == name else None
-        if content is None:
+        file = self.folder / name
+        if PurePosixPath(name).name != name or not file.is_file():
             raise _broken(f"{name!r} beside {META}", "none")
+        with file.open("rb") as handle:
+            content = handle.read(limit + 1)
         if len(content) > limit:
             raise _broken(f"at most {limit} bytes of {name!r}", "more")
         return content

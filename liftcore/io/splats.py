@@ -217,7 +217,7 @@ def some_rows(path: Path, mask: np.ndarray, suffix: str = ".ply", world: WorldFr
     """
     write = _writer_of(suffix, "suffix")
     if suffix == ".ply" and format_of(path) is SplatFormat.PLY:
-        return _named(path, ply.rewritten(path, len(mask), mask=mask))
+        return _blocks_of(path, ply.rewritten(path, len(mask), mask=mask))
     splats = _of_count(path, len(mask))
     frame = {} if world is None else {"world": world}
     return write(replace(splats[mask], extras={}, layout=(), header=(), **frame), None)
@@ -238,7 +238,7 @@ def labelled(path: Path, labels: Labels, suffix: str = ".ply", mask: np.ndarray 
         raise InvalidSplats("suffix", expected=" or ".join(WITH_COLUMNS) + ", which hold labels", got=repr(suffix))
     count = len(next(iter(labels.columns.values())))
     if suffix == ".ply" and mask is None and format_of(path) is SplatFormat.PLY:
-        return _named(path, ply.rewritten(path, count, labels.columns))
+        return _blocks_of(path, ply.rewritten(path, count, labels.columns))
     import torch
 
     splats = _of_count(path, count)
@@ -259,7 +259,7 @@ def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
     """
     terms = constant_terms(colours / 255).astype(np.float32)
     if format_of(path) is SplatFormat.PLY:
-        return _named(path, ply.recoloured(path, terms))
+        return _blocks_of(path, ply.recoloured(path, terms))
     return ply.ply_blocks(replace(_of_count(path, len(terms), colour=False), sh=terms[:, None]))
 
 
@@ -270,7 +270,7 @@ def _of_count(path: Path, count: int, *, colour: bool = True) -> Splats:
     return splats
 
 
-def _named(path: Path, blocks: Iterator[bytes]) -> Iterator[bytes]:
+def _blocks_of(path: Path, blocks: Iterator[bytes]) -> Iterator[bytes]:
     with _reading(path):
         yield from blocks
 

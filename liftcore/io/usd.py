@@ -12,7 +12,7 @@ Columns of splats are primvars of the fields, and ``splatlift_row`` their rows. 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from importlib import import_module
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liftcore.errors import InvalidSplats, Unavailable
-from liftcore.io.labels import IDS, KINDS, rows_by_id, stored_columns
+from liftcore.io.labels import IDS, KINDS, stored_columns
 from liftcore.io.quantised import gaussians_in
 from liftcore.runtime.folders import scratch_folder
 
@@ -64,12 +64,13 @@ def usd_blocks(splats: Splats, document: Mapping[str, Any] | None = None, suffix
             root.AddTranslateOp().Set(pxr.Gf.Vec3d(*place.tolist()))
         if (rotation := world.upright(TO_FILE).tolist())[0] < 1:
             root.AddOrientOp(pxr.UsdGeom.XformOp.PrecisionDouble).Set(pxr.Gf.Quatd(*rotation))
-        instance_rows = rows_by_id(dict(document or {}), KINDS[0])
+        names = {row[IDS[0]]: row.get("name") for row in (document or {}).get(KINDS[0], ())}
         ids = columns.get(IDS[0], np.zeros(splats.count, np.int32))
         for number, rows in _instances(ids):
             fields = {name: column[rows] for name, column in columns.items()} | {ROW: rows.astype("i4")}
             prim = _write_field(stage, f"instance_{number}" if number else "Splats", splats[rows], fields)
-            _name(prim, instance_rows, number)
+            if (name := names.get(number)) is not None:
+                pxr.UsdSemantics.LabelsAPI.Apply(prim, "class").CreateLabelsAttr([name])
         if document:
             first = next(iter(stage.GetPrimAtPath("/Scene").GetChildren()))
             first.SetCustomDataByKey(DOCUMENT, json.dumps(document, ensure_ascii=False))
@@ -120,9 +121,3 @@ def _instances(instances: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
     order = np.argsort(instances, kind="stable")
     numbers, firsts = np.unique(instances[order], return_index=True)
     yield from zip(numbers.tolist(), np.split(order, firsts[1:]), strict=True)
-
-
-def _name(prim: Any, instance_rows: Sequence[Mapping[str, Any]], number: int) -> None:
-    """Give a prim the semantic label of an instance, if it has a name."""
-    if number and number < len(instance_rows) and (name := instance_rows[number].get("name")) is not None:
-        open_library().UsdSemantics.LabelsAPI.Apply(prim, "class").CreateLabelsAttr([name])

@@ -62,21 +62,21 @@ class Brown:
 
     def straight(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the inverse of ``distorted``, by Newton's method; NaN where there is none, or beyond ``reach``."""
+
+        def miss(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            across, down = self.distorted(u, v)
+            return across - x, down - y
+
         u, v = np.array(x, np.float64), np.array(y, np.float64)
         with np.errstate(all="ignore"):  # divergence shows in the residual
             for _ in range(ITERATIONS):
-                miss_x, miss_y = (
-                    position - target for position, target in zip(self.distorted(u, v), (x, y), strict=True)
-                )
+                miss_x, miss_y = miss(u, v)
                 if max(np.abs(miss_x).max(), np.abs(miss_y).max()) < TOLERANCE:
                     break
                 a, b, d = self._slopes(u, v)
                 determinant = a * d - b * b
                 u, v = u - (d * miss_x - b * miss_y) / determinant, v - (a * miss_y - b * miss_x) / determinant
-            miss = np.hypot(
-                *(position - target for position, target in zip(self.distorted(u, v), (x, y), strict=True))
-            )
-            failed = ~(miss < 100 * TOLERANCE)
+            failed = ~(np.hypot(*miss(u, v)) < 100 * TOLERANCE)
         return np.where(failed, np.nan, u), np.where(failed, np.nan, v)
 
     def reach(self, radius: float) -> float:
@@ -119,9 +119,7 @@ class Fisheye:
     def distorted(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return where the lens images rays that a pinhole images at (x, y), f64, on the plane."""
         radius = np.hypot(x, y)
-        factor = np.where(
-            radius > 0, self._distorted_radius(np.arctan(radius))[0] / np.where(radius > 0, radius, 1.0), 1.0
-        )
+        factor = _ratio(self._distorted_radius(np.arctan(radius))[0], radius)
         return x * factor, y * factor
 
     def straight(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -136,7 +134,7 @@ class Fisheye:
                 angle = angle - (distorted - radius) / slope
             failed = ~((np.abs(self._distorted_radius(angle)[0] - radius) < 100 * TOLERANCE) & (angle >= 0))
             reach = np.where(angle < np.pi / 2, np.minimum(np.tan(angle), FARTHEST), FARTHEST)
-        factor = np.where(radius > 0, reach / np.where(radius > 0, radius, 1.0), 1.0)
+        factor = _ratio(reach, radius)
         return np.where(failed, np.nan, x * factor), np.where(failed, np.nan, y * factor)
 
     def reach(self, radius: float) -> float:
@@ -150,6 +148,11 @@ class Fisheye:
         k1, k2, k3, k4, a = self.k1, self.k2, self.k3, self.k4, angle * angle
         distorted = angle * (1 + a * (k1 + a * (k2 + a * (k3 + a * k4))))
         return distorted, 1 + a * (3 * k1 + a * (5 * k2 + a * (7 * k3 + a * 9 * k4)))
+
+
+def _ratio(lengths: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Return lengths divided by a radius, 1 where it is zero."""
+    return np.divide(lengths, radius, out=np.ones_like(radius), where=radius > 0)
 
 
 def _first_back(forth: np.ndarray, radii: np.ndarray) -> float:

@@ -26,7 +26,7 @@ from liftcore.scene.similarity import Similarity
 from liftcore.scene.world import UNKNOWN, WorldFrame
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from torch import Tensor
 
@@ -140,15 +140,14 @@ class Splats:
         }
         origin, rounding = _move_to_origin(columns, means, origin)
         columns, repairs = _repair_columns(columns)
-        for name in shapes:
-            object.__setattr__(self, name, columns.get(name))
         extra_columns = {name: _extra(name, values, count) for name, values in (extras or {}).items()}
-        fixed = {"kernel": kernel, "extras": extra_columns, "layout": tuple(layout), "header": tuple(header)}
+        fields: dict[str, Any] = {name: columns.get(name) for name in shapes}
+        fields |= {"kernel": kernel, "extras": extra_columns, "layout": tuple(layout), "header": tuple(header)}
         mode = render_mode_of(render_mode)
         doubts = [*_kernel_warnings(mode, kernel), *_activation_warnings(columns)]
         all_warnings = tuple(dict.fromkeys((*warnings, *repairs, *doubts, *rounding)))
-        fixed |= {"render_mode": mode, "origin": origin, "world": world, "warnings": all_warnings}
-        for name, value in fixed.items():
+        fields |= {"render_mode": mode, "origin": origin, "world": world, "warnings": all_warnings}
+        for name, value in fields.items():
             object.__setattr__(self, name, value)
         if self.sh is not None and self.sh.shape[1] not in SH_ROWS:
             raise InvalidSplats("sh", expected=f"{SH_ROWS} rows (degree 0..4)", got=str(self.sh.shape[1]))
@@ -230,10 +229,13 @@ class Splats:
         Raises:
             InvalidInput: they choose no splat, or are none of these (`chosen_rows`).
         """
-        rows = chosen_rows(keep, self.count).to(self.means.device)
-        columns = {name: value[rows] for name, value in vars(self).items() if isinstance(value, torch.Tensor)}
-        extras = {name: column[rows.to(column.device)] for name, column in self.extras.items()}
-        return replace(self, **columns, extras=extras)
+        rows = chosen_rows(keep, self.count)
+        return self._with_each(lambda column: column[rows.to(column.device)])
+
+    def _with_each(self, change: Callable[[Tensor], Tensor]) -> Splats:
+        """Return the same with every column changed."""
+        columns = {name: change(value) for name, value in vars(self).items() if isinstance(value, torch.Tensor)}
+        return replace(self, **columns, extras={name: change(column) for name, column in self.extras.items()})
 
     def transformed(self, matrix: Numbers) -> Splats:
         """Return the splats in another frame, ``p' = scale R p + translation``: places, sizes, turns and colours.
@@ -276,8 +278,7 @@ class Splats:
         """Return the same with its tensors on the CPU."""
         if self.means.device.type == "cpu":
             return self
-        columns = {name: value.cpu() for name, value in vars(self).items() if isinstance(value, torch.Tensor)}
-        return replace(self, **columns, extras={name: column.cpu() for name, column in self.extras.items()})
+        return self._with_each(lambda column: column.cpu())
 
     def positions(self, rows: Any = slice(None)) -> np.ndarray:
         """Return the means [n, 3] of these rows, or of all, in the world frame: f32, or f64 if an origin is added."""
@@ -361,12 +362,11 @@ def _in_range(name: str, values: Tensor, maximum: float, expected: str) -> Tenso
 
 def joined_harmonics(first: Tensor, rest: Array | None, names: tuple[str, str]) -> Tensor:
     """Return [P, K, 3] f32 of the constant terms [P, 3] or [P, 1, 3] and all others [P, K - 1, 3], or None."""
-    higher = first[:0] if rest is None else _floats(names[1], rest)
+    terms = [first] if rest is None else [first, _floats(names[1], rest)]
     try:
-        higher = first.new_zeros(len(first), 0, 3) if rest is None else higher
-        return torch.cat([first.reshape(len(first), 1, 3), higher.reshape(len(higher), -1, 3)], dim=1)
+        return torch.cat([array.reshape(len(array), -1, 3) for array in terms], dim=1)
     except (RuntimeError, TypeError):
-        got = f"{list(first.shape)} and {list(higher.shape)}"
+        got = " and ".join(str(list(array.shape)) for array in terms)
         expected = "shapes [P, 1, 3] and [P, K, 3]"
         raise InvalidSplats(" and ".join(names), expected=expected, got=got) from None
 
