@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import math
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Self
 
@@ -175,11 +176,17 @@ def area_mask(area: Area, size: tuple[int, int], radius: float) -> np.ndarray:
         left, top = np.clip(np.ceil(np.minimum(begin, end) - reach), 0, size).astype(np.int64).tolist()
         right, bottom = np.clip(np.floor(np.maximum(begin, end) + reach) + 1, 0, size).astype(np.int64).tolist()
         along_x, along_y = (end - begin).tolist()
-        x = np.arange(left, right) - begin[0]
-        for row in range(top, bottom):
+        low, high = sorted((0.0, along_y))
+        for row in range(top, bottom):  # of which the segment is near to few columns
             y = row - begin[1]
+            feet = np.array([0.0, along_x])
+            if along_y:
+                feet = np.clip([y - reach, y + reach], low, high) * along_x / along_y
+            first = max(left, math.ceil(begin[0] + feet.min() - reach))
+            last = max(first, min(right, math.floor(begin[0] + feet.max() + reach) + 1))
+            x = np.arange(first, last) - begin[0]
             share = np.clip((x * along_x + y * along_y) / max(along_x**2 + along_y**2, 1.0), 0.0, 1.0)
-            mask[row, left:right] |= np.hypot(x - share * along_x, y - share * along_y) <= reach
+            mask[row, first:last] |= np.hypot(x - share * along_x, y - share * along_y) <= reach
     return mask
 
 
