@@ -66,7 +66,6 @@ def add_arguments_encode(parser: Parser) -> None:
     parser.add_argument("--encoder", required=True, metavar="SPEC", help=spec)
     parser.add_argument("--cameras", type=Path, metavar="PATH", help="whose sizes say how photos are turned")
     parser.add_argument("--size", type=count, metavar="PX", help="the shorter side; default: of the model")
-    parser.add_argument("--batch", type=count, default=1, metavar="N", help="images encoded at once")
     parser.add_argument("--device", default="cpu", metavar="NAME", help="of the model, as torch names it")
     unit = "make unit vectors; the default"
     parser.add_argument("--normalised", action=argparse.BooleanOptionalAction, default=True, help=unit)
@@ -92,7 +91,7 @@ def run(options: argparse.Namespace) -> int:
     description = inspect_file(options.output, "features")
     names = ("bytes", "views", "channels", "encoder", "text_space", "normalised", "sizes")
     document = {"out": str(options.output), **{name: description[name] for name in names}}
-    document |= {name: facts[name] for name in ("folders", "renamed", "words")}
+    document |= {name: facts[name] for name in ("folders", "words")}
     document["warnings"] = [*facts["warnings"], *description["warnings"]]
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
@@ -102,7 +101,7 @@ def run_encode(options: argparse.Namespace) -> int:
     """Write the pack, completely or not at all, and describe it."""
     from liftcore import encode_images
 
-    names = ("device", "cameras", "size", "batch", "normalised")
+    names = ("device", "cameras", "size", "normalised")
     values = {name: getattr(options, name) for name in names}
     with option_errors({name: f"--{name}" for name in ("encoder", "device", "size")}):
         document = encode_images(options.images, options.output, options.encoder, **values, progress=True)
@@ -132,6 +131,4 @@ def _lines(document: dict[str, Any]) -> Iterator[str]:
     if document["words"]:
         yield f"  {len(document['words'])} words: {short_text(document['words'])}"
     yield from list_folders(document["folders"])
-    for name, view in list(document["renamed"].items())[:1]:
-        yield f"  names of views have no suffix of an image, like those of cameras: {name} is {view!r}"
     yield from (f"warning: {warning}" for warning in document["warnings"])

@@ -5,12 +5,13 @@ of ``IMG.jpg``. Hidden files and folders are skipped, as are files that operatin
 
 LangSplat's ``IMG_s.npy`` [L, H, W] contains mask ids, -1 for none, numbered through all levels, so an id is a row of
 ``IMG_f.npy`` [M, F]. Occam's LGS, OpenGaussian, LaGa and VALA write the same files.
+
+What opens a folder, here and beside, raises ``ValueError`` about its files (`liftcore.errors.reading`).
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from functools import wraps
 from pathlib import Path
-from typing import Concatenate, Literal, ParamSpec, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -27,8 +28,6 @@ CHANNELS_FIRST = "_fmap_CxHxW"
 LABELS, CODEBOOK = "_s.npy", "_f.npy"  # of LangSplat
 
 Layout = Literal["hwc", "chw"]
-P = ParamSpec("P")
-T = TypeVar("T")
 V_co = TypeVar("V_co", bound=ViewFeatures, covariant=True)
 FLATTEST = 16  # largest ratio of the sides of a grid: a larger one is a list of cells or of channels, not a photo
 
@@ -58,23 +57,11 @@ class ViewFolder(Mapping[str, V_co]):
         return len(self.files)
 
 
-def names_folder(open_views: Callable[Concatenate[Path, P], T]) -> Callable[Concatenate[Path, P], T]:
-    """Name the folder in what is wrong with its files."""
-
-    @wraps(open_views)
-    def open_named(folder: Path, *args: P.args, **options: P.kwargs) -> T:
-        with reading(folder, InvalidFeatures, "a folder of features or masks"):
-            return open_views(folder, *args, **options)
-
-    return open_named
-
-
 def folders_of(views: Iterable[str]) -> list[str]:
     """Return the folders that are part of names like ``camA/000``, sorted."""
     return sorted({view.rpartition("/")[0] for view in views if "/" in view})
 
 
-@names_folder
 def array_views(folder: Path, layout: Layout = "hwc", fit: Fit | Literal[""] = "") -> ViewFolder[FeatureGrid]:
     """Open the grids of a folder of ``.npy``, ``.npz`` or ``.pt`` files [h, w, F], or [F, h, w] for layout ``chw``.
 
@@ -113,7 +100,6 @@ def grids_of(
     return ViewFolder(files, read)
 
 
-@names_folder
 def langsplat_views(folder: Path) -> ViewFolder[Regions]:
     """Open the regions of a folder of ``IMG_s.npy`` and ``IMG_f.npy`` files, and of its sub-folders."""
     files = npy_files(folder, LABELS)

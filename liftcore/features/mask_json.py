@@ -8,6 +8,7 @@
   ``mask_data``).
 """
 
+import posixpath
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -145,8 +146,8 @@ def _box_mask(box: Any, size: tuple[int, int] | None) -> StoredMask:
 def _add_data_set(document: MaskDocument, content: Mapping[str, Any], *, unannotated_negative: bool) -> None:
     """Add the images of a COCO data set."""
     entries = {entry["id"]: entry for entry in content["images"]}
-    named = [(entry["id"], _text_of(entry, "name")) for entry in content.get("categories") or ()]
-    categories = {number: name for number, name in named if name is not None}
+    category_names = [(entry["id"], _text_of(entry, "name")) for entry in content.get("categories") or ()]
+    categories = {number: name for number, name in category_names if name is not None}
     names = {number: _file_name(entry) for number, entry in entries.items()}
     images = {number: ImageMasks(ROBOFLOW.sub("", name), file=name) for number, name in names.items()}
     _drop_upload_prefixes([*images.values()])
@@ -201,11 +202,8 @@ def views_of_images(names: Sequence[str]) -> dict[str, str]:
     stems = {PurePosixPath(path).name for path in paths.values()}
     if len(stems) == len(set(paths.values())):
         return {name: PurePosixPath(path).name for name, path in paths.items()}
-    parts = [PurePosixPath(path).parts[:-1] for path in paths.values()]
-    shared = next(
-        (k for k in range(min(map(len, parts))) if len({folders[k] for folders in parts}) > 1), min(map(len, parts))
-    )
-    return {name: "/".join(PurePosixPath(path).parts[shared:]) for name, path in paths.items()}
+    shared = posixpath.commonpath([posixpath.dirname(path) for path in paths.values()])
+    return {name: PurePosixPath(path).relative_to(shared).as_posix() for name, path in paths.items()}
 
 
 def tracked_view(ids: Path, document: Path, folder: Path, name: str) -> str:

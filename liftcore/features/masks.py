@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from liftcore.errors import InvalidFeatures, reading
-from liftcore.features.folders import ViewFolder, files_below, files_by_view, names_folder, npy_files, whole_numbers
+from liftcore.features.folders import ViewFolder, files_below, files_by_view, npy_files, whole_numbers
 from liftcore.features.mask_files import AS_COCO, StoredMasks, label_png, mask_records, read_mask, read_mask_json
 from liftcore.features.mask_json import declared_size
 from liftcore.io.npy import NUMBERS, open_array, read_floats, without_unit_axes
@@ -36,7 +36,6 @@ UNLABELLED = np.full((1, 1, 1), NO_LABEL, np.int32)
 OVERLAP = "move photos to another folder than their masks"
 
 
-@names_folder
 def mask_files(folder: Path) -> dict[str, Path]:
     """Return view -> its file of masks, of a folder without vectors and its sub-folders."""
     arrays = [path for path in files_below(folder) if path.name.endswith((VECTORS, ZIPPED_ARRAY))]
@@ -58,7 +57,6 @@ def labels_alone(path: Path, unlabelled: int = 0) -> tuple[np.ndarray, int]:
         return Regions(labels, np.zeros((max(rows, 1), 1), np.float32), context=str(path)).labels.numpy(), rows
 
 
-@names_folder
 def mask_views(
     folder: Path, unlabelled: int = 0, mask_vectors: Mapping[str, np.ndarray] | None = None
 ) -> ViewFolder[Regions]:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
-from liftcore.errors import InvalidInput
+from liftcore.errors import InvalidFeatures, InvalidInput, reading
 from liftcore.features.folders import Layout, ViewFolder, array_views, folders_of, langsplat_views
 from liftcore.features.masks import mask_files, mask_views
 from liftcore.features.prompts import Unannotated, prompt_views
@@ -15,9 +15,8 @@ from liftcore.io.photos import orientation_warnings
 from liftcore.io.safetensors_file import with_metadata
 from liftcore.runtime.arguments import as_path, check_choice, check_text, one_of
 from liftcore.runtime.progress import Progress, shown_progress
-from liftcore.scene.views import IMAGE_SUFFIXES
 from liftcore.text import OWN_WORDS
-from liftcore.values.fit import FITS, Fit
+from liftcore.values.fit import FITS
 from liftcore.values.pack import read_features, write_pack
 
 if TYPE_CHECKING:
@@ -38,26 +37,6 @@ CHOICES = {
 NAMES = ("encoder", "text_space")  # of a pack
 
 
-class PackOptions(TypedDict, total=False):
-    """Options for reading files of one format."""
-
-    layout: Layout
-    """of ``npy``, the order of the axes: hwc or chw"""
-    map_fit: Fit
-    """of ``npy``, what the encoder's preprocessing did to photos (`liftcore.values.fit`)"""
-    unlabelled: int | None
-    """of label pictures, the value of pixels without a mask; None: 0 for ``masks``, no value for ``prompts``"""
-    encoder: str | None
-    """of ``masks`` without vectors, the encoder of each mask's crop of its photo"""
-    photos: Path | str | Sequence[Path | str] | None
-    """for ``encoder``"""
-    device: str
-    """of ``encoder``, as torch names it"""
-    names: Path | str | None
-    """of ``prompts``, as for `liftcore.features.prompts.prompt_views`, as is ``unannotated``"""
-    unannotated: Unannotated
-
-
 def pack_folder(
     folder: Path | str,
     out: Path | str,
@@ -67,7 +46,7 @@ def pack_folder(
     text_space: str | None = None,
     normalised: bool | None = None,
     progress: Progress | bool | None = None,
-    **options: Unpack[PackOptions],
+    **options: Any,
 ) -> dict[str, Any]:
     """Write a folder of features or masks as a feature pack, completely or not at all.
 
@@ -77,10 +56,16 @@ def pack_folder(
         encoder_name, text_space, normalised: metadata of the pack; None: as recorded by the files or the encoder.
         progress: as for `liftcore.lift`.
         options: of the kind.
+            ``npy``: ``layout``, the order of the axes, hwc or chw; ``map_fit``, what the encoder's preprocessing did
+            to photos (`liftcore.values.fit`).
+            ``masks``: ``unlabelled``, the value of pixels without a mask in label pictures (0); of masks without
+            vectors ``encoder``, of each mask's crop of its photo, with ``photos`` and ``device``, as torch names it.
+            ``prompts``: ``unlabelled`` (no value), ``names`` and ``unannotated``, as for
+            `liftcore.features.prompts.prompt_views`.
 
     Returns:
-        A dictionary for JSON: ``folders`` that are part of view names, views that were ``renamed``, ``words`` in the
-        pack, and ``warnings``. `liftcore.evaluate.inspect_file` describes the pack.
+        A dictionary for JSON: ``folders`` that are part of view names, ``words`` in the pack, and ``warnings``.
+        `liftcore.evaluate.inspect_file` describes the pack.
 
     Raises:
         InvalidInput: files are malformed or do not match each other, the pack cannot be written, an unknown kind, or
@@ -90,39 +75,33 @@ def pack_folder(
     names = {"encoder": encoder_name or None, "text_space": text_space or None, "normalised": normalised}
     _check_options(kind, options, names)
     folder = as_path(folder, "folder")
-    table, warnings, is_encoded = None, list[str](), False
+    table, warnings = None, list[str]()
     with shown_progress(progress) as reporter:
-        if kind == "langsplat":
-            views: ViewFolder[Any] = langsplat_views(folder)
-        elif kind == "npy":
-            views = array_views(folder, options.get("layout", "hwc"), options.get("map_fit", ""))
-        elif kind == "prompts":
-            views, table, warnings = _prompt_views(folder, options)
-            names = {"encoder": encoder_name or "masks by prompt", "text_space": OWN_WORDS, "normalised": True}
-        elif options.get("encoder") is not None:
-            views, own_names, warnings = _encoded_masks(folder, out, options, normalised, reporter)
-            names = own_names | {name: value for name, value in names.items() if value is not None}
-            is_encoded = True
-        elif options.get("photos"):
-            raise InvalidInput("encoder", expected="an encoder of the masks in the photos", got="none")
-        else:
-            views = mask_views(folder, options.get("unlabelled") or 0)
+        with reading(folder, InvalidFeatures, "a folder of features or masks"):
+            if kind == "langsplat":
+                views: ViewFolder[Any] = langsplat_views(folder)
+            elif kind == "npy":
+                views = array_views(folder, options.get("layout", "hwc"), options.get("map_fit", ""))
+            elif kind == "prompts":
+                views, table, warnings = _prompt_views(folder, options)
+                names = {"encoder": encoder_name or "masks by prompt", "text_space": OWN_WORDS, "normalised": True}
+            elif options.get("encoder") is not None:
+                views, own_names, warnings = _encoded_masks(folder, out, options, normalised, reporter)
+                names = own_names | {name: value for name, value in names.items() if value is not None}
+            elif options.get("photos"):
+                raise InvalidInput("encoder", expected="an encoder of the masks in the photos", got="none")
+            else:
+                views = mask_views(folder, options.get("unlabelled") or 0)
         check_output(out, views.inputs, "pack")
         texts = {name: value if isinstance(value, str) else str(value).lower() for name, value in names.items()}
         metadata = {"source": kind} | {name: text for name, text in texts.items() if names[name] is not None}
         with writing(out):
             file = as_path(out, "output")
             write_pack(file, views, metadata, reporter, table)
-    keeps_names = kind in ("langsplat", "prompts") or is_encoded  # names of their files have no image suffix
-    return {
-        "folders": folders_of(views),
-        "renamed": {} if keeps_names else _renamed_views(views, folder),
-        "words": list(table.words) if table else [],
-        "warnings": warnings,
-    }
+    return {"folders": folders_of(views), "words": list(table.words) if table else [], "warnings": warnings}
 
 
-def _check_options(kind: str, options: PackOptions, names: Mapping[str, str | bool | None]) -> None:
+def _check_options(kind: str, options: Mapping[str, Any], names: Mapping[str, str | bool | None]) -> None:
     """Check the kind, that each option belongs to it and is one of its choices, and the names of the pack."""
     check_choice("kind", kind, OPTIONS)
     for name, value in options.items():
@@ -143,7 +122,7 @@ def _check_options(kind: str, options: PackOptions, names: Mapping[str, str | bo
         check_text("encoder_name" if name == "encoder" else name, value)
 
 
-def _prompt_views(folder: Path, options: PackOptions) -> tuple[ViewFolder[Any], TableEncoder, list[str]]:
+def _prompt_views(folder: Path, options: Mapping[str, Any]) -> tuple[ViewFolder[Any], TableEncoder, list[str]]:
     """Open masks by prompt, the table of their phrases, and warnings."""
     names = options.get("names")
     prompts = prompt_views(
@@ -159,7 +138,7 @@ def _prompt_views(folder: Path, options: PackOptions) -> tuple[ViewFolder[Any], 
 
 
 def _encoded_masks(
-    folder: Path, out: Path | str, options: PackOptions, normalised: bool | None, progress: Progress
+    folder: Path, out: Path | str, options: Mapping[str, Any], normalised: bool | None, progress: Progress
 ) -> tuple[ViewFolder[Any], dict[str, Any], list[str]]:
     """Encode crops of masks, and return their views, the metadata of the vectors, and warnings."""
     from liftcore.features.encoders import device_named
@@ -177,12 +156,6 @@ def _encoded_masks(
     vectors, readings = crop_vectors(files, images, encoder, unlabelled, progress)
     names = {"encoder": f"crops of masks, {encoder.name}", "text_space": encoder.text_space, "normalised": True}
     return mask_views(folder, unlabelled, vectors), names, orientation_warnings(readings, "masks and cameras")
-
-
-def _renamed_views(views: ViewFolder[Any], folder: Path) -> dict[str, str]:
-    """Return file of vectors -> view, of files whose name has an image suffix that the view does not have."""
-    files = {path.relative_to(folder).as_posix(): view for view, path in views.files.items()}
-    return {name: view for name, view in files.items() if Path(name).with_suffix("").suffix.lower() in IMAGE_SUFFIXES}
 
 
 def retag_pack(pack: Path | str, out: Path | str, names: Mapping[str, str]) -> None:

@@ -29,7 +29,7 @@ from typing import Literal
 import numpy as np
 
 from liftcore.errors import InvalidFeatures, reading
-from liftcore.features.folders import ViewFolder, files_below, names_folder
+from liftcore.features.folders import ViewFolder, files_below
 from liftcore.features.mask_files import AS_COCO, StoredMask, binary_mask, binary_picture, label_png
 from liftcore.features.mask_json import (
     VOID,
@@ -40,7 +40,7 @@ from liftcore.features.mask_json import (
     views_of_images,
 )
 from liftcore.io.files import visible_files
-from liftcore.io.npy import ARRAYS, NUMBERS, open_array, without_unit_axes
+from liftcore.io.npy import ARRAYS, NUMBERS, open_array
 from liftcore.runtime.one_line import join_names
 from liftcore.scene.views import composed, require_name, without_image_suffix
 from liftcore.text.table import TableEncoder, normalize_text
@@ -82,7 +82,6 @@ class _View:
     searched: set[str] = field(default_factory=set)  # normalized, that some data set searched for
     not_searched: set[str] = field(default_factory=set)  # normalized, that some data set did not search for
     has_void: bool = False
-    large_masks: int = 0  # pictures of phrases that cover more than half of it
 
     def was_searched(self, phrases: Iterable[str]) -> bool:
         """Return True if the view was searched for all of these phrases."""
@@ -128,7 +127,6 @@ class Prompts:
     warnings: tuple[str, ...] = ()  # of omitted images and unlabelled pixels
 
 
-@names_folder
 def prompt_views(
     folder: Path,
     names: Path | None = None,
@@ -162,7 +160,6 @@ def prompt_views(
         for path in pictures or arrays:
             with reading(path, InvalidFeatures, "a mask [h, w]"):
                 _add_binary(index, path, path.relative_to(folder), unlabelled)
-        warnings += _inverted_masks(index)
     else:
         suffix, count = Counter(path.suffix.lower() for path in files).most_common(1)[0] if files else ("", 0)
         hint = "give the folder that also contains json_data" if arrays else OTHER_FILES.get(suffix, "")
@@ -196,17 +193,6 @@ def _prompts(index: _MaskIndex, files: Sequence[Path], warnings: list[str]) -> P
     table = TableEncoder("phrases", [index.phrases[phrase] for phrase in order], vectors[:-1])
     counts = {text: seen_in[phrase] for phrase, text in sorted(index.phrases.items())}
     return Prompts(views, table, counts, tuple(warnings))
-
-
-def _inverted_masks(index: _MaskIndex) -> list[str]:
-    """Return a warning if several phrases cover most of most views, as masks in black on white do."""
-    inverted = sum(view.large_masks > 1 for view in index.views.values())
-    if 2 * inverted <= len(index.views):
-        return []
-    return [
-        f"in {inverted} of {len(index.views)} views two or more phrases cover over half of the picture each: a mask "
-        "is the pixels that are not black; invert masks that are black on white"
-    ]
 
 
 def label_texts(path: Path) -> dict[str, str]:
@@ -267,9 +253,8 @@ def _ids(path: Path) -> np.ndarray:
 
 
 def _plane(values: np.ndarray) -> np.ndarray:
-    """Remove leading axes of length 1, or the last one, of an array: [h, w]."""
-    plane = without_unit_axes(values, 3)
-    plane = plane[..., 0] if plane.ndim == 3 and plane.shape[-1] == 1 else without_unit_axes(plane, 2)
+    """Return an array without axes of length 1, [h, w]."""
+    plane = values if values.ndim == 2 else np.squeeze(values)
     if plane.ndim != 2:
         raise ValueError(f"a mask or ids [h, w], got {values.dtype} {list(values.shape)}")
     return plane
@@ -285,7 +270,6 @@ def _add_binary(index: _MaskIndex, path: Path, inner: Path, unlabelled: int | No
     (_, mask), (_, void) = _binary_masks(path, phrase, unlabelled)
     present = [label for label, pixels in ((phrase, mask), (VOID, void)) if pixels.any()]
     index.add(name, path, present, partial(_binary_masks, path, phrase, unlabelled))
-    index.views[name].large_masks += bool(mask.mean() > 1 / 2)
 
 
 def _add_labels(

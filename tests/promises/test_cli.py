@@ -316,7 +316,6 @@ def test_packed_maps_are_those_of_the_folder(scene: Path) -> None:
         assert isinstance(grid, lc.FeatureGrid) and np.array_equal(grid.grid.numpy(), values)
         np.save(scene / "maps" / f"{view}.png.npy", values.transpose(2, 0, 1))
     assert (document["views"], document["channels"]) == (3, CHANNELS)
-    assert document["renamed"] == {f"{view}.png.npy": view for view in VIEWS}
     assert run(*words, "--layout", "chw").status == 0
     transposed_pack = lc.read_features(scene / "p.safetensors")
     assert all(torch.equal(transposed_pack[view].codebook, packs[view].codebook) for view in VIEWS)
@@ -359,7 +358,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Any, Path]:
 @pytest.mark.slow
 def test_encoded_photos_are_lifted_and_asked_in_words(scene: Path, photos: Path, clip: tuple[Any, Any, Path]) -> None:
     encoder, pack, lift = f"maskclip:ViT-S-32-alt@{clip[2]}", scene / "p.safetensors", scene / "x.safetensors"
-    document = run("encode", photos, "-o", pack, "--encoder", encoder, "--size", 64, "--batch", 2, "--json").document
+    document = run("encode", photos, "-o", pack, "--encoder", encoder, "--size", 64, "--json").document
     packs = lc.read_features(pack)
     assert (document["views"], document["channels"], packs.views) == (3, 256, tuple(sorted(VIEWS)))
     grid = packs["left"]

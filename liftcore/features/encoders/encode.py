@@ -1,9 +1,9 @@
-"""Encoding of photos as a feature pack: in RGB, resized to whole patches, in batches of one size.
+"""Encoding of photos as a feature pack: in RGB, resized to whole patches, one by one.
 
 Photos are read in the orientation of their cameras (`liftcore.io.photos`).
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,28 +32,6 @@ TURNED_BACK = {6: 8, 8: 6}  # of the turns that EXIF has, those that are not the
 PAPER = (255, 255, 255)  # the colour behind transparent pixels: white, as in captures without a background
 
 
-def _batches(
-    images: Mapping[str, Path],
-    pixels: Pixels,
-    shorter: int,
-    batch: int,
-    sizes: Mapping[str, tuple[int, int]],
-    readings: dict[str, Reading],
-) -> Iterator[tuple[list[str], Tensor]]:
-    """Yield names and images [n, 3, H, W] of consecutive images of one size; fills ``readings``."""
-    names: list[str] = []
-    waiting: list[Tensor] = []
-    for name, path in images.items():
-        image, readings[name] = read_image(path, sizes.get(name))
-        ready = prepare(image, pixels, shorter)
-        if waiting and (len(waiting) == batch or ready.shape != waiting[0].shape):
-            yield names, torch.stack(waiting)
-            names, waiting = [], []
-        names.append(name)
-        waiting.append(ready)
-    yield names, torch.stack(waiting)
-
-
 def encode_images(
     images: Path | str | Sequence[Path | str],
     out: Path | str,
@@ -62,13 +40,12 @@ def encode_images(
     device: str = "cpu",
     cameras: Cameras | Path | str | None = None,
     size: int | None = None,
-    batch: int = 1,
     normalised: bool = True,
     progress: Progress | bool | None = None,
 ) -> dict[str, Any]:
     """Encode photos and write them as a feature pack, completely or not at all.
 
-    Grids are stored in a temporary folder next to the pack first, so memory holds one batch.
+    Grids are stored in a temporary folder next to the pack first, so memory holds one photo.
 
     Args:
         images: images, and folders of them; a view has the name of its image.
@@ -77,7 +54,7 @@ def encode_images(
         device: of an encoder opened by its specification, as torch names it.
         cameras: of the photos, or their file: their sizes decide whether photos with an EXIF orientation are read as
             stored or rotated.
-        size: pixels of the shorter side; None: the encoder's default. batch: images of one size encoded at once.
+        size: pixels of the shorter side; None: the encoder's default.
         normalised: True: cells become unit vectors (a cell of zeros stays zero).
         progress: as for `liftcore.lift`.
 
@@ -100,23 +77,23 @@ def encode_images(
     if isinstance(cameras, Path | str):
         cameras = read_cameras(cameras)
     sizes = {} if cameras is None else photo_sizes(photos, cameras)
-    file, readings, wide, count = as_path(out, "output"), dict[str, Reading](), list[str](), 0
+    file, readings, wide = as_path(out, "output"), dict[str, Reading](), list[str]()
     with shown_progress(progress) as reporter, writing(file):
         file.parent.mkdir(parents=True, exist_ok=True)
         with scratch_folder(f".{file.name}.", file.parent) as scratch:
             files = {name: scratch / f"{number}.npy" for number, name in enumerate(photos)}
             shorter = size or model.pixels.shorter
-            for names, stack in _batches(photos, model.pixels, shorter, batch, sizes, readings):
-                for name, grid in zip(names, model.encode(stack), strict=True):
-                    with reading(f"features of image {name!r}", InvalidFeatures, "finite values"):
-                        check_finite(grid)
-                    cells = torch.nn.functional.normalize(grid, dim=-1) if normalised else grid
-                    if float(cells.abs().max()) > LARGEST_F16:
-                        wide.append(name)
-                    else:
-                        cells = cells.to(torch.float16)
-                    np.save(files[name], cells.numpy())
-                count += len(names)
+            for count, (name, path) in enumerate(photos.items(), start=1):
+                image, readings[name] = read_image(path, sizes.get(name))
+                (grid,) = model.encode(prepare(image, model.pixels, shorter)[None])
+                with reading(f"features of image {name!r}", InvalidFeatures, "finite values"):
+                    check_finite(grid)
+                cells = torch.nn.functional.normalize(grid, dim=-1) if normalised else grid
+                if float(cells.abs().max()) > LARGEST_F16:
+                    wide.append(name)
+                else:
+                    cells = cells.to(torch.float16)
+                np.save(files[name], cells.numpy())
                 reporter("encode", count, len(photos), "views")
             metadata = {
                 "encoder": model.name,
