@@ -85,16 +85,16 @@ def grids_of(
         grid = read_floats(files[view], "F, h, w" if first else "h, w, F")
         if first and len(grid) == 1:  # ambiguous: a batch of one flat list [1, F, N], or one channel
             hint = "of a flat list of cells save array.reshape(F, h, w); of one channel array.reshape(h, w, 1) as hwc"
-            raise InvalidFeatures(str(files[view]), expected="[F, h, w]", got=f"{list(grid.shape)}", hint=hint)
+            raise ValueError(f"[F, h, w], got {list(grid.shape)}; {hint}")
         grid = grid.transpose(1, 2, 0) if first else grid
         height, width, channels = grid.shape
         if max(height, width) > FLATTEST * min(height, width):
             got = f"{height} x {width} cells in {list(grid.shape)}"
             hint = (
-                f"give a flat list of cells its rows and columns, array.reshape(h, w, {channels}), without the class"
+                f"give a flat list of cells its rows and columns, array.reshape(h, w, {channels}), without the class "
+                "token; where channels come first, array.reshape(F, h, w).transpose(1, 2, 0)"
             )
-            hint = f"{hint} token; where channels come first, array.reshape(F, h, w).transpose(1, 2, 0)"
-            raise InvalidFeatures(f"view {view!r} grid", expected="a map [h, w, F] of a photo", got=got, hint=hint)
+            raise ValueError(f"a map [h, w, F] of a photo, got {got}; {hint}")
         return FeatureGrid(grid, fit=fit, context=f"view {view!r}")
 
     return ViewFolder(files, read)
@@ -131,7 +131,7 @@ def whole_numbers(stored: np.ndarray) -> np.ndarray:
 def files_below(folder: Path) -> list[Path]:
     """List the files of a folder and its sub-folders, sorted, without those of `is_system_file`."""
     if not folder.is_dir():
-        raise InvalidFeatures(str(folder), expected="a folder of features or masks", got="no such folder")
+        raise ValueError("a folder of features or masks, got no such folder")
     return visible_files(folder, "**/*")
 
 

@@ -103,7 +103,7 @@ class _MaskIndex:
     def name(self, view: str, phrase: str) -> str:
         """Add a phrase of a view, and return its normalized form."""
         if not (key := normalize_text(phrase)):
-            raise InvalidFeatures(f"view {view!r}", expected="a phrase for each mask", got="an empty phrase")
+            raise ValueError(f"a phrase for each mask, got an empty phrase in the view {view!r}")
         require_name(phrase, f"a phrase of the view {view!r}", InvalidFeatures)
         self.phrases.setdefault(key, " ".join(composed(phrase).replace("_", " ").split()))
         return key
@@ -327,7 +327,7 @@ def _add_documents(
         if image.file and file_names.setdefault(name, image.file) != image.file:
             got = f"{file_names[name]} and {image.file}, both of the view {name!r}"
             hint = "rotated, cropped or mirrored copies do not match their photo: export without augmentation"
-            raise InvalidFeatures(str(document.path), expected="one image a photo", got=got, hint=hint)
+            raise ValueError(f"one image a photo, got {got} in {document.path.name}; {hint}")
         for phrase in image.phrases:
             index.name(name, phrase)
         view = index.view(name, document.path)
@@ -374,8 +374,7 @@ def _id_file(name: str, document: Path, files: Mapping[str, Sequence[Path]]) -> 
     stem = composed(PurePosixPath(name.replace("\\", "/")).stem)
     if stem not in files:
         hint = f"give the folder that contains both, or move {MASK_DATA} next to the folder of the JSON"
-        expected = f"its ids in {stem}.npy, .npz or .png"
-        raise InvalidFeatures(str(document), expected=expected, got="no such file", hint=hint)
+        raise ValueError(f"the ids of {document.name} in {stem}.npy, .npz or .png, got no such file; {hint}")
     return min(files[stem], key=lambda path: sum(not path.is_relative_to(parent) for parent in document.parents))
 
 
