@@ -22,7 +22,7 @@ from liftcore.runtime.memory import map_anonymous
 
 NAMES = {
     "F64": "float64", "F32": "float32", "F16": "float16", "I64": "int64", "I32": "int32", "I16": "int16",
-    "I8": "int8", "U8": "uint8", "U16": "uint16", "BOOL": "bool",
+    "I8": "int8", "U8": "uint8", "U16": "uint16", "BOOL": "bool", "BF16": "V2",  # which NumPy has not: two bytes
 }  # fmt: skip
 TYPES = {f"torch.{name}": code for code, name in NAMES.items()}
 
@@ -139,11 +139,10 @@ def map_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     return {name: _array(mapped, start, entry) for name, entry in header.items() if name != "__metadata__"}, metadata
 
 
-def check_arrays(arrays: Mapping[str, Any], schema: Mapping[str, tuple[str, str]]) -> dict[str, int]:
+def check_arrays(arrays: Mapping[str, np.ndarray], schema: Mapping[str, tuple[str, str]]) -> dict[str, int]:
     """Return the length of each axis of arrays that have the types and axes of a schema; a ValueError names others.
 
     Args:
-        arrays: of NumPy or torch, or their dtypes and shapes.
         schema: name -> types as NumPy has them, and letters of axes, such as ("f2 f4", "P F"); equal letters are
         equally long in all arrays. Names that are missing are not checked.
     """
@@ -152,19 +151,12 @@ def check_arrays(arrays: Mapping[str, Any], schema: Mapping[str, tuple[str, str]
         array, letters = arrays.get(name), axes.split()
         if array is None:
             continue
-        fits = len(array.shape) == len(letters) and _numpy_code(array.dtype) in types.split()
+        fits = array.ndim == len(letters) and array.dtype in [np.dtype(code) for code in types.split()]
         sides = dict(zip(letters, array.shape, strict=fits))
         if not fits or any(lengths.setdefault(letter, side) != side for letter, side in sides.items()):
             known_sides = "".join(f", {letter} = {side}" for letter, side in lengths.items() if letter in letters)
-            got = f"{_numpy_code(array.dtype)} {list(array.shape)}"
-            raise ValueError(f"{name} {types} [{axes}]{known_sides}, got {got}")
+            raise ValueError(f"{name} {types} [{axes}]{known_sides}, got {array.dtype} {list(array.shape)}")
     return lengths
-
-
-def _numpy_code(dtype: Any) -> str:
-    """Return a type as NumPy shortens it, "f2"; "bf16" and others that NumPy has not by their own names."""
-    name = NAMES.get(str(dtype), str(dtype).removeprefix("torch."))
-    return np.dtype(name).str[1:] if name in NAMES.values() else name.lower()
 
 
 def map_file(file: IO[bytes]) -> mmap.mmap:

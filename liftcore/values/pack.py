@@ -7,28 +7,29 @@ words: ``embeddings`` [n, F] and the metadata ``words``, as a table of text embe
 no encoder for queries by these.
 """
 
-import errno
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import MappingProxyType
-from typing import IO, Any, NamedTuple, Protocol, cast
+from typing import IO, Any, Protocol, cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from liftcore.errors import InvalidFeatures, InvalidTable, Unavailable, reading
+from liftcore.errors import InvalidFeatures, Unavailable, reading
 from liftcore.io.files import whole_file
 from liftcore.io.kinds import wrong_kind
+from liftcore.io.npy import without_unit_axes
 from liftcore.io.safetensors_file import (
     MAX_HEADER_BYTES,
     check_arrays,
     check_header,
+    map_tensors,
     safetensors_header,
     tensor_bytes,
 )
-from liftcore.runtime.arguments import as_path
+from liftcore.runtime.arguments import as_path, nearest
 from liftcore.runtime.folders import scratch_folder
 from liftcore.runtime.progress import Progress, silent
 from liftcore.runtime.torch_modes import callers_modes
@@ -41,29 +42,18 @@ from liftcore.values.views import MAX_CHANNELS, NO_LABEL, FeatureGrid, Regions, 
 
 U8_NO_LABEL = 255
 LARGEST_I16 = 32_767
-FEATURE_TYPES = "f2 f4 bf16"
-PARTS = {"labels": ("u1 i2 i4", "L h w"), "codebook": (FEATURE_TYPES, "M F"), "grid": (FEATURE_TYPES, "h w F")}
-NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+SCHEMA = {"labels": ("u1 i2 i4", "L h w"), "codebook": ("f2 f4 V2", "M F"), "grid": ("f2 f4 V2", "h w F")}
 TABLE = "embeddings"
 FIT = "map_fit"  # of the metadata: of the pack's grids
 MAX_TENSORS = 2 * MAX_VIEWS + 1  # of a pack: labels and a codebook a view, and its words
-
-
-class TensorSpec(NamedTuple):
-    """Type and shape of a tensor of a pack, known before it is read."""
-
-    dtype: str  # as safetensors names it: "F16"
-    shape: tuple[int, ...]
-
-
-Shapes = dict[str, tuple[int, ...]]  # of the tensors of a view: labels and codebook, or grid
+EXPECTED = "a feature pack (.safetensors)"
 
 
 class _Source(Protocol):
     """Source of one view."""
 
     @property
-    def shapes(self) -> Shapes: ...
+    def shapes(self) -> Mapping[str, tuple[int, ...]]: ...  # by part: labels and codebook, or grid
     @property
     def fit(self) -> str: ...  # of a grid to its photo, "" for not recorded
     def read(self) -> ViewFeatures: ...
@@ -124,19 +114,19 @@ class Views(Mapping[str, ViewFeatures]):
         """Return True if the view is a region map; else it is a grid."""
         return "labels" in self._find(view).shapes
 
-    def shapes(self, view: str) -> Shapes:
-        """Return the shapes of a view's tensors by part (labels and codebook, or grid), from the header alone."""
-        shapes = self._find(view).shapes
+    def shapes(self, view: str) -> dict[str, tuple[int, ...]]:
+        """Return the shapes of a view by part (labels and codebook, or grid), from the header alone."""
+        shapes = dict(self._find(view).shapes)
         camera = self.seeing(view)
-        if camera is not None and (window := self.window(view, camera)) is not None:
-            sides = (part.stop - part.start for part in (window.rows, window.columns))
-            return {"grid": (*sides, shapes["grid"][2])}
-        if camera is None or camera.lens is None:
+        if camera is None:
             return shapes
-        if "grid" in shapes:
-            height, width, channels = shapes["grid"]
-            return {"grid": (*grid_sides(height, width, camera), channels)}
-        return shapes | {"labels": (shapes["labels"][0], camera.height, camera.width)}
+        if "labels" in shapes:
+            sides = shapes["labels"][1:] if camera.lens is None else (camera.height, camera.width)
+            return shapes | {"labels": (shapes["labels"][0], *sides)}
+        height, width, channels = shapes["grid"]
+        if (window := self.window(view, camera)) is not None:
+            return {"grid": (*(part.stop - part.start for part in (window.rows, window.columns)), channels)}
+        return {"grid": (*grid_sides(height, width, camera), channels)}
 
     def fit(self, view: str) -> str:
         """Return the fit of a view's map to its photo; "" where it is not recorded, as of region maps."""
@@ -169,7 +159,8 @@ class Views(Mapping[str, ViewFeatures]):
     def _find(self, view: str) -> _Source:
         source = self._sources.get(composed(view))
         if source is None:
-            raise InvalidFeatures("view", expected="a view of the features", got=repr(view))
+            hint = nearest(str(view), self.views, 3)
+            raise InvalidFeatures("view", expected="a view of the features", got=repr(view), hint=hint)
         return source
 
 
@@ -194,7 +185,7 @@ def as_views(views: Mapping[str, ViewFeatures] | Iterable[tuple[str, ViewFeature
     if not sources:
         raise InvalidFeatures("features", expected="at least one view", got="none")
     if isinstance(views, dict):  # other mappings may read files: theirs are checked one by one
-        _check_channels((name, source.read()) for name, source in sources.items())
+        _check_channels({source.read().codebook.shape[1]: name for name, source in sources.items()})
     channels = next(iter(sources.values())).read().codebook.shape[1]
     return Views(channels, "", "", None, sources)
 
@@ -208,19 +199,19 @@ def read_features(*paths: str | Path) -> Views:
             share their channels and their encoder.
     """
     packs = [_open(as_path(path)) for path in paths]
-    sources: dict[str, _Stored] = {}
+    sources: dict[str, _PackView] = {}
     channels: dict[int, str] = {}
     for pack in packs:
         for view, stored in _composed_names(pack.views).items():
+            source = pack.views[stored]
             if view in sources:
-                raise ValueError(f"each view in one pack, got {view!r} in {sources[view].pack.path} and {pack.path}")
-            sources[view] = source = _Stored(pack, stored)
-            with reading(source.where, InvalidFeatures, "labels with a codebook, or a grid"):
-                channels.setdefault(_check_specs(source.specs), source.where)
+                raise ValueError(f"each view in one pack, got {view!r} in {sources[view].path} and {pack.path}")
+            sources[view] = source
+            channels.setdefault(source.channels(), source.where)
         if len(sources) > MAX_VIEWS:
             raise ValueError(f"at most {MAX_VIEWS} views, got {len(sources)} up to {pack.path}; {FEWER_VIEWS}")
     if not sources:
-        raise ValueError(f"at least one view, got {len(packs)} packs without any")
+        raise ValueError("at least one view, got no pack")
     if len(channels) > 1:
         got = " and ".join(f"{count} in {place}" for count, place in list(channels.items())[:2])
         raise ValueError(f"the same channels in every view, got {got}")
@@ -263,47 +254,47 @@ def write_pack(
     for view in views:
         require_name(view, "the name of a view", InvalidFeatures)
     with whole_file(path) as handle:
-        if table is None:
-            return _write(handle, views, metadata, progress)
-        extra_tensors = {TABLE: torch.from_numpy(table.embeddings).half()}
-        _write(handle, views, {**metadata, "words": json.dumps(table.words)}, progress, extra_tensors)
+        _write(handle, views, metadata, progress, table)
 
 
 def _write(
     handle: IO[bytes],
     views: Mapping[str, ViewFeatures],
     metadata: Mapping[str, str],
-    progress: Progress,
-    extra_tensors: Mapping[str, Tensor] = MappingProxyType({}),
+    progress: Progress = silent,
+    table: TableEncoder | None = None,
 ) -> None:
-    specs = [(name, value.dtype, tuple(value.shape)) for name, value in extra_tensors.items()]
-    fits = set[str]()
-
-    def iterate_reported() -> Iterator[tuple[str, ViewFeatures]]:
-        for count, (view, features) in enumerate(views.items(), start=1):
-            yield view, features
-            fits.update([features.fit] if isinstance(features, FeatureGrid) else [])
-            specs.extend((f"{view}/{part}", value.dtype, tuple(value.shape)) for part, value in _parts(features))
-            progress("check", count, len(views), "views")
-
-    _check_channels(iterate_reported())
+    words = {} if table is None else {TABLE: torch.from_numpy(table.embeddings).half()}
+    specs = [(name, tensor.dtype, tuple(tensor.shape)) for name, tensor in words.items()]
+    channels, fits = dict[int, str](), set[str]()
+    for count, (view, features) in enumerate(views.items(), start=1):
+        channels.setdefault(features.codebook.shape[1], view)
+        fits.update([features.fit] if isinstance(features, FeatureGrid) else [])
+        specs += [(f"{view}/{part}", tensor.dtype, tuple(tensor.shape)) for part, tensor in _parts(features)]
+        progress("check", count, len(views), "views")
+    _check_channels(channels)
     if len(fits) > 1:
-        raise InvalidFeatures(
-            "views", expected="one fit of all maps of a pack", got=", ".join(map(repr, sorted(fits)))
-        )
+        got, hint = ", ".join(map(repr, sorted(fits))), "write the maps of each fit as a pack of their own"
+        raise InvalidFeatures("views", expected="one fit of all maps of a pack", got=got, hint=hint)
+    if table is not None:
+        metadata = {**metadata, "words": json.dumps(table.words)}
     if fits - {""}:
         metadata = {**metadata, FIT: fits.pop()}
     header, offsets = safetensors_header(specs, metadata)
     if len(header) > MAX_HEADER_BYTES:
-        raise InvalidFeatures("views", expected="fewer views in a pack", got=str(len(views)))
+        hint = "write several packs: a lift reads them as one"
+        raise InvalidFeatures("views", expected="fewer views in a pack", got=str(len(views)), hint=hint)
     handle.write(header)
-    for name, tensor in extra_tensors.items():
+
+    def write(name: str, tensor: Tensor) -> None:
         handle.seek(len(header) + offsets[name])
         handle.write(tensor_bytes(tensor))
+
+    for name, tensor in words.items():
+        write(name, tensor)
     for count, (view, features) in enumerate(views.items(), start=1):
         for part, tensor in _parts(features):
-            handle.seek(len(header) + offsets[f"{view}/{part}"])
-            handle.write(tensor_bytes(tensor))
+            write(f"{view}/{part}", tensor)
         progress("pack", count, len(views), "views")
 
 
@@ -317,13 +308,12 @@ def _parts(features: ViewFeatures) -> Iterator[tuple[str, Tensor]]:
         yield "grid", features.grid
 
 
-def _check_channels(views: Iterable[tuple[str, ViewFeatures]]) -> None:
-    channels: dict[int, str] = {}
-    for view, features in views:
-        channels.setdefault(features.codebook.shape[1], view)
+def _check_channels(channels: Mapping[int, str]) -> None:
+    """Refuse several numbers of channels, each with the name of a view that has it."""
     if len(channels) > 1:
         got = ", ".join(f"{count} in {view!r}" for count, view in list(channels.items())[:3])
-        raise InvalidFeatures("features", expected="the same channels in every view", got=got)
+        hint = "lift the views of each encoder by themselves"
+        raise InvalidFeatures("features", expected="the same channels in every view", got=got, hint=hint)
 
 
 def _spooled(pairs: Iterable[tuple[str, ViewFeatures]]) -> Views:
@@ -337,26 +327,22 @@ def _spooled(pairs: Iterable[tuple[str, ViewFeatures]]) -> Views:
     with scratch_folder("splatlift-views-") as folder:
         files: dict[str, Path] = {}
         for pair in iter(next_pair, end):
-            if not (isinstance(pair, tuple | list) and len(pair) == 2):
-                got = type(pair).__name__
-                raise InvalidFeatures("features", expected="pairs of a name and a view", got=got)
-            name, features = pair
-            (name,) = _composed_names([name])
-            if name in files:
-                raise InvalidFeatures("features", expected="each view once", got=f"{name!r} twice")
-            files[name] = folder / f"{len(files)}.safetensors"
+            with reading("features", InvalidFeatures, "pairs of a name and a view"):
+                name, features = pair
+                (name,) = _composed_names([name])
+                if name in files:
+                    raise ValueError(f"each view once, got {name!r} twice")
             view = _MemoryView({name: features}, name).read()
+            files[name] = folder / f"{len(files)}.safetensors"
             try:
                 with files[name].open("wb") as handle:
-                    _write(handle, {name: view}, {}, silent)
+                    _write(handle, {name: view}, {})
             except OSError as error:
-                if error.errno not in NO_ROOM:
-                    raise
                 hint = "set TMPDIR to a folder with more room, or give a mapping of views, which is read as it is"
                 expected, got = f"room for an iterator's views in {folder}", error.strerror or str(error)
                 raise Unavailable("features", expected=expected, got=got, hint=hint) from error
         if not files:
-            raise InvalidFeatures("features", expected="at least one view", got="none")
+            raise InvalidFeatures("features", expected="at least one view", got="an iterator of none")
         return replace(read_features(*files.values()), paths=())  # mapped: the files may lose their names
 
 
@@ -381,8 +367,11 @@ class _MemoryView:
     name: str
 
     @property
-    def shapes(self) -> Shapes:
-        return {part: tuple(tensor.shape) for part, tensor in _parts(self.read())}
+    def shapes(self) -> Mapping[str, tuple[int, ...]]:
+        features = self.read()
+        if isinstance(features, FeatureGrid):
+            return {"grid": tuple(features.grid.shape)}
+        return {"labels": tuple(features.labels.shape), "codebook": tuple(features.codebook.shape)}
 
     @property
     def fit(self) -> str:
@@ -401,132 +390,98 @@ class _MemoryView:
 
 
 @dataclass(frozen=True)
-class _PackFile:
-    path: Path
-    handle: Any  # an open safetensors mapping
-    specs: dict[str, TensorSpec]
-    metadata: dict[str, str]
-    views: list[str]
-
-
-@dataclass(frozen=True)
-class _Stored:
+class _PackView:
     """A view of a pack."""
 
-    pack: _PackFile
-    name: str
+    path: Path  # of the pack
+    name: str  # in the pack
+    fit: str
+    parts: dict[str, np.ndarray] = field(default_factory=dict)  # mapped
 
     @property
     def where(self) -> str:
-        return f"{self.pack.path} view {self.name!r}"
+        return f"{self.path} view {self.name!r}"
 
     @property
-    def specs(self) -> dict[str, TensorSpec]:
-        keys = {part: f"{self.name}/{part}" for part in PARTS}
-        return {part: self.pack.specs[key] for part, key in keys.items() if key in self.pack.specs}
+    def shapes(self) -> Mapping[str, tuple[int, ...]]:
+        return {part: array.shape for part, array in self.parts.items()}
 
-    @property
-    def shapes(self) -> Shapes:
-        return {part: spec.shape for part, spec in self.specs.items()}
-
-    @property
-    def fit(self) -> str:
-        return self.pack.metadata.get(FIT, "") if "grid" in self.specs else ""
+    def channels(self) -> int:
+        """Check types and shapes, and return F."""
+        with reading(self.where, InvalidFeatures, "labels with a codebook, or a grid"):
+            if set(self.parts) not in ({"grid"}, {"labels", "codebook"}):
+                raise ValueError(f"labels with a codebook, or a grid, got {' with '.join(self.parts)}")
+            sides = check_arrays(self.parts, SCHEMA)
+            if not all(sides.values()) or sides["F"] > MAX_CHANNELS:
+                raise ValueError(f"at most {MAX_CHANNELS} channels, and no side empty, got {self.shapes}")
+            return sides["F"]
 
     def read(self) -> ViewFeatures:
-        tensor = self.pack.handle.get_tensor
-        if "grid" in self.specs:
-            return FeatureGrid(tensor(f"{self.name}/grid"), fit=cast("Any", self.fit), context=self.where)
-        stored = tensor(f"{self.name}/labels")
-        labels = stored.to(torch.int32)
-        if stored.dtype == torch.uint8:
+        if "grid" in self.parts:
+            return FeatureGrid(_tensor(self.parts["grid"]), fit=cast("Any", self.fit), context=self.where)
+        stored = self.parts["labels"]
+        labels = stored.astype(np.int32)
+        if stored.dtype == np.uint8:
             labels[stored == U8_NO_LABEL] = NO_LABEL
-        return Regions(labels, tensor(f"{self.name}/codebook"), context=self.where)
+        return Regions(labels, _tensor(self.parts["codebook"]), context=self.where)
 
 
-def _open(path: Path) -> _PackFile:
-    from safetensors import SafetensorError, safe_open
+def _tensor(array: np.ndarray) -> Tensor:
+    """Return mapped floats as a tensor; NumPy has no bfloat16, and reads two bytes a number."""
+    if array.dtype == np.dtype("V2"):
+        return torch.from_numpy(array.view(np.int16)).view(torch.bfloat16)
+    return torch.from_numpy(array)
 
-    expected, hint = "a feature pack (.safetensors)", "make packs with 'splatlift pack'"
+
+@dataclass(frozen=True)
+class _Pack:
+    path: Path
+    views: Mapping[str, _PackView]
+    metadata: Mapping[str, str]
+    embeddings: np.ndarray | None  # of its own words
+
+
+def _open(path: Path) -> _Pack:
     try:
-        with reading(path, InvalidFeatures, expected, hint):
+        with reading(path, InvalidFeatures, EXPECTED, "make packs with 'splatlift pack'"):
             check_header(path)
-            try:
-                handle: Any = safe_open(str(path), framework="pt")
-                names = handle.keys()
-                if len(names) > MAX_TENSORS:
-                    limit = f"at most {MAX_VIEWS} views, of two tensors each"
-                    raise ValueError(f"{limit}, got {len(names)} tensors; {FEWER_VIEWS}")
-                slices = {name: handle.get_slice(name) for name in names}
-                specs = {
-                    name: TensorSpec(part.get_dtype(), _axes(name, part.get_shape())) for name, part in slices.items()
-                }
-                return _PackFile(path, handle, specs, handle.metadata() or {}, _view_names(names))
-            except SafetensorError as error:
-                raise ValueError(f"{expected}, got a file that does not open as one ({str(error)[:120]})") from None
+            arrays, metadata = map_tensors(path)
+            if len(arrays) > MAX_TENSORS:
+                limit = f"at most {MAX_VIEWS} views, of two tensors each"
+                raise ValueError(f"{limit}, got {len(arrays)} tensors; {FEWER_VIEWS}")
+            embeddings, views = arrays.pop(TABLE, None), dict[str, _PackView]()
+            for key, array in arrays.items():
+                name, _, part = key.rpartition("/")
+                if not name or part not in SCHEMA:
+                    raise ValueError(f"tensors 'VIEW/labels' with 'VIEW/codebook', or 'VIEW/grid', got {key[:120]!r}")
+                view = views.setdefault(name, _PackView(path, name, metadata.get(FIT, "")))
+                values = without_unit_axes(array, len(SCHEMA[part][1].split()))
+                view.parts[part] = values[None] if part == "labels" and values.ndim == 2 else values
+            if not views:
+                raise ValueError(f"{EXPECTED}, got one without views")
     except InvalidFeatures as error:
-        raise wrong_kind(path, "features", InvalidFeatures, expected=expected) or error from None
+        raise wrong_kind(path, "features", InvalidFeatures, expected=EXPECTED) or error from None
+    return _Pack(path, views, metadata, embeddings)
 
 
-def _axes(name: str, shape: Sequence[int]) -> tuple[int, ...]:
-    """Return the shape of a tensor of a pack with the axes of its part: others of length 1 before them go, and labels
-    [h, w] are one level.
-    """
-    part = name.rpartition("/")[2]
-    extra = len(shape) - len(PARTS[part][1].split()) if part in PARTS else 0
-    if part == "labels" and extra == -1:
-        return (1, *shape)
-    return tuple(shape[extra:]) if extra > 0 and all(side == 1 for side in shape[:extra]) else tuple(shape)
-
-
-def _view_names(tensors: Sequence[str]) -> list[str]:
-    views: dict[str, None] = {}
-    for key in tensors:
-        view, _, part = key.rpartition("/")
-        if key == TABLE and len(tensors) > 1:
-            continue
-        if not view or part not in PARTS:
-            raise ValueError(f"tensors 'VIEW/labels' with 'VIEW/codebook', or 'VIEW/grid', got {key[:120]!r}")
-        views[view] = None
-    return list(views)
-
-
-def _check_specs(specs: Mapping[str, TensorSpec]) -> int:
-    """Check the header of one view; its channels."""
-    if set(specs) not in ({"grid"}, {"labels", "codebook"}):
-        raise ValueError(f"labels with a codebook, or a grid, got {' with '.join(specs)}")
-    lengths = check_arrays(specs, PARTS)
-    if not all(lengths.values()) or lengths["F"] > MAX_CHANNELS:
-        got = " with ".join(f"{part} {list(spec.shape)}" for part, spec in specs.items())
-        raise ValueError(f"no side empty, and at most {MAX_CHANNELS} channels, got {got}")
-    return lengths["F"]
-
-
-def _table(packs: Sequence[_PackFile], channels: int) -> TableEncoder | None:
+def _table(packs: Sequence[_Pack], channels: int) -> TableEncoder | None:
     """Return the words that the packs bring, the same in all that bring some."""
     tables: dict[Path, TableEncoder] = {}
     for pack in packs:
-        if TABLE not in pack.specs:
+        if pack.embeddings is None:
             continue
-        argument = f"{pack.path} {TABLE}"
-        rows = pack.handle.get_tensor(TABLE)
-        rows = (rows.float() if rows.dtype == torch.bfloat16 else rows).numpy()
-        try:
-            table = TableEncoder.of(f"words of {pack.path.name}", pack.metadata.get("words", "null"), rows)
-        except InvalidTable as error:
-            raise InvalidFeatures(argument, expected=error.expected, got=error.got, hint=error.hint) from None
+        name = f"words of {pack.path.name}"
+        tables[pack.path] = table = TableEncoder.of(name, pack.metadata.get("words", "null"), pack.embeddings)
+        first = next(iter(tables))
         if table.channels != channels:
-            expected = f"{channels} channels, as its views have"
-            raise InvalidFeatures(argument, expected=expected, got=str(table.channels))
-        first = next(iter(tables), pack.path)
-        tables[pack.path] = table
+            raise ValueError(f"words of {channels} channels, as its views, got {table.channels} in {pack.path}")
         if table.words != tables[first].words or (table.embeddings != tables[first].embeddings).any():
             hint = "write the masks of all views into one pack"
             raise ValueError(f"one table in all packs, got two in {first} and {pack.path}; {hint}")
     return next(iter(tables.values()), None)
 
 
-def _shared_metadata(packs: Sequence[_PackFile], key: str) -> str:
+def _shared_metadata(packs: Sequence[_Pack], key: str) -> str:
     values = {pack.metadata.get(key, ""): pack.path for pack in packs}
     paths = {value: path for value, path in values.items() if value}
     if len(paths) > 1:

@@ -5,6 +5,7 @@ An engine runs the steps.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import re
@@ -38,8 +39,9 @@ from liftcore.runtime.folders import scratch_folder
 from liftcore.runtime.progress import Timings
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
-from liftcore.values.pack import NO_ROOM, Views, write_pack
+from liftcore.values.pack import Views, write_pack
 
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 PACKED = 64  # views of a pack
 PIECES = re.compile("blocks-[0-9a-f]{64}")  # the folder of the pieces of one lift
 PACKAGES = ("lifting", "raster", "scene", "solve", "values")  # whose code computes pieces
