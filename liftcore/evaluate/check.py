@@ -469,12 +469,7 @@ def _check_features(
             rows.append([_edges(flipped, photo) for flipped in (labels, labels[:, ::-1], labels[::-1])])
     figures, wrong = {}, unlike_maps(grids)
     if grids:
-        figures_of_maps = smoothness(grids)
-        figures |= {
-            "neighbouring_cells": figures_of_maps.neighbours,
-            "any_two_cells": figures_of_maps.all_pairs,
-            **figures_of_maps.readings,
-        }
+        figures |= smoothness(grids)
     if rows:
         edges, *flipped = np.median(np.array(rows), axis=0).tolist()
         mirrored = max(flipped)

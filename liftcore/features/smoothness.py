@@ -7,57 +7,43 @@ smooth only in the right order.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from liftcore.values.views import FeatureGrid, ViewFeatures
 
-MIN_SMOOTHNESS = 0.1  # least `Smoothness.share` of a map of a photo
+MIN_SMOOTHNESS = 0.1  # of a map of a photo: excess of the neighbours' cosine, as a share of the largest possible one
 READINGS = {"[F, h, w]": (1, 2, 0), "[w, h, F]": (1, 0, 2)}  # shapes of the same bytes, and their axes h, w, F
 SAMPLED_VIEWS = 4  # views whose grids are checked; fewer grids are not
 
 
-@dataclass(frozen=True)
-class Smoothness:
-    """Mean cosines of the cells of maps, medians over the maps."""
-
-    neighbours: float  # of neighbouring cells
-    all_pairs: float  # of any two cells
-    readings: dict[str, float]  # of neighbouring cells, if the bytes are read in another order of axes
-
-    @property
-    def share(self) -> float:
-        """Excess of the neighbours' cosine over that of all pairs, as a fraction of the largest possible excess."""
-        return (self.neighbours - self.all_pairs) / max(1 - self.all_pairs, 1e-6)
-
-
-def smoothness(grids: Sequence[np.ndarray]) -> Smoothness:
-    """Measure the smoothness of one or more maps [h, w, F] f32."""
+def smoothness(grids: Sequence[np.ndarray]) -> dict[str, float]:
+    """Return medians over maps [h, w, F] f32 of mean cosines of neighbouring cells and of any two cells, and of
+    neighbours where the bytes are read in another order of axes, by READINGS.
+    """
     rows = []
     for grid in grids:
-        readings = [
-            _mean_cosines(grid.reshape(np.array(grid.shape)[np.argsort(axes)]).transpose(axes))[0]
-            for axes in READINGS.values()
-        ]
-        rows.append([*_mean_cosines(grid), *readings])
-    neighbours, all_pairs, *reading_means = np.median(np.array(rows), axis=0).tolist()
-    return Smoothness(neighbours, all_pairs, dict(zip(READINGS, reading_means, strict=True)))
+        sides = np.array(grid.shape)
+        readings = (grid.reshape(sides[np.argsort(axes)]).transpose(axes) for axes in READINGS.values())
+        rows.append([*_mean_cosines(grid), *(_mean_cosines(reading)[0] for reading in readings)])
+    medians = np.median(np.array(rows), axis=0).tolist()
+    return dict(zip(("neighbouring_cells", "any_two_cells", *READINGS), medians, strict=True))
 
 
 def unlike_maps(grids: Sequence[np.ndarray]) -> list[str]:
     """Return warnings about maps [h, w, F] whose neighbouring cells are not similar."""
     if not grids:
         return []
-    statistics = smoothness(grids)
-    best = max(statistics.readings, key=lambda reading: statistics.readings[reading])
-    cosine = f"neighbouring cells have a mean cosine of {statistics.neighbours:.2f}"
-    if statistics.readings[best] - statistics.neighbours > MIN_SMOOTHNESS:
-        reading_note = f"read as {best}, of {statistics.readings[best]:.2f}, so the bytes have that order"
+    figures = smoothness(grids)
+    neighbours, any_two = figures["neighbouring_cells"], figures["any_two_cells"]
+    best = max(READINGS, key=figures.__getitem__)
+    cosine = f"neighbouring cells have a mean cosine of {neighbours:.2f}"
+    if figures[best] - neighbours > MIN_SMOOTHNESS:
+        reading_note = f"read as {best}, of {figures[best]:.2f}, so the bytes have that order"
         option = "--layout chw (in Python layout='chw')"
         hint = f"pack maps with channels first with {option}, and write others from contiguous arrays"
         return [f"features: {cosine}, {reading_note}; {hint}"]
-    if statistics.share < MIN_SMOOTHNESS:
+    if neighbours - any_two < MIN_SMOOTHNESS * max(1 - any_two, 1e-6):
         return [f"features: {cosine}, like any two cells, so the maps have no relation to the photos"]
     return []
 
