@@ -146,15 +146,11 @@ def read_mask(segmentation: Any, size: tuple[int, int] | None) -> StoredMask | N
     if segmentation is None or segmentation == []:
         return None
     if isinstance(segmentation, list):
-        return stored_mask(fill_polygons(_known_size(size), read_polygons(segmentation)))
+        if size is None:
+            hint = "give the image's width and height, or masks as run lengths"
+            raise ValueError(f"the size of the image of a polygon, got none; {hint}")
+        return stored_mask(fill_polygons(check_size(size), read_polygons(segmentation)))
     return read_runs(segmentation)
-
-
-def _known_size(size: tuple[int, int] | None) -> tuple[int, int]:
-    if size is None:
-        hint = "give the image's width and height, or masks as run lengths"
-        raise ValueError(f"the size of the image of a polygon, got none; {hint}")
-    return check_size(size)
 
 
 def read_polygons(segmentation: Any) -> list[np.ndarray]:

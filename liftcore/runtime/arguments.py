@@ -16,7 +16,6 @@ from liftcore.errors import InvalidInput, InvalidSettings, SplatliftError
 
 _CHARACTERS = 80  # of each name, and of the text, that are compared and printed
 _MAX_NAMES = 2000  # names that are compared; longer lists would delay other requests
-_MAX_CHARACTERS = 40_000  # of the compared names, each counted as long as the longest: a fifth of a second
 _DEVICE_NUMBER = re.compile(r"cuda:([0-9]{1,4})")
 
 
@@ -90,6 +89,5 @@ def nearest(text: str, names: Iterable[str], count: int) -> str:
     """
     text, cut = text[:_CHARACTERS], [name[:_CHARACTERS] for name in islice(names, _MAX_NAMES)]
     begin = [name for name in cut if text and name.startswith(f"{text} ")]
-    limit = _MAX_CHARACTERS // max(1, *map(len, cut), 1)
-    ranked = get_close_matches(text, cut[:limit], count, cutoff=0.0)
+    ranked = get_close_matches(text, cut, count, cutoff=0.0)
     return f"nearest: {', '.join(list(dict.fromkeys([*begin, *ranked]))[:count])}"

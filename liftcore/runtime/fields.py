@@ -101,13 +101,8 @@ def _error_of(
     if first["type"] == "literal_error":
         expected = one_of(re.findall(r"'([^']*)'", expected))
     elif place and place[0] in model.model_fields and first["type"] in ("greater_than_equal", "less_than_equal"):
-        low, high = bounds_of(model.model_json_schema()["properties"][place[0]])
+        schema = model.model_json_schema()["properties"][place[0]]
+        parts = [schema, *schema.get("anyOf", ())]
+        low, high = (next((part[name] for part in parts if name in part), None) for name in ("minimum", "maximum"))
         expected = f"{low} to {high}" if None not in (low, high) else expected
     return error_type(".".join(place) or model.__name__.lower(), expected=expected, got=got, hint=hint)
-
-
-def bounds_of(schema: dict[str, Any]) -> tuple[Any, Any]:
-    """Return the minimum and the maximum of a field, by its JSON schema; None for no bound."""
-    parts = [schema, *schema.get("anyOf", ())]
-    low, high = (next((part[name] for part in parts if name in part), None) for name in ("minimum", "maximum"))
-    return low, high

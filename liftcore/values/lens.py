@@ -25,9 +25,14 @@ def as_pinhole_sees(observation: ViewFeatures, camera: Camera) -> ViewFeatures:
     """
     if camera.lens is None:
         return observation
-    if isinstance(observation, Regions):
-        return Regions.unchecked(_labels(observation.labels, camera), observation.codebook)
-    return FeatureGrid.unchecked(_grid(observation.grid, camera))
+    pinhole = _Pinhole(camera.lens, camera.width, camera.height, camera.cx, camera.cy)
+    if isinstance(observation, FeatureGrid):
+        return FeatureGrid.unchecked(
+            _grid(observation.grid, pinhole, grid_sides(*observation.grid.shape[:2], camera))
+        )
+    places = _label_places(pinhole, *observation.labels.shape[1:])
+    labels = observation.labels.flatten(1).index_select(1, places)
+    return Regions.unchecked(labels.reshape(-1, camera.height, camera.width), observation.codebook)
 
 
 def grid_sides(height: int, width: int, camera: Camera) -> tuple[int, int]:
@@ -37,12 +42,6 @@ def grid_sides(height: int, width: int, camera: Camera) -> tuple[int, int]:
         return height, width
     rows, columns = height * camera.height / photo.height, width * camera.width / photo.width
     return max(1, round(rows)), max(1, round(columns))
-
-
-def _labels(labels: Tensor, camera: Camera) -> Tensor:
-    """Return [L, H, W] i32 of labels [L, h, w] of the photo."""
-    places = _label_places(_pinhole(camera), labels.shape[1], labels.shape[2])
-    return labels.flatten(1).index_select(1, places).reshape(labels.shape[0], camera.height, camera.width)
 
 
 @lru_cache(maxsize=KEPT_PINHOLES)
@@ -60,14 +59,13 @@ def _label_places(pinhole: "_Pinhole", height: int, width: int) -> Tensor:
     return torch.from_numpy(places.ravel())
 
 
-def _grid(grid: Tensor, camera: Camera) -> Tensor:
+def _grid(grid: Tensor, pinhole: "_Pinhole", sides: tuple[int, int]) -> Tensor:
     """Return [rows, columns, F] of a grid [h, w, F] of the photo, of its dtype."""
-    height, width, channels = grid.shape
-    rows, columns = grid_sides(height, width, camera)
+    (height, width, channels), (rows, columns) = grid.shape, sides
     centres = np.meshgrid(
-        (np.arange(columns) + 0.5) * camera.width / columns, (np.arange(rows) + 0.5) * camera.height / rows
+        (np.arange(columns) + 0.5) * pinhole.width / columns, (np.arange(rows) + 0.5) * pinhole.height / rows
     )
-    x, y = _shares(*centres, _pinhole(camera))
+    x, y = _shares(*centres, pinhole)
     u, v = (x * width - 0.5).clip(0, width - 1), (y * height - 0.5).clip(0, height - 1)
     left, top = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
     cells = grid.reshape(-1, channels)
@@ -94,12 +92,6 @@ class _Pinhole(NamedTuple):
     height: int
     cx: float
     cy: float
-
-
-def _pinhole(camera: Camera) -> _Pinhole:
-    if camera.lens is None:
-        raise ValueError("the camera has no lens")
-    return _Pinhole(camera.lens, camera.width, camera.height, camera.cx, camera.cy)
 
 
 def _shares(u: np.ndarray, v: np.ndarray, pinhole: _Pinhole) -> tuple[np.ndarray, np.ndarray]:

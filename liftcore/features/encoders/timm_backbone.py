@@ -128,7 +128,8 @@ def _from_file(label: str, name: str, path: Path) -> Any:
 
 
 def _not_weights(label: str, name: str, path: Path, got: str) -> InvalidInput:
-    return InvalidInput(label, expected=f"only tensors of {name} in {path.name}", got=got[:200])
+    hint = "save the state_dict() of timm's model alone, as safetensors"
+    return InvalidInput(label, expected=f"only tensors of {name} in {path.name}", got=got[:200], hint=hint)
 
 
 def _unexplained(model: Any, keys: Iterable[str]) -> list[str]:
