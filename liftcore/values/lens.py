@@ -27,9 +27,8 @@ def as_pinhole_sees(observation: ViewFeatures, camera: Camera) -> ViewFeatures:
         return observation
     pinhole = _Pinhole(camera.lens, camera.width, camera.height, camera.cx, camera.cy)
     if isinstance(observation, FeatureGrid):
-        return FeatureGrid.unchecked(
-            _grid(observation.grid, pinhole, grid_sides(*observation.grid.shape[:2], camera))
-        )
+        height, width = observation.grid.shape[:2]
+        return FeatureGrid.unchecked(_grid(observation.grid, pinhole, grid_sides(height, width, camera)))
     places = _label_places(pinhole, *observation.labels.shape[1:])
     labels = observation.labels.flatten(1).index_select(1, places)
     return Regions.unchecked(labels.reshape(-1, camera.height, camera.width), observation.codebook)
