@@ -185,6 +185,9 @@ def test_result_goes_only_with_a_job_that_is_deleted_with_it(store: Store) -> No
     assert store.lift(ANNA, job.id).file.is_file()
     store.delete_job(ANNA, job.id, with_result=True)
     assert list((store.root / "lifts").iterdir()) == []
+    for lift, message in ((None, "at least one lift"), (job.id, "the id of a lift")):
+        with pytest.raises(NotFound, match=message):
+            store.lift(ANNA, lift)
 
 
 def test_revoked_key_follows_no_job_and_its_queued_jobs_are_canceled(store: Store) -> None:

@@ -123,6 +123,7 @@ def test_labels_are_columns_with_names_and_boxes(lift: Path, table: list[object]
         box = entry["oriented_box"]
         sides = (splats.means.numpy()[inside] - box["centre"]) @ np.array(box["axes"]).T
         assert (np.abs(sides) <= np.array(box["half_sizes"]) + 1e-5).all()
+        assert np.linalg.det(box["axes"]) == pytest.approx(1)  # right-handed, each of length one
 
 
 def test_objects_are_written_one_by_one_and_as_a_table(lift: Path, tmp_path: Path) -> None:
