@@ -24,12 +24,14 @@ from liftcore.runtime.one_thread import one_thread
 from liftcore.solve.clusters import principal_axes
 
 MOST_CODES = 8_192
-FIRST_CODES = 2_048  # at least: 1,024 lost .003 of accuracy and .004 of mIoU (`tabletop`, hard, 13 views)
+LEAST_CODES = 512  # where as many features differ: mixtures at borders are few, and would go first
+LEAST_SPLATS = 4_096  # with a feature
 SAMPLE = 1 << 17  # splats of which groups are made
 HELD_OUT = 8  # each eighth of them measures the loss, and makes no group
 CHANNELS = 64  # principal directions in which groups are cut
 ROUNDS = 3  # of 2-means that place a cut
-MOST_LOSS = 0.045  # 1 - cosine about the mean, of held-out splats by weight
+SMALL_LOSS = 0.01  # 1 - cosine about the mean, of held-out splats by weight, from which there are no more groups
+MOST_LOSS = 0.045  # likewise, with which features stay exact
 LEAST_SAVED = 2  # times smaller that codes and codebook must be than features
 BLOCK = 8_192  # rows converted to float32 at once
 
@@ -66,25 +68,24 @@ def code_features(features: np.ndarray, has_feature: np.ndarray, total_weight: n
     rows = np.flatnonzero(has_feature)
     rows = rows[:: -(-len(rows) // SAMPLE) or 1]
     most_groups = min(MOST_CODES - 1, len(features) // LEAST_SAVED - 1)  # one is zero
-    if len(rows) < LEAST_SAVED * (FIRST_CODES + 1):
+    if len(rows) < LEAST_SPLATS:
         return f"Features are exact: {len(rows)} splats with a feature are too few to share codes."
-    unit, weights = _unit(features[rows]), np.sqrt(np.maximum(total_weight[rows], 1e-6)).astype(np.float64)
+    root_weights = has_feature * np.sqrt(np.maximum(total_weight, np.float32(1e-6)))
+    unit, weights = _unit(features[rows]), root_weights[rows]
     with one_thread():
         centre = (weights @ unit / weights.sum()).astype(np.float32)
         axes = principal_axes(unit[::HELD_OUT] - centre, CHANNELS)
     points, offsets = _points(features, rows, centre, axes), unit - centre
-    training = np.where(np.arange(len(rows)) % HELD_OUT > 0, weights, 0.0)
-    cuts, groups, loss = list[_Cut](), np.zeros(len(rows), np.int32), np.inf
-    while loss > MOST_LOSS and (cut := _cut(points, training, groups, most_groups)) is not None:
+    training = np.where(np.arange(len(rows)) % HELD_OUT > 0, weights, np.float32(0.0))
+    cuts, groups, loss = list[_Cut](), np.zeros(len(rows), np.int32), 1.0
+    while (loss > SMALL_LOSS or groups.max() < LEAST_CODES) and (
+        cut := _cut(points, training, groups, most_groups)
+    ) is not None:
         cuts, groups = [*cuts, cut], cut.place(points, groups)
-        loss = _loss(offsets, training, weights, groups) if groups.max() >= FIRST_CODES - 1 else np.inf
-    loss = loss if np.isfinite(loss) else _loss(offsets, training, weights, groups)  # fewer features than that differ
+        loss = _loss(offsets, training, weights, groups)
     if loss > MOST_LOSS:
         return f"Features are exact: as codes their mean cosine about the scene's mean would be {1 - loss:.3f}."
-    sums = _sums(groups, weights, features[rows].astype(np.float32))
-    codebook = np.zeros((len(sums) + 1, features.shape[1]), features.dtype)
-    codebook[1:] = sums / np.maximum(np.bincount(groups, weights), 1e-30)[:, None]
-    code = np.zeros(len(features), np.uint16)
+    code, count = np.zeros(len(features), np.uint16), int(groups.max()) + 2
 
     def place(block: np.ndarray) -> None:
         groups, points = np.zeros(len(block), np.int32), _points(features, block, centre, axes)
@@ -93,7 +94,12 @@ def code_features(features: np.ndarray, has_feature: np.ndarray, total_weight: n
         code[block] = groups + 1
 
     _over_blocks(place, np.flatnonzero(has_feature))
-    return Codes(code, codebook, float(loss))
+    sums = np.zeros((count, features.shape[1]))  # of all splats: a sample has ten a group
+    for first in range(0, len(code), BLOCK):
+        block = slice(first, first + BLOCK)
+        sums += _sums(code[block], root_weights[block], features[block].astype(np.float32), count)
+    codebook = sums / np.maximum(np.bincount(code, root_weights, count), 1e-30)[:, None]
+    return Codes(code, codebook.astype(features.dtype), float(loss))
 
 
 def _cut(points: np.ndarray, weights: np.ndarray, groups: np.ndarray, most_groups: int) -> _Cut | None:
@@ -134,7 +140,7 @@ def _loss(offsets: np.ndarray, training: np.ndarray, weights: np.ndarray, groups
 
 
 def _sums(groups: np.ndarray, weights: np.ndarray, values: np.ndarray, count: int | None = None) -> np.ndarray:
-    """Return the sums [K, D] f64 of weighted values [n, D] of each group."""
+    """Return the sums [K, D] of weighted values [n, D] of each group, in their type."""
     count, number = int(groups.max()) + 1 if count is None else count, len(groups)
     return csr_array((weights, groups, np.arange(number + 1)), shape=(number, count)).T @ values
 
