@@ -354,15 +354,15 @@ REGIONS = {"v/labels": LABELS, "v/codebook": BOOK}
 FEATURE_FILES = [
     ("empty", b"", "empty file"),
     ("text", b"short", "begins with"),
-    ("truncated", save({"v/grid": ONES})[:-1], "open"),
+    ("truncated", save({"v/grid": ONES})[:-1], "not fully covered"),
     ("a tensor twice", safetensors(f"{{{GRID_TEXT},{GRID_TEXT}}}".encode()) + bytes(8), "twice"),
     ("no channels", tensors(0, v__grid=tensor([1, 1, 0], 0, 0)), "empty"),
-    ("no views", save({}), "at least one view"),
+    ("no views", save({}), "no tensor"),
     ("unknown part", save({"v/depth": ONES}), "'v/depth'"),
     ("codebook alone", save({"v/codebook": BOOK}), "codebook"),
     ("labels beside a grid", save(REGIONS | {"v/grid": ONES}), "with grid"),
-    ("grid of two sides", save({"v/grid": BOOK}), "[h, w, F]"),
-    ("labels of floats", save({"v/labels": ONES, "v/codebook": BOOK}), "I16"),
+    ("grid of two sides", save({"v/grid": BOOK}), "[h w F]"),
+    ("labels of floats", save({"v/labels": ONES, "v/codebook": BOOK}), "u1 i2 i4"),
     ("views of other channels", save({"v/grid": ONES, "w/grid": np.ones((1, 1, 4), np.float32)}), "channels"),
     ("label beyond the codebook", save(REGIONS | {"v/labels": LABELS + 4}), "the label 4"),
     ("NaN in a codebook", save(REGIONS | {"v/codebook": BOOK * np.nan}), "finite"),
@@ -372,7 +372,7 @@ FEATURE_FILES = [
 ]
 FEATURE_BOMBS = [
     ("header of 2^63 bytes", safetensors(b"{}", 2**63), "header"),
-    ("deep header", safetensors(b'{"a":' * 100_000), "open"),
+    ("deep header", safetensors(b'{"a":' * 100_000), "recursion limit"),
 ]
 
 WORD = {"embeddings": tensor([1, 1], 0, 4)}
