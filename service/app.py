@@ -7,6 +7,7 @@ import logging
 import re
 import secrets
 import sys
+import threading
 import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
@@ -95,6 +96,18 @@ def create_app(settings: ServiceSettings, store: Store) -> FastAPI:
 class Application(FastAPI):
     """The application, whose OpenAPI document names the problem of errors."""
 
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._documents, self._turn = dict[bool, bytes](), threading.Lock()
+
+    def document(self, *, asks_for_keys: bool) -> bytes:
+        """Return the document as JSON. It is made once, as that takes a second of computation."""
+        with self._turn:
+            if asks_for_keys not in self._documents:
+                document = with_keys(self.openapi()) if asks_for_keys else self.openapi()
+                self._documents[asks_for_keys] = json.dumps(document).encode()
+        return self._documents[asks_for_keys]
+
     def openapi(self) -> dict[str, Any]:
         """Return the document; the first sentence of each description is the summary."""
         if self.openapi_schema is None:
@@ -104,7 +117,7 @@ class Application(FastAPI):
             for operations_of_path in document["paths"].values():
                 for operation in operations_of_path.values():
                     operation["summary"] = re.split(r"\.\s", operation["description"])[0].rstrip(".")
-            self.openapi_schema = with_keys(document)
+            self.openapi_schema = document
         return self.openapi_schema
 
 
@@ -137,22 +150,17 @@ class Recorder:
             await self._app(scope, receive, send)
             return
         start, status, sent_bytes, is_replaced = time.monotonic(), 0, 0, False
+        scope["headers"] = [  # an unknown unit means the whole (RFC 9110), and starlette refuses it
+            (name, value)
+            for name, value in scope["headers"]
+            if name != b"range" or value.lower().startswith(b"bytes=")
+        ]
         request_id = request_id_of(scope)
 
         async def send_marked(message: Message) -> None:
-            nonlocal status, sent_bytes, is_replaced
-            if is_replaced:
-                return
+            nonlocal status, sent_bytes
             if message["type"] == "http.response.start":
-                status, headers = message["status"], Headers(raw=message["headers"])
-                if status >= HTTPStatus.BAD_REQUEST and headers.get("content-type", "").startswith("text/plain"):
-                    # The framework refuses in plain text.
-                    names = {"Content-Range": headers["content-range"]} if "content-range" in headers else None
-                    await answer_to(HTTPException(status, headers=names), scope["path"][:200])(
-                        scope, receive, send_marked
-                    )
-                    is_replaced = True
-                    return
+                status = message["status"]
                 message = {**message, "headers": list(message.get("headers", ()))}
                 headers = MutableHeaders(raw=message["headers"])
                 for name, value in SAFE_HEADERS.items():
@@ -161,10 +169,23 @@ class Recorder:
             await send(message)
             sent_bytes += len(message.get("body", b""))
 
+        async def send_problem(message: Message) -> None:
+            """Send a problem in place of a refusal of the framework in plain text."""
+            nonlocal is_replaced
+            if message["type"] == "http.response.start" and message["status"] >= HTTPStatus.BAD_REQUEST:
+                headers = Headers(raw=message["headers"])
+                if headers["content-type"].startswith("text/plain"):
+                    is_replaced = True
+                    range_header = {"Content-Range": headers["content-range"]} if "content-range" in headers else None
+                    error = HTTPException(message["status"], headers=range_header)
+                    await answer_to(error, scope["path"][:200])(scope, receive, send_marked)
+            if not is_replaced:
+                await send_marked(message)
+
         token = REQUEST_ID.set(request_id)
         try:
             try:
-                await self._app(scope, receive, send_marked)
+                await self._app(scope, receive, send_problem)
             except Exception as error:
                 if status:  # the answer has begun: the connection is closed
                     raise

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, computed_field
+from pydantic_core import PydanticCustomError
 
 from liftcore import Answer, LiftSettings, Objects, Picture, Query, SceneNode, WorldFrame
 from liftcore.errors import InvalidSettings
@@ -31,8 +32,10 @@ from liftcore.models import (
 # Limits of one file or request. JSON is parsed in the event loop, where each megabyte may take .3 s.
 BODY_BYTES = 256 << 10
 BITS_BYTES = 1 << 20  # of a body with a bit a splat
-WORD_CHARACTERS = 1000  # of a word, or a query's text
+WORD_CHARACTERS = 1000  # of a word, of a query's text, and of a pack's names
+FILE_CHARACTERS = 4 << 20  # of all names, or all words, of a file: a hundred thousand of 40
 NAME_CHARACTERS = 100  # that people give to lifts, selections and keys
+TEXT_CHARACTERS = 4000  # of the texts of a question together: an encoder takes seconds for more
 PACKS = 64  # of a lift
 SETTINGS = 100  # of a lift
 MAX_TEXTS = 32  # texts, or examples, of a question
@@ -250,7 +253,6 @@ class Lift(BaseModel):
     created: Seconds
     file: Path = Field(exclude=True)
     parameters: dict[str, Any] = Field(exclude=True)
-    labels: dict[str, dict[str, Any]] = Field(exclude=True)  # of objects, by number: `ObjectLabel`
 
     @computed_field
     @property
@@ -318,14 +320,15 @@ class Tradeoff(BaseModel):
     table: str = Field(description="the runs as Markdown, with a summary and the protocol")
     created: Seconds
 
-    @classmethod
-    def of_row(cls, row: dict[str, Any]) -> Self:
-        """Return the trade-off of a row, in which the document of the comparison stands beside its own columns."""
-        inputs = {name: row[name] for name in ("id", "splats", "cameras", "features", "created")}
-        return cls(**row["metadata"] | inputs | {"labels": row["parameters"].get("labels")})
-
 
 # Queries: the models of liftcore, with the lift, the encoder, and limits of HTTP
+
+
+def _at_most(texts: list[str]) -> list[str]:
+    if (count := sum(map(len, texts))) > TEXT_CHARACTERS:
+        context = {"expected": f"texts of at most {TEXT_CHARACTERS} characters together, which are {count}"}
+        raise PydanticCustomError("too_long_together", "{expected}", context)
+    return texts
 
 
 def _query_field(name: str) -> Any:
@@ -335,7 +338,7 @@ def _query_field(name: str) -> Any:
 
 
 # Only the first error is reported: a list of a hundred thousand items must not make as many errors.
-Texts = Annotated[list[Text], Field(max_length=MAX_TEXTS, fail_fast=True)]
+Texts = Annotated[list[Text], Field(max_length=MAX_TEXTS, fail_fast=True), AfterValidator(_at_most)]
 Numbers = Annotated[
     tuple[Annotated[float, Field(allow_inf_nan=False, strict=True)], ...],
     Field(min_length=1, max_length=VECTOR, fail_fast=True),

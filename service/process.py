@@ -12,6 +12,7 @@ import fcntl
 import importlib
 import json
 import logging
+import math
 import os
 import resource
 import signal
@@ -30,6 +31,8 @@ from service.errors import FULL, Busy, Fault, InvalidRequest, NoSpace, ProcessDi
 
 TASKS = "service.tasks"  # what a spare child has imported
 TICK_SECONDS = 0.2  # until a cancel, a stop or a limit is noticed
+STOPPED_SECONDS = 2.0  # after which a stopped process (SIGSTOP) is given up
+STOPPED = "its process was stopped"
 GONE_SECONDS = 3.0  # for the kernel to end a process group
 ORDERS = 100  # of a child, then a fresh one takes its place: what libraries keep does not add up
 TRIES = 3  # of an order that a request waits for, whose process is killed
@@ -96,8 +99,38 @@ class Child:
                 return
 
     def is_alive(self) -> bool:
-        """Return True if it has not ended."""
-        return self._process.poll() is None
+        """Return True if it has neither ended nor been stopped."""
+        return self._process.poll() is None and not self.is_stopped()
+
+    def is_stopped(self) -> bool:
+        """Return True if it was stopped (SIGSTOP), as Linux reports it: it lives and does not respond."""
+        with contextlib.suppress(OSError):
+            state = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()[0]
+            return state in ("T", "t")
+        return False
+
+    @contextlib.contextmanager
+    def watched(self, why_end: Callable[[], str]) -> Iterator[list[str]]:
+        """End it in the block once there is a reason, or it stays stopped; yield a list that gets the reason."""
+        reasons, is_done, stopped_since = list[str](), threading.Event(), math.inf
+
+        def watch() -> None:
+            nonlocal stopped_since
+            while not reasons and not is_done.wait(TICK_SECONDS):
+                now = time.monotonic()
+                stopped_since = min(stopped_since, now) if self.is_stopped() else math.inf
+                reason = STOPPED if now - stopped_since > STOPPED_SECONDS else why_end()
+                if reason:
+                    reasons.append(reason)
+                    self.end()
+
+        watcher = threading.Thread(target=watch, daemon=True)
+        watcher.start()
+        try:
+            yield reasons
+        finally:
+            is_done.set()
+            watcher.join()
 
     def end(self) -> int:
         """Kill the group; return the status, negative for a signal. No process of it is left after this.
@@ -171,30 +204,22 @@ class Children:
         child, last = self._take(), None
         if not reusable:
             self._keep(None)  # for checks beside it, and for the next job
-        deadline, reasons, is_done = time.monotonic() + seconds, list[str](), threading.Event()
+        deadline = time.monotonic() + seconds
 
-        def watch() -> None:
-            while not reasons and not is_done.wait(TICK_SECONDS):
-                if self.stopping.is_set():
-                    reasons.append("the server stops")
-                elif time.monotonic() > deadline:
-                    reasons.append(f"it took more than {seconds:g} s")
-                elif reason := why_end():
-                    reasons.append(reason)
-            if reasons:
-                child.end()
+        def reason_now() -> str:
+            if self.stopping.is_set():
+                return "the server stops"
+            return f"it took more than {seconds:g} s" if time.monotonic() > deadline else why_end()
 
-        watcher = threading.Thread(target=watch, daemon=True)
-        watcher.start()
+        reasons = list[str]()
         try:
-            for message in child.messages(order):
-                if is_last(message):
-                    last = message
-                else:
-                    take(message)
+            with child.watched(reason_now) as reasons:
+                for message in child.messages(order):
+                    if is_last(message):
+                        last = message
+                    else:
+                        take(message)
         finally:
-            is_done.set()
-            watcher.join()
             if last is not None and reusable and not reasons and child.orders < self._orders:
                 self._keep(child)
                 status = 0
@@ -207,7 +232,7 @@ class Children:
         if last is not None:
             return Ending(last)
         ending = f"signal {-status}" if status < 0 else f"status {status}"
-        was_killed = not reasons and status == -signal.SIGKILL
+        was_killed = reasons == [STOPPED] or (not reasons and status == -signal.SIGKILL)
         return Ending(None, "".join(reasons) or f"its process ended with {ending}", was_killed)
 
     def check(self, order: Message, seconds: float, argument: str) -> Message:
@@ -216,10 +241,10 @@ class Children:
         All tries together have the seconds.
         """
         deadline = time.monotonic() + seconds
-        ending = Ending(None, was_killed=True)
-        for _ in range(TRIES):
-            if ending.was_killed:
-                ending = self.run(order, deadline - time.monotonic(), reusable=True)
+        ending = self.run(order, seconds, reusable=True)
+        for _ in range(TRIES - 1):
+            if ending.was_killed and (left := deadline - time.monotonic()) > 0:
+                ending = self.run(order, left, reusable=True)
         if ending.last is not None:
             if "fault" in ending.last:
                 raise Fault(ending.last["fault"])
@@ -254,7 +279,11 @@ class Children:
                 child.end()
                 child.close()
                 child = None
-            child = child or self._start()
+            try:
+                child = child or self._start()
+            except OSError as error:
+                got = f"none: {error.strerror}"
+                raise Busy("server", expected="room for a process", got=got, hint="send it again") from None
             self._running.add(child)
         return child
 

@@ -58,7 +58,6 @@ MASK_PIXELS = 1 << 26  # of all views of an export: a minute, as for the largest
 WORD_FILES = {"labels": "splat_labels", "map": "labels", "picture": "picture"}
 SPLATS_FILES = {"object": "object", "scores": "coloured"}
 VIEW_LINKS = ("render", "mask", "attention")  # links of an answer that end with a view
-UNLABELLED = {"name": None, "hidden": False}
 Request = dict[str, Any]
 
 
@@ -236,7 +235,7 @@ class Answers:
         tree, labels = self._named_tree(request), request["object_labels"]
         first, last = request["first"], request["first"] + request["count"]
         objects = [
-            item.model_dump(mode="json") | _object_label(labels.get(str(item.id), UNLABELLED))
+            item.model_dump(mode="json") | {"hidden": False} | _object_label(labels.get(str(item.id)))
             for item in tree.objects[first:last]
         ]
         count = len(tree.objects)
@@ -318,9 +317,7 @@ class Answers:
 
     def _labelled_objects(self, request: Request) -> SceneTree:
         """Return the tree of a lift with the names that people gave."""
-        labels = {
-            label["id"]: {"name": label["name"]} for label in request["object_labels"].values() if label["name"]
-        }
+        labels = {int(number): {"name": name} for number, (name, _) in request["object_labels"].items() if name}
         tree = self._named_tree(request)
         return tree.model_copy(
             update={"nodes": tuple(item.model_copy(update=labels.get(item.id)) for item in tree.nodes)}
@@ -333,9 +330,12 @@ def _select(scene: Scene, name: str, bits: str) -> Any:
     return scene.select(name).edit(Edit(operation="set", bits=bits))
 
 
-def _object_label(label: dict[str, Any]) -> dict[str, Any]:
-    """Return what the label of an object says: whether it is hidden, and its name, which has no score."""
-    return {"hidden": label["hidden"]} | ({"name": label["name"], "score": None} if label["name"] else {})
+def _object_label(label: list[Any] | None) -> dict[str, Any]:
+    """Return the label of an object: whether it is hidden, and its name, which has no score."""
+    if label is None:
+        return {}
+    name, is_hidden = label
+    return {"hidden": is_hidden} | ({} if name is None else {"name": name, "score": None})
 
 
 def _key(request: Request, *names: str) -> str:
@@ -347,7 +347,10 @@ def _key(request: Request, *names: str) -> str:
 
 def json_of(document: dict[str, Any]) -> bytes:
     """Return a document as JSON, which has no infinite numbers: boxes of huge splats may hold them."""
-    return json.dumps(finite(document), allow_nan=False, separators=(",", ":")).encode()
+    try:
+        return json.dumps(document, allow_nan=False, separators=(",", ":")).encode()
+    except ValueError:
+        return json.dumps(finite(document), allow_nan=False, separators=(",", ":")).encode()
 
 
 def compressed(blocks: Iterable[bytes]) -> Iterable[bytes]:

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from liftcore.errors import InvalidLift, NotFound
+from liftcore.files import require_pairs
 from service.errors import Conflict, InvalidRequest
-from service.models import Key, Lift, NewShare, Share
-from service.store import LIFTS, RESULTS, VALID, Owner, Store, create_key, sync
+from service.models import Key, Lift, NewShare, Share, Tradeoff
+from service.store import LIFTS, VALID, VISIBLE, Owner, Store, create_key, sync
 
 MOST_SHARES = 100  # valid keys of one lift
 
@@ -26,13 +27,13 @@ def change_lift(store: Store, owner: Owner, lift: str, changes: dict[str, Any]) 
         if "world" in changes:
             changes = changes | {"world": json.dumps(changes["world"] or {})}
         for column in changes.keys() & {"name", "photos", "world"}:
-            connection.execute(f"UPDATE results SET {column} = ? WHERE id = ?", (changes[column] or None, lift))
+            connection.execute(f"UPDATE lifts SET {column} = ? WHERE id = ?", (changes[column] or None, lift))
     return store.lift(owner, lift)
 
 
 def find_lift_file(store: Store, owner: Owner, sha256: str) -> Lift | None:
     """Return the lift of a file with that digest; None if there is none."""
-    rows = store.rows(f"{LIFTS} AND sha256 = :sha256 LIMIT 1", sha256=sha256, **vars(owner))
+    rows = store.rows(f"{LIFTS} WHERE {VISIBLE} AND sha256 = :sha256 LIMIT 1", sha256=sha256, **vars(owner))
     return Lift.of_row(rows[0]) if rows else None
 
 
@@ -43,13 +44,17 @@ def add_lift(store: Store, owner: Owner, draft: Path, content: dict[str, Any], c
     splats_id, own_cameras, *packs = [f"sha256:{file['sha256']}" for file in files]
     order = {"kind": "lift", "splats": splats_id, "cameras": cameras or own_cameras, "settings": metadata["settings"],
              "features": [pack for pack in packs if store.find_asset(owner, pack)], "parameters": {}}  # fmt: skip
-    if store.asset(owner, splats_id, "splats").counts["splats"] != metadata["count"]:
-        raise InvalidLift("lift", expected="a row for each splat", got=f"{metadata['count']} rows")
+    splats = store.asset(owner, splats_id, "splats")
+    if splats.counts["splats"] != content["count"]:
+        got = f"{content['count']} for {splats.counts['splats']} splats"
+        raise InvalidLift("lift", expected="a row for each splat", got=got)
     try:
-        store.asset(owner, order["cameras"], "cameras")
+        seen_views = store.asset(owner, order["cameras"], "cameras").counts.get("names")
     except NotFound as error:
         hint = "PUT its file of cameras first; in place of a folder a zip of it, named here as ?cameras=ID"
         raise NotFound(error.argument, expected=error.expected, got=error.got, hint=hint) from None
+    if seen_views is not None and metadata["views"]:
+        require_pairs(metadata["views"], seen_views)
     sync(draft)
     now = time.time()
     with store.write():
@@ -57,17 +62,20 @@ def add_lift(store: Store, owner: Owner, draft: Path, content: dict[str, Any], c
             store.asset(owner, asset)
             store.own_asset(owner.owner, asset)
         job = store.insert_job(owner.owner, order, state="succeeded", attempt=1, started=now)
-        store.insert_result(job, content, draft.rename(draft.with_suffix(".safetensors")))
+        store.insert_lift(job, content, draft, store.root / "lifts" / f"{job}.safetensors")
     return store.lift(owner, job)
 
 
-def get_tradeoff(store: Store, owner: Owner, tradeoff: str) -> dict[str, Any]:
-    """Return the row of the trade-off of that id; its file is the chart."""
-    rows = store.rows(f"{RESULTS} 'tradeoff' AND id = :id", id=tradeoff, **vars(owner))
+def get_tradeoff(store: Store, owner: Owner, tradeoff: str) -> tuple[Tradeoff, bytes]:
+    """Return the trade-off of that id, and its chart as a PNG."""
+    rows = store.rows("SELECT * FROM tradeoffs WHERE id = :id", id=tradeoff)
     if not rows:
         hint = "POST /tradeoff makes one; it has its job's id"
         raise NotFound("tradeoff", expected="the id of a trade-off", got=tradeoff[:80], hint=hint)
-    return rows[0]
+    job, result = store.job(owner, tradeoff), rows[0]["document"]
+    inputs = {"splats": job.splats, "cameras": job.cameras, "features": job.features}
+    fields = {"id": job.id, **inputs, "labels": job.parameters.get("labels"), "created": job.ended}
+    return Tradeoff.model_validate({**result["document"], "table": result["page"], **fields}), rows[0]["chart"]
 
 
 # Keys shared for one lift

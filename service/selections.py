@@ -122,13 +122,20 @@ def _update(connection: sqlite3.Connection, selection: str, **columns: Any) -> N
 # Labels of objects
 
 
+def object_labels(store: Store, lift: str) -> list[ObjectLabel]:
+    """Return the labels that people gave to objects of the lift."""
+    return [ObjectLabel(**row) for row in store.rows("SELECT * FROM objects WHERE lift = :lift", lift=lift)]
+
+
 def change_object_label(
     store: Store, owner: Owner, lift: str, object_id: int, changes: dict[str, Any]
 ) -> ObjectLabel:
     """Set the ``name`` of an object (None: its own), or ``hidden``."""
     with store.write() as connection:
-        labels = store.lift(owner, lift).labels
-        label = ObjectLabel.model_validate({"id": object_id} | labels.get(str(object_id), {}) | changes)
-        document = json.dumps(labels | {str(object_id): label.model_dump()})
-        connection.execute("UPDATE results SET labels = ? WHERE id = ?", (document, lift))
-    return label
+        store.lift(owner, lift)
+        connection.execute("INSERT OR IGNORE INTO objects (lift, id) VALUES (?, ?)", (lift, object_id))
+        for column in changes.keys() & {"name", "hidden"}:
+            update = f"UPDATE objects SET {column} = ? WHERE lift = ? AND id = ?"
+            connection.execute(update, (changes[column], lift, object_id))
+    select = "SELECT * FROM objects WHERE lift = :lift AND id = :id"
+    return ObjectLabel(**store.rows(select, lift=lift, id=object_id)[0])

@@ -107,19 +107,22 @@ def encoder_spec(settings: ServiceSettings, text_space: str, requested: str | No
     """
     if requested == "default":
         return settings.encoder
+    if requested in (None, text_space) and text_space == OWN_WORDS:
+        return OWN_WORDS
     if requested not in (None, text_space):
-        if requested in settings.text_spaces:
-            return settings.text_spaces[requested]
-        raise InvalidRequest(
-            "encoder", expected="the name of a text space that the operator set up", got=repr(requested),
-            hint=f"known here: {', '.join(['default', *sorted(settings.text_spaces)])}",
-        )  # fmt: skip
-    encoders = {space: encoder for encoder, space in BUILT_IN.items()}
-    if text_space != NO_WORDS and "encoder" in settings.model_fields_set:
-        encoders = {text_space: settings.encoder}
-    encoders |= {settings.encoder: settings.encoder, **settings.text_spaces, OWN_WORDS: OWN_WORDS}
-    if text_space in encoders:
-        return encoders[text_space]
+        if requested not in settings.text_spaces:
+            raise InvalidRequest(
+                "encoder", expected="the name of a text space that the operator set up", got=repr(requested),
+                hint=f"known here: {', '.join(['default', *sorted(settings.text_spaces)])}",
+            )  # fmt: skip
+        return settings.text_spaces[requested]
+    if text_space in settings.text_spaces:
+        return settings.text_spaces[text_space]
+    if text_space == settings.encoder or (text_space != NO_WORDS and "encoder" in settings.model_fields_set):
+        return settings.encoder
+    for encoder, space in BUILT_IN.items():
+        if text_space == space:
+            return encoder
     if text_space == NO_WORDS:
         raise InvalidRequest(
             "lift", expected="features that share a space with a text encoder", got="text space 'none'",

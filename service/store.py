@@ -14,10 +14,11 @@ import os
 import secrets
 import shutil
 import sqlite3
+import stat
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from service.errors import REQUEST_ID, Busy, Conflict, KeyReused, Misconfigured,
 from service.models import FINAL_STATES, Asset, Job, Key, Lift
 
 DATABASE = "service.sqlite"
-VERSION = 22  # SQLite's user_version
+VERSION = 21  # SQLite's user_version
 SCHEMA = """
 CREATE TABLE IF NOT EXISTS assets (
     id TEXT, owner TEXT, kind TEXT NOT NULL, bytes INTEGER NOT NULL, file TEXT NOT NULL,
@@ -43,37 +44,41 @@ CREATE TABLE IF NOT EXISTS events (
     number INTEGER PRIMARY KEY AUTOINCREMENT, job TEXT NOT NULL REFERENCES jobs (id) ON DELETE CASCADE,
     kind TEXT NOT NULL, data TEXT NOT NULL) STRICT;
 CREATE INDEX IF NOT EXISTS events_of_job ON events (job, number);
-CREATE TABLE IF NOT EXISTS results (
+CREATE TABLE IF NOT EXISTS lifts (
     id TEXT PRIMARY KEY REFERENCES jobs (id) ON DELETE CASCADE, name TEXT, photos TEXT, world TEXT,
-    labels TEXT NOT NULL DEFAULT '{}', file TEXT NOT NULL, bytes INTEGER NOT NULL, sha256 TEXT NOT NULL,
-    metadata TEXT NOT NULL) STRICT;
-CREATE INDEX IF NOT EXISTS results_by_digest ON results (sha256);
+    file TEXT NOT NULL, bytes INTEGER NOT NULL, sha256 TEXT NOT NULL, count INTEGER NOT NULL,
+    channels INTEGER NOT NULL, metadata TEXT NOT NULL) STRICT;
+CREATE INDEX IF NOT EXISTS lifts_by_digest ON lifts (sha256);
+CREATE TABLE IF NOT EXISTS tradeoffs (
+    id TEXT PRIMARY KEY REFERENCES jobs (id) ON DELETE CASCADE, document TEXT NOT NULL, chart BLOB NOT NULL) STRICT;
 CREATE TABLE IF NOT EXISTS keys (
     id TEXT PRIMARY KEY, name TEXT NOT NULL, digest TEXT NOT NULL UNIQUE, scopes TEXT NOT NULL, lifts TEXT NOT NULL,
     maker TEXT, created REAL NOT NULL, expires REAL, revoked REAL) STRICT;
 CREATE TABLE IF NOT EXISTS selections (
-    id TEXT PRIMARY KEY, lift TEXT NOT NULL REFERENCES results (id) ON DELETE CASCADE, name TEXT NOT NULL,
+    id TEXT PRIMARY KEY, lift TEXT NOT NULL REFERENCES lifts (id) ON DELETE CASCADE, name TEXT NOT NULL,
     version INTEGER NOT NULL, step INTEGER NOT NULL, created REAL NOT NULL, changed REAL NOT NULL) STRICT;
 CREATE INDEX IF NOT EXISTS selections_of_lift ON selections (lift);
 CREATE TABLE IF NOT EXISTS steps (
     selection TEXT NOT NULL REFERENCES selections (id) ON DELETE CASCADE, number INTEGER NOT NULL,
     count INTEGER NOT NULL, box TEXT, bits BLOB NOT NULL, PRIMARY KEY (selection, number)) STRICT;
+CREATE TABLE IF NOT EXISTS objects (
+    lift TEXT NOT NULL REFERENCES lifts (id) ON DELETE CASCADE, id INTEGER NOT NULL, name TEXT,
+    hidden INTEGER NOT NULL DEFAULT 0, PRIMARY KEY (lift, id)) STRICT;
 """
 MAX_ATTEMPTS = 3  # that count against a job
 BUSY_SECONDS = 10.0  # that a write waits for another process
 RESERVE_BYTES = 1 << 20  # of a file that is given free on a full disk: a delete writes before it makes room
 JSON_COLUMNS = frozenset(
     ("counts", "warnings", "features", "settings", "parameters", "plan", "progress", "problem", "world", "metadata",
-     "labels", "lifts", "box")
+     "document", "lifts", "box")
 )  # fmt: skip
 # Whose records count: those of others are absent. A key with shared lifts sees these, too.
 VISIBLE = "(:admin OR owner = :owner OR id IN (SELECT value FROM json_each(:lifts)))"
 VALID = "revoked IS NULL AND (expires IS NULL OR expires > :now)"
-RESULTS = (
-    "SELECT * FROM (SELECT results.*, owner, kind, splats, cameras, features, parameters, ended AS created"
-    f" FROM results JOIN jobs USING (id)) WHERE {VISIBLE} AND kind ="
+LIFTS = (
+    "SELECT * FROM (SELECT lifts.*, owner, splats, cameras, features, parameters, ended AS created"
+    " FROM lifts JOIN jobs USING (id))"
 )
-LIFTS = f"{RESULTS} 'lift'"
 
 log = logging.getLogger(__name__)
 
@@ -118,6 +123,7 @@ class Store:
         self._readers: list[sqlite3.Connection] = []
         try:
             self._writer = connect(self.root / DATABASE)
+            self._identity = self._identify()
             self._put_back()
             with self._room_to_delete():
                 pass
@@ -139,8 +145,14 @@ class Store:
         for name in ("blobs", "lifts", "work", "tmp"):
             (self.root / name).mkdir(exist_ok=True)
 
+    def _identify(self) -> tuple[int, int]:
+        status = (self.root / DATABASE).stat()
+        return status.st_dev, status.st_ino
+
     def require_usable(self) -> None:
-        """Require that the database can be written, and that the disk has room."""
+        """Require that the database is the file that was opened and can be written, and that the disk has room."""
+        if self._identify() != self._identity:
+            raise sqlite3.OperationalError("another file is in the place of the database")
         self.require_room()
         with self.write() as connection:
             connection.execute(f"PRAGMA user_version = {VERSION}")
@@ -194,7 +206,7 @@ class Store:
     ) -> tuple[list[dict[str, Any]], str | None]:
         """Return so many records after a cursor, newest first, and the cursor of the next page; None at the end."""
         created, _, after = ("inf", "", "") if cursor is None else cursor.partition("~")
-        select = LIFTS if table == "lifts" else f"SELECT * FROM {table} WHERE {VISIBLE}"
+        select = f"{LIFTS if table == 'lifts' else f'SELECT * FROM {table}'} WHERE {VISIBLE}"
         if table == "assets":  # without names of views, which may be a hundred thousand
             counts = "json_remove(counts, '$.names', '$.words') AS counts"
             select = f"SELECT id, kind, bytes, file, {counts}, warnings, min(created) AS created" + (
@@ -252,7 +264,7 @@ class Store:
 
     def unnamed_files(self) -> list[Path]:
         """Return the files that no row names, as a crash between a file and its row leaves them."""
-        names = {row["file"] for row in self.rows("SELECT file FROM assets UNION SELECT file FROM results")}
+        names = {row["file"] for row in self.rows("SELECT file FROM assets UNION SELECT file FROM lifts")}
         jobs = {row["id"] for row in self.rows("SELECT id FROM jobs WHERE ended IS NULL")}
         files = [path for name in ("blobs", "lifts") for path in (self.root / name).iterdir() if path not in names]
         return files + [folder for folder in (self.root / "work").iterdir() if folder.name not in jobs]
@@ -293,7 +305,7 @@ class Store:
             record = self.asset(owner, asset)
             with self.write() as connection:
                 users = self.rows(
-                    f"SELECT id FROM jobs LEFT JOIN results USING (id) WHERE {VISIBLE} AND instr(splats || cameras ||"
+                    f"SELECT id FROM jobs LEFT JOIN lifts USING (id) WHERE {VISIBLE} AND instr(splats || cameras ||"
                     " features || parameters || coalesce(photos, ''), :asset) LIMIT 4",
                     asset=asset, **vars(owner),
                 )  # fmt: skip
@@ -393,31 +405,35 @@ class Store:
 
     def finish(self, job: Job, result: dict[str, Any], draft: Path) -> None:
         """Store the result and the success of a job together; a job that is being canceled gets none."""
-        path = self.result_file(job.id, draft)
-        sync(draft)
+        path = self.root / "lifts" / f"{job.id}.safetensors"
+        if job.kind == "lift":
+            sync(draft)
         try:
-            with self.write():
-                is_canceled = self.job(SERVICE, job.id).state == "canceling"
-                if not is_canceled:
-                    self.insert_result(job.id, result, draft)
-                self._move(job.id, "canceled" if is_canceled else "succeeded")
+            with self.write() as connection:
+                if self.job(SERVICE, job.id).state == "canceling":
+                    self._move(job.id, "canceled")
+                elif job.kind == "lift":
+                    self.insert_lift(job.id, result, draft, path)
+                    self._move(job.id, "succeeded")
+                else:
+                    row = (job.id, json.dumps(result), draft.read_bytes())
+                    connection.execute("INSERT INTO tradeoffs VALUES (?, ?, ?)", row)
+                    self._move(job.id, "succeeded")
         except BaseException:
             if path.exists() and not draft.exists():  # the next attempt to store it finds the draft again
                 path.replace(draft)
             raise
 
-    def result_file(self, job: str, draft: Path) -> Path:
-        """Return the place of a job's result."""
-        return self.root / "lifts" / f"{job}{draft.suffix}"
-
-    def insert_result(self, job: str, result: dict[str, Any], draft: Path) -> None:
-        """Move a synced file of a lift, or a chart, to its place and add its row, within a transaction."""
-        size, path = draft.stat().st_size, self.result_file(job, draft)
+    def insert_lift(self, job: str, result: dict[str, Any], draft: Path, path: Path) -> None:
+        """Move a synced lift file to its place and add its row, within a transaction."""
+        size = draft.stat().st_size
         draft.replace(path)
         sync(path.parent)
-        row = (job, f"lifts/{path.name}", size, result["sha256"], json.dumps(result["metadata"]))
-        insert = "INSERT INTO results (id, file, bytes, sha256, metadata) VALUES (?, ?, ?, ?, ?)"
-        self._writer.execute(insert, row)
+        self._writer.execute(
+            "INSERT INTO lifts (id, file, bytes, sha256, count, channels, metadata) VALUES (?, ?, ?, ?, ?, ?, ?)",
+            (job, f"lifts/{path.name}", size, result["sha256"], result["count"], result["channels"],
+             json.dumps(result["metadata"])),
+        )  # fmt: skip
 
     def end(self, job: Job, problem: dict[str, Any] | None = None, *, retries: bool = False) -> None:
         """End an attempt without a result: the job fails, is put back in line, or is canceled as was asked.
@@ -468,8 +484,7 @@ class Store:
                 )
                 raise Conflict("job", expected=f"a job without a {record.kind}", got=got, hint=hint)
             connection.execute("DELETE FROM jobs WHERE id = ?", (job,))
-        for path in (self.root / "lifts").glob(f"{job}*"):
-            path.unlink()
+        (self.root / "lifts" / f"{job}.safetensors").unlink(missing_ok=True)
         self.forget_work(job)
 
     def forget_work(self, job: str) -> None:
@@ -501,7 +516,7 @@ class Store:
 
     def lift(self, owner: Owner, lift: str | None) -> Lift:
         """Return the lift of that id; the newest one without an id."""
-        select = f"{LIFTS} AND id = coalesce(:id, id) ORDER BY created DESC, id LIMIT 1"
+        select = f"{LIFTS} WHERE {VISIBLE} AND id = coalesce(:id, id) ORDER BY created DESC, id LIMIT 1"
         rows = self.rows(select, id=lift, **vars(owner))
         if rows:
             return Lift.of_row(rows[0])
@@ -532,8 +547,10 @@ def sync(path: Path) -> None:
 
 def require_whole(path: Path, size: int) -> None:
     """Require that a file still has its stored size; a pipe in its place would block."""
-    if path.is_file() and path.stat().st_size == size:
-        return
+    with suppress(OSError):
+        status = path.stat()
+        if stat.S_ISREG(status.st_mode) and status.st_size == size:
+            return
     hint = "it was deleted a moment ago, or something else wrote there: upload it again, or lift again"
     expected = f"a file of {size} bytes in the data directory"
     raise NotFound("content", expected=expected, got="none, or one of another size", hint=hint)

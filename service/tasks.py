@@ -10,7 +10,7 @@ import json
 import logging
 import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,21 +27,22 @@ from liftcore import (
     load_lift,
     open_engine,
     plan_files,
+    read_features,
 )
-from liftcore.errors import InvalidInput, InvalidLift, SplatliftError
+from liftcore.errors import InvalidFeatures, InvalidInput, InvalidLift, SplatliftError
 from liftcore.evaluate import inspect_file
 from liftcore.files import finite, identify, is_zip, wrong_kind
 from liftcore.text.table import TableEncoder
 from service.errors import replace_names
+from service.models import FILE_CHARACTERS, VIEW_CHARACTERS, WORD_CHARACTERS
 from service.process import NICENESS
 
 if TYPE_CHECKING:
     from service.process import Reporter
 
 BLOCK_ROWS = 1 << 14  # of a lift, checked at a time
-SHOWN_BYTES = 64 << 10  # of what the database has of a file; of more, these lists are left out
-FILE_BYTES = 5 << 20  # of these lists: a hundred thousand names of 40 characters
-LISTS = ("names", "views", "words", "views_without_camera", "views_without_splats")
+SHOWN_CHARACTERS = 256 << 10  # of names or words in the counts of an asset; more are left out
+SHOWN_BYTES = 64 << 10  # of a lift's metadata in the database; of more, names of views and words are left out
 SHOWN_DIGITS = 12  # of the splats' digest, in the title of a trade-off's chart
 Order = dict[str, Any]
 
@@ -57,15 +58,21 @@ def check(order: Order, report: Reporter) -> dict[str, Any]:
     try:
         if kind == "lift":
             return check_lift(path, order.get("cameras"))
+        extra = EXTRA_CHECKS.get(kind, lambda _: {})(path)
         description = inspect_file(path, kind, trusted=False)
-        counts = {name: value for name, value in description.items() if name not in ("kind", "bytes")}
-        if kind == "table":
-            counts["words"] = list(TableEncoder.open(path).words)
+        counts = {name: value for name, value in description.items() if name not in ("kind", "bytes")} | extra
+        require_texts("view name", counts.get("names", ()), VIEW_CHARACTERS, error_class(kind))
+        require_texts("word", counts.get("words", ()), WORD_CHARACTERS, error_class(kind))
     except SplatliftError as error:
         raise _of_another_kind(kind, path) or error from None
+    except MemoryError:
+        got, expected = "one that needs more", "a file that fits the memory of a check"
+        raise error_class(kind)(kind, expected=expected, got=got) from None
+    for name in ("names", "words"):
+        if sum(map(len, counts.get(name, ()))) > SHOWN_CHARACTERS:
+            del counts[name]
     warnings = [str(warning) for warning in counts.pop("warnings")]
-    counts = shown(finite(counts), error_class(kind))
-    return {"suffix": _suffix(kind, path), "counts": counts, "warnings": warnings}
+    return {"suffix": _suffix(kind, path), "counts": finite(counts), "warnings": warnings}
 
 
 def error_class(kind: str) -> type[InvalidInput]:
@@ -81,18 +88,35 @@ def _suffix(kind: str, path: Path) -> str:
     return ".zip" if kind == "photos" else ".safetensors"
 
 
-def shown(document: dict[str, Any], error: type[InvalidInput]) -> dict[str, Any]:
-    """Return what the database has of a file: of a long document its lists of names and words are left out."""
-    count = len(json.dumps(document))
-    if SHOWN_BYTES < count <= FILE_BYTES:
-        document = {
-            name: value for name, value in document.items() if not (name in LISTS and isinstance(value, list))
-        }
-        count = len(json.dumps(document))
-    if count > SHOWN_BYTES:
-        expected = f"names and words of at most {FILE_BYTES} bytes together, {SHOWN_BYTES} of other descriptions"
-        raise error("file", expected=expected, got=f"{count} bytes", hint="several files hold more")
-    return document
+def require_texts(argument: str, texts: Sequence[str], longest: int, error: type[InvalidInput]) -> None:
+    """Require names or words of a length that a query can have, and lists of a limited length."""
+    for text in texts:
+        if len(text) > longest or not (text or argument == "word"):  # a table may have a row without a word
+            raise error(
+                argument, expected=f"1 to {longest} characters",
+                got=f"{len(text)}: {text[:40]!r}..." if text else "an empty one",
+                hint="name each image, without folders where that is enough" if argument == "view name" else "",
+            )  # fmt: skip
+    if (total := sum(map(len, texts))) > FILE_CHARACTERS:
+        limit = f"at most {FILE_CHARACTERS} characters of all together"
+        raise error(argument, expected=limit, got=f"{total} in {len(texts)}", hint="several files hold more")
+
+
+def check_pack(path: Path) -> dict[str, Any]:
+    """Limit the words and the names that a feature pack brings."""
+    packs = read_features(path)
+    require_texts("word", packs.table.words if packs.table else (), WORD_CHARACTERS, InvalidFeatures)
+    for name in ("encoder", "text_space"):
+        if len(text := getattr(packs, name)) > WORD_CHARACTERS:
+            expected = f"at most {WORD_CHARACTERS} characters"
+            raise InvalidFeatures(name, expected=expected, got=f"{len(text)}: {text[:40]!r}...")
+    return {}
+
+
+EXTRA_CHECKS: dict[str, Callable[[Path], dict[str, Any]]] = {
+    "features": check_pack,
+    "table": lambda path: {"words": list(TableEncoder.open(path).words)},
+}
 
 
 def check_lift(path: Path, cameras: str | None) -> dict[str, Any]:
@@ -112,20 +136,28 @@ def check_lift(path: Path, cameras: str | None) -> dict[str, Any]:
                 raise InvalidLift("lift", expected="finite numbers", got=f"others in {name!r} from row {first} on")
     if "object" in arrays and (missing := set(range(len(arrays["object_views"]))) - set(np.unique(arrays["object"]))):
         raise InvalidLift("lift", expected="splats of each object", got=f"none of object {min(missing)}")
+    require_texts("view name", metadata["views"], VIEW_CHARACTERS, InvalidLift)
+    require_texts("word", metadata["words"], WORD_CHARACTERS, InvalidLift)
     if None in metadata["timings"].values():  # JSON has no infinite numbers
         raise InvalidLift("lift", expected="finite timings", got="others", hint="a list of lifts tells them")
     return lift_content(path, (len(lift), lift.features.shape[1]), metadata)
 
 
 def lift_content(path: Path, shape: Sequence[int], metadata: dict[str, Any]) -> dict[str, Any]:
-    """Return the columns of a lift's row."""
-    sizes = {"count": shape[0], "channels": shape[1], "view_count": len(metadata["views"])}
-    diagnostics = metadata["diagnostics"]
-    metadata = metadata | sizes | {"diagnostics": shown(diagnostics, InvalidLift)}
-    metadata = shown(metadata, InvalidLift)
+    """Return the columns of a lift's row; of long metadata the names of views and the words are left out."""
+    views = metadata["views"]
+    if len(json.dumps(metadata)) > SHOWN_BYTES:
+        metadata = metadata | {"views": [], "words": []}
+        unseen = ("views_without_camera", "views_without_splats")
+        diagnostics = {name: value for name, value in metadata["diagnostics"].items() if name not in unseen}
+        metadata["diagnostics"] = diagnostics
+    if (count := len(json.dumps(metadata))) > SHOWN_BYTES:
+        expected = f"at most {SHOWN_BYTES} bytes of metadata beside the names of views and the words"
+        raise InvalidLift("lift", expected=expected, got=f"{count}")
+    metadata["view_count"] = len(views)
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return {"sha256": digest, "metadata": metadata}
+    return {"sha256": digest, "count": shape[0], "channels": shape[1], "metadata": metadata}
 
 
 def _of_another_kind(kind: str, path: Path) -> InvalidInput | None:
@@ -217,7 +249,6 @@ def tradeoff(order: Order, report: Reporter) -> dict[str, Any]:
         command=f"POST /tradeoff {json.dumps(parameters | {'settings': settings})}",
     )
     with tempfile.TemporaryDirectory(prefix="splatlift-chart-") as folder:
-        chart = next(file for file in tradeoff.save(Path(folder)) if file.suffix == ".png").read_bytes()
-    Path(order["output"]).write_bytes(chart)
-    metadata = {**tradeoff.document, "table": "\n".join(tradeoff.lines()) + "\n"}
-    return {"sha256": hashlib.sha256(chart).hexdigest(), "metadata": metadata}
+        chart = next(file for file in tradeoff.save(Path(folder)) if file.suffix == ".png")
+        Path(order["output"]).write_bytes(chart.read_bytes())
+    return {"document": tradeoff.document, "page": "\n".join(tradeoff.lines()) + "\n"}

@@ -51,7 +51,7 @@ def run(options: argparse.Namespace) -> int:
             _print(options, key.model_dump(), f"key {key.id} of {key.name} is revoked, and its shares")
         else:
             lifts = [lift.strip() for lift in (options.lifts or "").split(",") if lift.strip()]
-            known_lifts = {lift for (lift,) in connection.execute("SELECT id FROM results")}
+            known_lifts = {lift for (lift,) in connection.execute("SELECT id FROM lifts")}
             if unknown := set(lifts) - known_lifts:
                 hint = "GET /lifts lists them"
                 raise NotFound("--lifts", expected="ids of lifts", got=sorted(unknown)[0][:80], hint=hint)

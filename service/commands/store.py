@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> int:
 
 def files_of(data: Path) -> list[tuple[str, int, str]]:
     """Return path below the directory, bytes and sha256 of every file in the database."""
-    select = "SELECT file, bytes, substr(id, 8) FROM assets UNION SELECT file, bytes, sha256 FROM results"
+    select = "SELECT file, bytes, substr(id, 8) FROM assets UNION SELECT file, bytes, sha256 FROM lifts"
     with closing(connect(data / DATABASE, "ro")) as connection:
         return [tuple(row) for row in connection.execute(select)]
 

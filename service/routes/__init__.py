@@ -91,14 +91,12 @@ def unchanged(request: Request, etag: str, *, exists: bool = True) -> Response |
     return Response(status_code=304, headers={"ETag": etag}) if is_same else None
 
 
-def file_answer(
-    request: Request, file: Path, size: int, sha256: str, name: str, media_type: str = BINARY
-) -> Response:
+def file_answer(request: Request, file: Path, size: int, sha256: str, name: str) -> Response:
     """Return a stored file, whose bytes never change, or a range of it."""
     require_whole(file, size)
     etag = f'"{sha256}"'
     headers = cache_headers(etag)
-    return unchanged(request, etag) or FileResponse(file, headers=headers, media_type=media_type, filename=name)
+    return unchanged(request, etag) or FileResponse(file, headers=headers, media_type=BINARY, filename=name)
 
 
 def add_list(

@@ -30,7 +30,7 @@ from service.routes import (
     unchanged,
 )
 from service.routes.assets import UPLOAD, check_upload, in_thread, receive_upload
-from service.routes.queries import NO_ENCODER, NPY, PNG, respond, scene_request, with_encoder
+from service.routes.queries import NO_ENCODER, NPY, PNG, labels_of, respond, scene_request, with_encoder
 from service.settings import encoder_label
 from service.store import SERVICE, Owner
 
@@ -102,7 +102,7 @@ def get_lift_features(lift: str, request: Request, deps: Deps, owner: Caller) ->
 @router.get("/tradeoffs/{tradeoff}", tags=["trade-offs"])
 def get_tradeoff(tradeoff: str, deps: Deps, owner: Caller) -> models.Tradeoff:
     """Get a trade-off: the runs, and the recommended ones."""
-    return models.Tradeoff.of_row(results.get_tradeoff(deps.store, owner, tradeoff))
+    return results.get_tradeoff(deps.store, owner, tradeoff)[0]
 
 
 @router.get(
@@ -110,8 +110,9 @@ def get_tradeoff(tradeoff: str, deps: Deps, owner: Caller) -> models.Tradeoff:
 )  # fmt: skip
 def get_tradeoff_chart(tradeoff: str, request: Request, deps: Deps, owner: Caller) -> Response:
     """Draw accuracy over time, and how near each quality level is to the exact lift, as a picture."""
-    row = results.get_tradeoff(deps.store, owner, tradeoff)
-    return file_answer(request, row["file"], row["bytes"], row["sha256"], f"tradeoff-{tradeoff}.png", PNG)
+    chart = results.get_tradeoff(deps.store, owner, tradeoff)[1]
+    etag = f'"{hashlib.sha256(chart).hexdigest()}"'
+    return unchanged(request, etag) or Response(chart, media_type=PNG, headers=cache_headers(etag))
 
 
 # Keys shared for one lift
@@ -193,7 +194,7 @@ def list_objects(
 ) -> Response:
     """List the objects of the scene, found by masks when it was lifted; a vocabulary names them."""
     record = deps.store.lift(owner, lift)
-    work = _nodes("catalogue", record, deps, owner, options) | {"object_labels": record.labels}
+    work = _nodes("catalogue", record, deps, owner, options) | {"object_labels": labels_of(record, deps)}
     return respond(request, deps, work)
 
 

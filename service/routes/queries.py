@@ -6,6 +6,7 @@ import base64
 import hashlib
 import json
 import os
+import re
 import secrets
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -41,7 +42,7 @@ from service.models import (
     WordsAnswer,
 )
 from service.routes import BINARY, Caller, Deps, OneOf, Parts, cache_headers, content_of, get_and_post, unchanged
-from service.selections import bits_of_selection, get_selection
+from service.selections import bits_of_selection, get_selection, object_labels
 from service.settings import encoder_label, encoder_spec, encoder_version
 from service.store import SERVICE, Owner
 
@@ -269,20 +270,28 @@ def export(parameters: ExportRequest, request: Request, deps: Deps, owner: Calle
     """Export objects, words or questions as a file with labels."""
     lift = deps.store.lift(owner, parameters.lift)
     work: dict[str, Any] = scene_request("export", lift, deps) | NO_ENCODER
+    title = [parameters.of]
     if parameters.of == "questions":
         if not parameters.questions or any(question.lift not in (None, lift.id) for question in parameters.questions):
             raise InvalidRequest("questions", expected="a question or more, to the same lift", got="none, or others")
+        by_name = _by_name(parameters.questions)
         parts = [
             {"name": name, "request": query_request("query", question, lift, deps, owner)}
-            for name, question in _by_name(parameters.questions).items()
+            for name, question in by_name.items()
         ]
-        work |= {"parts": parts}
+        work, title = work | {"parts": parts}, list(by_name)
     elif parameters.of == "words" or parameters.encoder is not None or parameters.table is not None:
         work = word_request("export", parameters, lift, deps, owner)
+    name = "-".join(re.findall(r"[A-Za-z0-9]+", " ".join(title)))[:80] or "splats"
     what, suffix, media_type, _ = EXPORTS[parameters.format]
-    work |= {"of": parameters.of, "of_view": parameters.view, "object_labels": lift.labels}
+    work |= {"of": parameters.of, "of_view": parameters.view, "object_labels": labels_of(lift, deps)}
     work |= {"what": what, "suffix": suffix}
-    return respond(request, deps, work, media_type, f"{parameters.of}-{lift.id}{suffix}")
+    return respond(request, deps, work, media_type, f"{name}-{lift.id}{suffix}")
+
+
+def labels_of(lift: models.Lift, deps: Parts) -> dict[str, tuple[str | None, bool]]:
+    """Return the labels of a lift's objects for the query process: name and whether it is hidden, by number."""
+    return {str(label.id): (label.name, label.hidden) for label in object_labels(deps.store, lift.id)}
 
 
 def _by_name(questions: list[models.NamedQuestion]) -> dict[str, models.NamedQuestion]:
@@ -290,8 +299,12 @@ def _by_name(questions: list[models.NamedQuestion]) -> dict[str, models.NamedQue
     by_name = dict[str, models.NamedQuestion]()
     for question in questions:
         terms = map(example_text, (*question.text, *question.like, *question.sets))
-        name = question.name or ", ".join(terms)
-        by_name[f"{name} {len(by_name) + 1}" if name in by_name else name] = question
+        name = title = question.name or ", ".join(terms)
+        number = 1
+        while name in by_name:
+            number += 1
+            name = f"{title} {number}"
+        by_name[name] = question
     return by_name
 
 
@@ -341,6 +354,6 @@ def render(question: RenderRequest, request: Request, deps: Deps, owner: Caller)
     work = scene_request("render", lift, deps) | seen_from(question) | {"channel": question.channel}
     hide = question.hide and [item for item in question.hide if item]  # `hide=` of an address: none
     if hide is None:
-        hide = [f"object:{number}" for number, label in lift.labels.items() if label["hidden"]]
+        hide = [f"object:{label.id}" for label in object_labels(deps.store, lift.id) if label.hidden]
     work |= {"hide": hide} | with_selections(hide, lift, deps)
     return respond(request, deps, work, PNG)

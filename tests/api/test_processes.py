@@ -59,9 +59,9 @@ def check_of(folder: Path, kind: str, content: bytes, **more: Any) -> dict[str, 
     } | more
 
 
-def kill() -> None:
+def kill(signal_number: int) -> None:
     for process in running():
-        os.kill(process, signal.SIGKILL)
+        os.kill(process, signal_number)
 
 
 def test_child_of_a_check_is_used_again(children: Children, tmp_path: Path) -> None:
@@ -84,10 +84,11 @@ def test_order_beyond_its_time_or_memory_is_refused(children: Children, tmp_path
     assert children.check(check_of(tmp_path, "cameras", cameras_json()), 600, "cameras")["counts"]["views"] == 3
 
 
-def test_children_that_are_killed_are_replaced(children: Children, tmp_path: Path) -> None:
-    until(children.is_ready)
-    kill()
-    assert children.check(check_of(tmp_path, "cameras", cameras_json()), 600, "cameras")["counts"]["views"] == 3
+def test_children_that_are_killed_or_stopped_are_replaced(children: Children, tmp_path: Path) -> None:
+    for signal_number in (signal.SIGKILL, signal.SIGSTOP):
+        until(children.is_ready)
+        kill(signal_number)
+        assert children.check(check_of(tmp_path, "cameras", cameras_json()), 600, "cameras")["counts"]["views"] == 3
 
 
 def test_reason_ends_an_order_with_its_group(children: Children, tmp_path: Path) -> None:
@@ -145,9 +146,9 @@ def fault_of_request(queries: QueryClient) -> dict[str, Any]:
 def test_query_process_that_is_killed_is_replaced(queries: QueryClient) -> None:
     fault = fault_of_request(queries)
     assert fault["status"] in (404, 422) and "/nowhere/lift" not in json.dumps(fault)
-    kill()
+    kill(signal.SIGKILL)
     assert fault_of_request(queries) == fault
-    thread = threading.Thread(target=lambda: (time.sleep(0.05), kill()))
+    thread = threading.Thread(target=lambda: (time.sleep(0.05), kill(signal.SIGKILL)))
     thread.start()
     assert fault_of_request(queries) == fault  # killed while it answers: the next one does
     thread.join()
@@ -176,7 +177,7 @@ def test_calls_beyond_the_line_or_after_the_stop_are_refused(queries: QueryClien
         except (Fault, Busy) as error:
             outcomes.append(type(error))
 
-    kill()  # nobody is answered until it is replaced
+    kill(signal.SIGSTOP)  # nobody is answered until it is replaced
     threads = [threading.Thread(target=ask) for _ in range(30)]
     for thread in threads:
         thread.start()

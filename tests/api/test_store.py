@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 import sqlite3
 import threading
 from collections.abc import Iterator
@@ -65,13 +66,13 @@ def finish(store: Store, job: Job) -> None:
     """End an attempt at a job with a lift."""
     metadata = {
         "version": "0", "settings": {}, "encoder": "", "text_space": "none", "views": [], "view_count": 0,
-        "diagnostics": {}, "timings": {}, "features": [], "count": 1, "channels": 1,
+        "diagnostics": {}, "timings": {}, "features": [],
     }  # fmt: skip
     with store.scratch() as scratch:
         draft = scratch / "lift"
         draft.write_bytes(job.id.encode())
         digest = hashlib.sha256(job.id.encode()).hexdigest()
-        store.finish(job, {"sha256": digest, "metadata": metadata}, draft)
+        store.finish(job, {"sha256": digest, "count": 1, "channels": 1, "metadata": metadata}, draft)
 
 
 def states_of(store: Store, job: str) -> list[str]:
@@ -227,23 +228,32 @@ def test_files_are_on_the_disk_before_their_rows(store: Store, monkeypatch: pyte
     flushed, flush = set[int](), os.fsync
 
     def note(handle: int) -> None:
-        assert store.rows("SELECT count(*) AS count FROM assets UNION ALL SELECT count(*) FROM results") == before
+        assert store.rows("SELECT count(*) AS count FROM assets UNION ALL SELECT count(*) FROM lifts") == before
         flushed.add(os.fstat(handle).st_ino)
         flush(handle)
 
     job, _ = store.submit(ANNA, order_of(store, ANNA))
     active = store.claim()
     assert active is not None
-    before = store.rows("SELECT count(*) AS count FROM assets UNION ALL SELECT count(*) FROM results")
+    before = store.rows("SELECT count(*) AS count FROM assets UNION ALL SELECT count(*) FROM lifts")
     monkeypatch.setattr(os, "fsync", note)
     finish(store, active)
     lift = store.lift(ANNA, job.id).file
     assert flushed == {path.stat().st_ino for path in (lift, lift.parent)}
-    before = store.rows("SELECT count(*) AS count FROM assets UNION ALL SELECT count(*) FROM results")
+    before = store.rows("SELECT count(*) AS count FROM assets UNION ALL SELECT count(*) FROM lifts")
     asset = store.asset(ANNA, add_asset(store, ANNA, "splats", b"x")).file
     assert {path.stat().st_ino for path in (asset, asset.parent)} < flushed
     with store.write() as connection:
         assert connection.execute("PRAGMA synchronous").fetchone()[0] == 2  # each commit waits for the disk
+
+
+def test_another_file_in_the_place_of_the_database_is_noticed(store: Store) -> None:
+    store.require_usable()
+    copy = store.root / "copy"
+    shutil.copyfile(store.root / DATABASE, copy)
+    copy.replace(store.root / DATABASE)
+    with pytest.raises(sqlite3.OperationalError, match="another file"):
+        store.require_usable()
 
 
 def test_disk_below_its_floor_takes_no_work_and_gives_room(tmp_path: Path) -> None:
