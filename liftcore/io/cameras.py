@@ -7,9 +7,11 @@ COLMAP writes several models (``sparse/0``, ``sparse/1``, ...) where photos do n
 frame of its own. Only the user knows which is that of the splats, so a folder of several is refused.
 """
 
+import errno
 import os
 import re
 import shutil
+import tempfile
 import zipfile
 from collections.abc import Iterable
 from contextlib import suppress
@@ -17,7 +19,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from liftcore.errors import InvalidCameras, naming, reading
+from liftcore.errors import InvalidCameras, Unavailable, naming, reading
 from liftcore.io.colmap import MODEL_FILES, has_model, is_whole, model_files, read_colmap, read_image_names
 from liftcore.io.files import BROKEN_ZIP, files_in_zip, first_bytes, is_zip, open_regular, open_zip
 from liftcore.io.json_file import FORMATS as JSON_FORMATS
@@ -107,6 +109,7 @@ def read_cameras(path: Path | str) -> Cameras:
 
     Raises:
         InvalidCameras: no camera format is recognised, several models are, or the content is malformed.
+        Unavailable: the temporary folder has no free space for the files of a zip.
     """
     path = as_path(path)
     try:
@@ -271,6 +274,9 @@ def _from_zip(path: Path, frame_file: Path | None) -> Cameras:
         with open_zip(path) as archive, scratch_folder("splatlift-") as root:
             return _from_unzipped(archive, path, root, frame_file)
     except BROKEN_ZIP as error:
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            expected, hint = f"free space in {tempfile.gettempdir()} for the zip's files", "free some, or set TMPDIR"
+            raise Unavailable(str(path), expected=expected, got="a full disk", hint=hint) from None
         if ", got " in str(error):
             raise
         raise ValueError(f"a zip of cameras, got one that does not open ({str(error)[:120]})") from None

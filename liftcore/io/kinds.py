@@ -164,7 +164,9 @@ _BY_KEYS = (
 )
 _COLMAP_POINTS = ("points3D.bin", "points3D.txt", "frames.bin", "rigs.bin", "frames.txt", "rigs.txt")
 _STEP = re.compile(r"(?:iteration|point_cloud|export|step|ckpt|splat)s?[_-]?0*([0-9]+)")
-_CHECKPOINT = re.compile(r"(^|/)(ckpt_[0-9]+(_rank[0-9]+)?\.pt|step-[0-9]+\.ckpt)$")
+_CHECKPOINT = re.compile(  # splat-distiller puts features beside it
+    r"(^|/)(ckpt_[0-9]+[^/]*(?<!_features)(?<!_filtered)(?<!_labels)\.pt|step-[0-9]+\.ckpt)$"
+)
 Fault = TypeVar("Fault", bound=InvalidInput)
 
 
