@@ -55,7 +55,7 @@ def read_checkpoint(path: Path, *, colour: bool = True) -> Fields:
     numbers = [np.dtype, *(type(np.dtype(kind)) for kind in (np.float64, np.float32, np.int64))]
     numbers += [(scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
     with torch.serialization.safe_globals(numbers):
-        tensors, names = _splats(load_tensors(path))
+        tensors, names = _splats(load_tensors(path, EXPORT_PLY))
     fields: Fields = {field: _array(tensors, name) for field, name in GSPLAT.items()}
     fields["opacity_logits"] = fields["opacity_logits"].reshape(len(fields["opacity_logits"]), -1)[:, 0]
     if colour and names[0] in tensors:

@@ -50,14 +50,11 @@ def pixels(value: Any, name: str) -> int:
 
 def matrix(value: Any, rows: tuple[int, ...], columns: int, name: str) -> np.ndarray:
     """Convert nested lists to a matrix [r, columns] f64, r being one of ``rows``."""
-    try:
-        numbers = np.array(value, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        numbers = np.empty(0)  # no matrix: refused by its shape
-    if numbers.shape not in [(count, columns) for count in rows] or not np.isfinite(numbers).all():
+    shaped = isinstance(value, list) and len(value) in rows
+    if not shaped or not all(isinstance(row, list) and len(row) == columns for row in value):
         shapes = " or ".join(f"{count}x{columns}" for count in rows)
-        raise ValueError(f"a {shapes} matrix of finite numbers as {name}, got {repr(value)[:60]}")
-    return numbers
+        raise ValueError(f"a {shapes} matrix of nested lists as {name}, got {repr(value)[:60]}")
+    return np.array([[number(cell, name) for cell in row] for row in value])
 
 
 def finite(value: Any) -> Any:

@@ -100,8 +100,10 @@ def _tensor(path: Path, kinds: str) -> np.ndarray:
     return array
 
 
-def load_tensors(path: Path) -> Any:
-    """Load a file of torch for weights alone, which builds tensors and runs no code of the file."""
+def load_tensors(path: Path, hint: str = "save its tensors by torch.save") -> Any:
+    """Load a file of torch for weights alone, which builds tensors and runs no code of the file; an error ends by the
+    hint.
+    """
     import torch
 
     open_regular(path).close()
@@ -109,7 +111,7 @@ def load_tensors(path: Path) -> Any:
         return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except Exception as error:  # unpickling raises errors of many types
         got = f"one that holds more than tensors, or is damaged ({str(error).splitlines()[0][:100]})"
-        raise ValueError(f"a file of tensors alone, got {got}".replace("; ", ", ")) from None
+        raise ValueError(f"a file of tensors alone, got {got.replace(';', ',')}; {hint}") from None
 
 
 def is_stored(tensor: "Tensor") -> bool:

@@ -20,6 +20,7 @@ from liftcore.scene.views import cameras_of_views, view_names
 MAX_PHOTOS = 10_000  # photos
 DIRECTORY_BYTES = 8 << 20  # of the list of what is in a zip: of 20,000 files with long names
 KEPT_ZIPS = 4  # whose directories stay in memory
+LOCAL_HEADER = struct.Struct("<26x2H")  # before a member: the lengths of its name and its extra field
 LARGEST_BYTES = 64 << 20  # of a photo: 100 million pixels as a good JPEG
 SIDE = 20_000  # pixels: what browsers decode ends there
 SPARE_BYTES = 1 << 20  # beside twice the archive: photos hardly shrink in a zip, bombs grow a thousandfold out of it
@@ -90,9 +91,9 @@ def _require_photo(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> None:
 
 @dataclass(frozen=True)
 class PhotoIndex:
-    """The photos of a checked zip, which stays open: its directory is read once."""
+    """Positions of the photos in a checked zip, which does not stay open: if it is deleted, its room is free."""
 
-    archive: zipfile.ZipFile
+    path: Path
     members: Mapping[str, zipfile.ZipInfo]  # by their views
 
     def names(self, views: Collection[str]) -> set[str]:
@@ -112,9 +113,14 @@ class PhotoIndex:
         return _media_type(member.filename), member.file_size, chain([first], blocks)
 
     def _blocks(self, member: zipfile.ZipInfo) -> Iterator[bytes]:
-        with self.archive.open(member) as photo:
-            while block := photo.read(BLOCK_BYTES):
-                yield block
+        # To open the zip would read its whole directory again.
+        with self.path.open("rb") as file:
+            file.seek(member.header_offset)
+            name, extra = LOCAL_HEADER.unpack(file.read(LOCAL_HEADER.size))
+            file.seek(name + extra, io.SEEK_CUR)
+            with zipfile.ZipExtFile(file, "r", member) as photo:
+                while block := photo.read(BLOCK_BYTES):
+                    yield block
 
 
 def photo_index(path: Path) -> PhotoIndex:
@@ -133,8 +139,8 @@ def _damaged(error: Exception) -> NotFound:
 
 @lru_cache(KEPT_ZIPS)
 def _index(path: Path, modified_ns: int) -> PhotoIndex:
-    archive = open_zip(path)
-    return PhotoIndex(archive, _members(archive))
+    with open_zip(path) as archive:
+        return PhotoIndex(path, _members(archive))
 
 
 def in_camera_orientation(

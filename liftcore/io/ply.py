@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
 
 MAX_HEADER_BYTES = 256 * 1024
+MAX_HEADER_LINES = 4096
 BLOCK_ROWS = 16_384  # rows converted at a time: a few MB, so that memory stays near the file's size
 MAX_SH_DEGREE = 4
 LOBE_CHANNELS = 6  # of a spherical beta lobe: r g b theta phi beta
@@ -568,6 +569,9 @@ def _header_lines(head: bytes) -> tuple[tuple[str, ...], int]:
     if not all(line.isascii() or line.startswith(_REMARKS) for line in lines):
         expected, got = "ASCII characters in all lines but comments", "other characters in it"
         raise _header_error(expected, got)
+    if len(lines) > MAX_HEADER_LINES:
+        limit, hint = f"at most {MAX_HEADER_LINES} header lines", "leave out properties that are no splat's"
+        raise ValueError(f"{limit}, got {len(lines)}; {hint}")
     if cloud := cloud_without_splats(lines):
         expected = "splats (properties such as 'opacity', 'scale_0', 'rot_0')"
         raise ValueError(f"{expected}, got {cloud[0]} without any of them; {cloud[1]}")

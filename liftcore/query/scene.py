@@ -159,8 +159,10 @@ class Scene:
         """
         from liftcore.query.ask import ask, locate
         from liftcore.query.question import Query
+        from liftcore.text import check_texts
 
         query = Query.of(query) if isinstance(query, str) else query
+        check_texts(query.texts)  # before an encoder is opened
         needs_encoder = bool(query.texts) or encoder is not None
         answer = ask(self, query, self.encoder(encoder) if needs_encoder else None)
         if places is False:
