@@ -155,9 +155,9 @@ class Algebra:
         axes = {} if directions.axes is None else {"axes": directions.axes}
         pieces.save("directions", None, {"mean": directions.mean, "distances": directions.distances, **axes})
         self.run("reweight", steps.compare, pieces.splat_pieces)
-        groups = steps.compared_groups(pieces)
-        sums = pieces.table("cosines", (2, codebook.regions + int(groups.max(initial=0)) + 1))
-        pieces.save("consistency", None, vars(SceneConsistency.of(sums, groups, mask)))
+        levels = steps.compared_levels(pieces)
+        sums = pieces.table("cosines", (2, codebook.regions + int(levels.max(initial=0)) + 1))
+        pieces.save("consistency", None, vars(SceneConsistency.of(sums, levels, mask)))
         return median_reliability(sums, mask)
 
     def solve(self) -> tuple[Tensor, SplatSupport]:

@@ -246,18 +246,18 @@ def _tree(pieces: Pieces) -> dict[str, Any]:
     return {name: pieces.load(f"tree-{pieces.turn}")[name] for name in names}
 
 
-def compared_groups(pieces: Pieces) -> np.ndarray:
-    """Return the group of each region [M] i8, in which regions are compared: one, or the levels."""
+def compared_levels(pieces: Pieces) -> np.ndarray:
+    """Return the level in which each region is compared [M] i8, from 0 on; the same for all if none is apart."""
     levels = pieces.load("regions")["levels"]
-    groups = np.unique(levels, return_inverse=True)[1].astype(np.int8)
-    return groups if pieces.levels_apart else np.zeros_like(groups)
+    numbers = np.unique(levels, return_inverse=True)[1].astype(np.int8)
+    return numbers if pieces.levels_apart else np.zeros_like(numbers)
 
 
 @saved_as("cosines")
 def compare(pieces: Pieces, piece: int, threads: int | None) -> Saved:
     """Save the cosines of regions with their sums over the scene."""
     block, levels = splat_block(pieces, piece), pieces.load("regions")["levels"]
-    reweighter = BlockReweighter(block.W, compared_groups(pieces), block.means, threads)
+    reweighter = BlockReweighter(block.W, compared_levels(pieces), block.means, threads)
     cosines, sums = reweighter.cosines(_directions(pieces), by_region=bool((levels >= 0).any()))
     return {"cosines": cosines}, sums, reweighter.shape
 
@@ -277,7 +277,7 @@ def reweighted(
     scores, consensus = np.zeros((2, block.means.shape[0])), consensus_of(pieces, piece, block.W, threads)
     factors, facts = pieces.writable(pieces.load("cosines", piece)["cosines"]), pieces.load("consistency")
     consistency = SceneConsistency(*(facts[name] for name in ("mean_cosines", "powers", "regions")))
-    BlockReweighter(block.W, compared_groups(pieces), None, threads).weigh(factors, consistency, consensus, scores)
+    BlockReweighter(block.W, compared_levels(pieces), None, threads).weigh(factors, consistency, consensus, scores)
     return scale_weights(block.W, factors), confidence_of(scores)
 
 

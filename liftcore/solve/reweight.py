@@ -62,7 +62,7 @@ from liftcore.solve.closed_form import morton_codes
 from liftcore.solve.directions import RegionDirections
 from liftcore.solve.shared_rows import compare_rows, flat_table
 from liftcore.solve.sums import PieceSums, piece_sums
-from liftcore.values.region_weights import MEMORY_LIMIT, RegionWeights, row_blocks, run_each
+from liftcore.values.region_weights import MEMORY_LIMIT, RegionWeights, from_zero, row_blocks, run_each
 
 BLOCK_ROWS, BLOCK_ENTRIES = 1 << 11, 1 << 15  # a splat has a sum per view
 POWERS = 1 << 12  # table size of powers of consensus; linear interpolation has a relative error of 3e-5 at most
@@ -95,29 +95,29 @@ def scale_weights(W: RegionWeights, factors: Tensor) -> RegionWeights:
 
 @dataclass(frozen=True)
 class SceneConsistency:
-    """Quantities of the whole scene that a step needs; those of G groups of regions."""
+    """Quantities of the whole scene that a step needs; those of L levels that are compared apart."""
 
-    mean_cosines: np.ndarray  # [G] f64, c
-    powers: np.ndarray  # [G] f64, exponents of the consensus, SHARPNESS (1 - r)
+    mean_cosines: np.ndarray  # [L] f64, c
+    powers: np.ndarray  # [L] f64, exponents of the consensus, SHARPNESS (1 - r)
     regions: np.ndarray  # [M] f32, r_m / r of each region; 1 for regions without a reliability
 
     @classmethod
-    def of(cls, sums: np.ndarray, group: np.ndarray, mask: np.ndarray) -> "SceneConsistency":
+    def of(cls, sums: np.ndarray, level: np.ndarray, mask: np.ndarray) -> "SceneConsistency":
         """Compute from the sums of `BlockReweighter.cosines` over all splats.
 
         Args:
-            sums: [2, M + G] f64. group: [M] i8. mask: [M] bool, the regions with a reliability.
+            sums: [2, M + L] f64. level: [M] i8. mask: [M] bool, the regions with a reliability.
         """
-        confirmed, totals = sums[:, group.size :]
+        confirmed, totals = sums[:, level.size :]
         mean_cosines = np.divide(confirmed, totals, out=np.zeros_like(totals), where=totals > 0)
-        regions, powers = np.ones(group.size, np.float32), np.ones_like(totals)
-        for turn in range(totals.size):
-            of_group = mask & (group == turn)
+        regions, powers = np.ones(level.size, np.float32), np.ones_like(totals)
+        for number in range(totals.size):
+            of_level = mask & (level == number)
             if mask.any():
-                median = median_reliability(sums, of_group) or 0.0
-                powers[turn] = SHARPNESS * (1.0 - median)
+                median = median_reliability(sums, of_level) or 0.0
+                powers[number] = SHARPNESS * (1.0 - median)
                 if median > 0:
-                    seen, reliable = _reliabilities(sums, of_group)
+                    seen, reliable = _reliabilities(sums, of_level)
                     regions[seen] = reliable / median
         return cls(mean_cosines, powers, regions)
 
@@ -140,78 +140,91 @@ class BlockReweighter:
 
     Args:
         W: of all views by rows of codebooks, on the CPU; a row for each splat of the block.
-        group: [M] i8, from 0 on; regions are compared with those of their group alone.
+        level: [M] i8, from 0 on; regions are compared with those of their level alone.
         means: [n, 3] of these splats; neighbours, which read the same directions, are processed together.
     """
 
-    def __init__(self, W: RegionWeights, group: np.ndarray, means: Tensor | None, threads: int | None) -> None:
-        self.W, self.group, self.threads = W, group, threads
-        self.view = torch.repeat_interleave(W.offsets.diff())
+    def __init__(self, W: RegionWeights, level: np.ndarray, means: Tensor | None, threads: int | None) -> None:
+        self.W, self.threads = W, threads
+        self.view = torch.repeat_interleave(W.offsets.diff()).numpy()
         self.rows = torch.nonzero(W.indptr.diff())[:, 0]
         if means is not None:
             self.rows = self.rows[torch.argsort(morton_codes(means[self.rows]))]
         self.blocks = row_blocks(W.indptr.diff()[self.rows].numpy(), BLOCK_ROWS, BLOCK_ENTRIES)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """The shape of the sums of `cosines`, [2, M + G]."""
-        return 2, self.group.size + self.groups
-
-    @property
-    def groups(self) -> int:
-        """The number of groups, G."""
-        return int(self.group.max(initial=0)) + 1
+        self.level, self.levels = level, int(level.max(initial=0)) + 1
+        self.shape = 2, level.size + self.levels
 
     def cosines(self, directions: RegionDirections, by_region: bool) -> tuple[Tensor, Iterator[PieceSums]]:
-        """Return ``c_jm`` of each entry, [nnz] f32, complete once the sums are read.
+        """Return ``c_jm`` of the entries, level after level, [nnz] f32, complete once the sums are read.
 
         Args:
             by_region: True to compute the sums of reliability.
 
         Returns:
-            The cosines and the sums of each piece: ``W (1 - p) c`` and ``W (1 - p)`` of each region and, from place M
-            on, ``W c`` and ``W`` of each group.
+            The cosines, and the sums of each level and piece [2, M + levels]: ``W (1 - p) c`` and ``W (1 - p)`` of
+            each region and, from place M on, ``W c`` and ``W`` of each level.
         """
-        products, squares = self._entries(), self._entries()
-        for columns in directions.slices():
-            table, width = flat_table(directions.table(columns)), columns.stop - columns.start
-            outputs = [table, width, products.numpy(), squares.numpy()]
-            for turn in range(self.groups):
-                arrays = [*self._arrays(), turn, *outputs]
+        products = _zeros(self.W)
+        return products, self._sums(products, directions, by_region)
+
+    def _sums(self, products: Tensor, directions: RegionDirections, by_region: bool) -> Iterator[PieceSums]:
+        for number, (W, entries, _) in enumerate(self._by_level()):
+            squares = _zeros(W)
+            values = [products[entries].numpy(), squares.numpy()]
+            for columns in directions.slices():
+                table, width = flat_table(directions.table(columns)), columns.stop - columns.start
+                arrays = [table, width, *self._arrays(W), *values]
                 blocks = [(self.rows[first:last].numpy(), *arrays) for first, last in self.blocks]
                 run_each(compare_rows, blocks, self.threads)
+            arrays = [*self._arrays(W), *values, self.level.size + number, by_region]
 
-        def add_rows(first: int, last: int, table: np.ndarray) -> None:
-            for turn in range(self.groups):
-                tally(*[first, last, *self._arrays(), turn, products.numpy(), squares.numpy(), by_region, table])
+            def add_rows(first: int, last: int, table: np.ndarray, arrays: list[Any] = arrays) -> None:
+                tally(*[first, last, *arrays, table])
 
-        return products, piece_sums(add_rows, self.W.indptr.shape[0] - 1, self.shape, self.threads)
+            yield from piece_sums(add_rows, W.indptr.shape[0] - 1, self.shape, self.threads)
 
     def weigh(self, cosines: Tensor, scene: SceneConsistency, consensus: Tensor | None, scores: np.ndarray) -> None:
-        """Replace cosines by factors ``s ((1 - p) c_jm + p c) (r_m / r) q^power``, in place.
+        """Replace cosines by factors ``s ((1 - p) c_jm + p c) (r_m / r) q^power`` in the order of W, in place.
 
         Args:
             cosines: [nnz] f32, of `cosines`.
-            consensus: [nnz] f32 of each entry (`liftcore.solve.consensus`); None: no consensus.
+            consensus: [nnz] f32 of each entry of W (`liftcore.solve.consensus`); None: no consensus.
             scores: [2, n] f64, to which ``sum W' c_jm`` and ``sum W`` of each splat are added.
         """
-        consensus = torch.zeros(0, dtype=torch.float32) if consensus is None else consensus  # as the kernel reads it
-        parts = [cosines.numpy(), scene.regions, consensus.numpy(), scores]
-        for turn, (mean_cosine, power) in enumerate(zip(scene.mean_cosines, scene.powers, strict=True)):
+        by_level = cosines.clone() if self.levels > 1 else cosines
+        levels = zip(self._by_level(), scene.mean_cosines, scene.powers, strict=True)
+        for (W, entries, places), mean_cosine, power in levels:
+            factors = by_level[entries]
+            shares = torch.zeros(0, dtype=torch.float32) if consensus is None else consensus[places]
             powers = ((np.arange(POWERS + 2) / POWERS) ** power).astype(np.float32)
-            arrays = [*self._arrays(), turn, *parts, mean_cosine, power, powers]
+            arrays = [*self._arrays(W), factors.numpy(), shares.numpy(), scene.regions, scores]
             # In the order of memory: nothing is shared by neighbours, unlike in `cosines`.
-            blocks = [(first, last, *arrays) for first, last in self.W.blocks(BLOCK_ROWS, BLOCK_ENTRIES)]
-            run_each(weigh_rows, blocks, self.threads)
+            blocks = W.blocks(BLOCK_ROWS, BLOCK_ENTRIES)
+            run_each(weigh_rows, [(*ends, *arrays, mean_cosine, power, powers) for ends in blocks], self.threads)
+            if self.levels > 1:
+                cosines[places] = factors
 
-    def _entries(self) -> Tensor:
-        """Return zeros for the entries of W, [nnz] f32."""
-        size = self.W.weight.nbytes
-        return zeros(tuple(self.W.weight.shape), torch.float32, name="weights", in_file=2 * size > MEMORY_LIMIT)
+    def _by_level(self) -> Iterator[tuple[RegionWeights, slice, Any]]:
+        """Yield W with the entries of each level alone, where these lie level after level, and where in W."""
+        if self.levels == 1:
+            yield self.W, slice(None), slice(None)
+            return
+        level_of_entry, end = self.level[self.W.region.numpy()], 0
+        for number in range(self.levels):
+            kept = torch.from_numpy(level_of_entry == number)
+            part = {"region": self.W.region[kept], "weight": self.W.weight[kept]}
+            begin, end = end, end + part["region"].shape[0]
+            yield replace(self.W, indptr=from_zero(kept)[self.W.indptr], **part), slice(begin, end), kept
 
-    def _arrays(self) -> list[np.ndarray]:
-        """Return the arrays of W, and the view and the group of each region."""
-        return [*(part.numpy() for part in (self.W.indptr, self.W.region, self.W.weight, self.view)), self.group]
+    def _arrays(self, W: RegionWeights) -> list[np.ndarray]:
+        """Return the arrays of W, and the view of each region."""
+        return [*(part.numpy() for part in (W.indptr, W.region, W.weight)), self.view]
+
+
+def _zeros(W: RegionWeights) -> Tensor:
+    """Return zeros for the entries of W, [nnz] f32."""
+    size = W.weight.nbytes
+    return zeros(tuple(W.weight.shape), torch.float32, name="weights", in_file=2 * size > MEMORY_LIMIT)
 
 
 def confidence_of(scores: np.ndarray) -> Tensor:
@@ -222,10 +235,21 @@ def confidence_of(scores: np.ndarray) -> Tensor:
 
 @kernel
 def weigh_rows(
-    first_row, last_row, indptr, region, weight, view, group, turn, cosines, reliable, consensus, scores,
-    mean_cosine, power, powers,
-):  # fmt: skip
-    """Compute `BlockReweighter.weigh` of the regions of a group in rows ``first_row..last_row``.
+    first_row,
+    last_row,
+    indptr,
+    region,
+    weight,
+    view,
+    cosines,
+    consensus,
+    reliable,
+    scores,
+    mean_cosine,
+    power,
+    powers,
+):
+    """Compute `BlockReweighter.weigh` of a level in rows ``first_row..last_row``.
 
     Powers of consensus are interpolated in a table [n].
     """
@@ -233,20 +257,16 @@ def weigh_rows(
         first, last = indptr[row], indptr[row + 1]
         before = after = cosine_sum = 0.0
         for k in range(first, last):
-            if group[region[k]] == turn:
-                before += weight[k]
+            before += weight[k]
         inverse = 1.0 / before if before > 0.0 else 0.0
         k = first
         while k < last:
             begin, v, view_share = k, view[region[k]], 0.0
             while k < last and view[region[k]] == v:
-                if group[region[k]] == turn:
-                    view_share += weight[k] * inverse
+                view_share += weight[k] * inverse
                 k += 1
             share = min(view_share, 1.0)
             for n in range(begin, k):
-                if group[region[n]] != turn:
-                    continue
                 scaled = ((1.0 - share) * cosines[n] + share * mean_cosine) * reliable[region[n]]
                 if consensus.size > 0:
                     if consensus[n] > STEEP:
@@ -262,34 +282,29 @@ def weigh_rows(
         scores[0, row] += gain * cosine_sum
         scores[1, row] += before
         for n in range(first, last):
-            if group[region[n]] == turn:
-                cosines[n] = cosines[n] * gain if gain > 0.0 else 1.0
+            cosines[n] = cosines[n] * gain if gain > 0.0 else 1.0
 
 
 @kernel
-def tally(first, last, indptr, region, weight, view, group, turn, cosines, squares, by_region, sums):
-    """Replace products of the entries of a group in some rows by cosines; add these to the sums [2, M + G] f64."""
-    place = group.size + turn
+def tally(first, last, indptr, region, weight, view, cosines, squares, place, by_region, sums):
+    """Replace products of a level in some rows by cosines; add these to the sums [2, M + levels] f64."""
     for row in range(first, last):
         total = 0.0
         for k in range(indptr[row], indptr[row + 1]):
-            if group[region[k]] == turn:
-                total += weight[k]
+            total += weight[k]
         inverse = 1.0 / total if total > 0.0 else 0.0
         k = indptr[row]
         while k < indptr[row + 1]:
             begin, v, view_share = k, view[region[k]], 0.0
             while k < indptr[row + 1] and view[region[k]] == v:
-                if group[region[k]] == turn:
-                    length = np.sqrt(squares[k])
-                    cosine = cosines[k] / length if length > NO_CONSENSUS else np.float32(0.0)
-                    cosines[k] = min(max(cosine, np.float32(0.0)), np.float32(1.0))
-                    sums[0, place] += weight[k] * np.float64(cosines[k])
-                    sums[1, place] += weight[k]
-                    view_share += weight[k] * inverse
+                length = np.sqrt(squares[k])
+                cosine = cosines[k] / length if length > NO_CONSENSUS else np.float32(0.0)
+                cosines[k] = min(max(cosine, np.float32(0.0)), np.float32(1.0))
+                sums[0, place] += weight[k] * np.float64(cosines[k])
+                sums[1, place] += weight[k]
+                view_share += weight[k] * inverse
                 k += 1
             other_share = max(1.0 - view_share, 0.0)
             for n in range(begin, k if by_region else begin):
-                if group[region[n]] == turn:
-                    sums[0, region[n]] += weight[n] * other_share * cosines[n]
-                    sums[1, region[n]] += weight[n] * other_share
+                sums[0, region[n]] += weight[n] * other_share * cosines[n]
+                sums[1, region[n]] += weight[n] * other_share

@@ -75,24 +75,13 @@ def count_pieces(rows, indptr, length):
     return pieces
 
 
-@inlined
-def next_entry(k, end, region, group, turn):
-    """Return the first entry from k on of a region of the group; ``end`` if there is none."""
-    while k < end and group[region[k]] != turn:
-        k += 1
-    return k
-
-
 @kernel
-def unite_rows(
-    rows, first, last, piece, length, indptr, region, weight, group, turn, scales, regions, shares, entries
-):
+def unite_rows(rows, first, last, piece, length, indptr, region, weight, scales, regions, shares, entries):
     """Write the regions of a group, ascending, with the share and the entry of each row; return their number.
 
     Args:
         rows: of W; those numbered ``first..last`` are the group.
         piece: number of a piece of ``length`` entries of each row.
-        group: [M] i8; regions of the group ``turn`` alone count. None: all.
         scales: [GROUP] f64, 1 / the row's sum of weights.
         regions: [GROUP length] i32. shares: [GROUP GROUP length] f32, zero for none.
         entries: i64 likewise, -1 for none.
@@ -102,8 +91,6 @@ def unite_rows(
         row = rows[first + j]
         k[j] = indptr[row] + piece * length
         ends[j] = min(indptr[row + 1], k[j] + length)
-        if group is not None:
-            k[j] = next_entry(k[j], ends[j], region, group, turn)
         if k[j] < ends[j]:
             heads[j] = region[k[j]]
     count = 0
@@ -117,7 +104,7 @@ def unite_rows(
             if heads[j] == least:
                 n = k[j]
                 shares[place], entries[place] = weight[n] * scales[j], n
-                k[j] = n + 1 if group is None else next_entry(n + 1, ends[j], region, group, turn)
+                k[j] = n + 1
                 heads[j] = region[k[j]] if k[j] < ends[j] else NO_REGION
             else:
                 shares[place], entries[place] = 0.0, -1
@@ -208,8 +195,8 @@ def sum_rows(rows, indptr, region, weight, inverse, table, width, sums):
         for j in range(last - first):
             scales[j] = inverse[rows[first + j]]
         for piece in range(pieces):
-            arrays = indptr, region, weight, None, 0, scales
-            count = unite_rows(rows, first, last, piece, LONG, *arrays, regions, shares, entries)
+            arrays = indptr, region, weight, scales, regions, shares, entries
+            count = unite_rows(rows, first, last, piece, LONG, *arrays)
             for c in range(0, width, LANES):
                 store_rows(group_sums, c, stride, sum_vectors(0, count, regions, shares, table, width, c))
             if pieces > 1:
@@ -223,16 +210,15 @@ def sum_rows(rows, indptr, region, weight, inverse, table, width, sums):
 
 
 @kernel
-def compare_rows(rows, indptr, region, weight, view, group, turn, table, width, products, squares):
+def compare_rows(rows, table, width, indptr, region, weight, view, products, squares):
     """Add ``e_m . r_jv`` and ``|r_jv|^2`` of the entries of some rows, over the channels of a table of e.
 
     r_jv is the sum of all views minus that of view v, except for a view of over half of the weight: there the
     difference of two float32 sums would be mostly rounding error, and the other views are summed directly.
 
     Args:
-        rows: [n] i64, of W. view: [M] i64, of each region.
-        group: [M] i8; regions of the group ``turn`` are compared with each other alone.
-        table: `flat_table` [M, width]. products, squares: [nnz] f32.
+        rows: [n] i64, of W. table: `flat_table` [M, width].
+        view: [M] i64, of each region. products, squares: [nnz] f32.
     """
     regions, shares = np.empty(GROUP * MOST_COMPARED, np.int32), np.empty(GROUP * GROUP * MOST_COMPARED, np.float32)
     entries = np.empty(GROUP * GROUP * MOST_COMPARED, np.int64)
@@ -254,10 +240,9 @@ def compare_rows(rows, indptr, region, weight, view, group, turn, table, width, 
         for j in range(last - first):
             total = 0.0
             for k in range(indptr[rows[first + j]], indptr[rows[first + j] + 1]):
-                if group[region[k]] == turn:
-                    total += weight[k]
+                total += weight[k]
             scales[j] = 1.0 / total if total > 0.0 else 0.0
-        arrays = indptr, region, weight, group, turn, scales, regions, shares, entries
+        arrays = indptr, region, weight, scales, regions, shares, entries
         count = unite_rows(rows, first, last, 0, MOST_COMPARED, *arrays)
         number, v = np.int64(-1), -1
         sums[total_at : total_at + size] = 0.0
