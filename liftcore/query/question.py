@@ -277,6 +277,8 @@ Corner = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(description=
 class Box:
     """An axis-aligned box, world frame."""
 
+    # The same in requests and answers, as generators of clients want one class of a name.
+    __pydantic_config__: ClassVar = ConfigDict(extra="forbid")
     low: Corner
     high: Corner
 
