@@ -12,7 +12,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from tests.server import Server, run_command, until, wait_for_end
+from tests.promises.over_http import lift_of, upload_scene
+from tests.server import Server, run_command, until
 from tests.tiny_scene import make_scene
 
 CHECKS = (
@@ -48,13 +49,7 @@ def failures_of(folder: Path, *, examples: int, phases: Sequence[str]) -> str:
         options = ("--name", "contract", "--scopes", "read,write", "--json")
         secret = json.loads(run_command("keys", "create", *options, data=server.data))["key"]
         server.client.headers["Authorization"] = f"Bearer {secret}"
-        ids = [
-            server.client.put(f"/assets/{kind}", content=getattr(scene, kind)).json()["id"]
-            for kind in ("splats", "cameras", "features")
-        ]
-        order = {"splats": ids[0], "cameras": ids[1], "features": ids[2:], "settings": {"preset": "row-sum"}}
-        job = wait_for_end(server.client, server.client.post("/lift", json=order).headers["location"])
-        assert job["state"] == "succeeded", job
+        lift_of(server.client, upload_scene(server.client, scene))
         until(lambda: server.client.get("/query", params={"text": "apple"}).status_code == 200)
         command = [
             str(Path(sys.executable).with_name("schemathesis")), "run",

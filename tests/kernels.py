@@ -15,7 +15,7 @@ from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.compositing import CompositingParams, Weighting
 from liftcore.scene.splats import Kernel
 from liftcore.values.settings import LiftSettings
-from tests.tiny_scene import make_scene
+from tests.promises.tiny_files import write_files
 
 
 def main() -> None:
@@ -24,13 +24,9 @@ def main() -> None:
         warm_up(kernel)
     warm_up(params=CompositingParams(opacity_logit_scale=1.2))
     warm_up(weighting=Weighting(top_k=1))
-    scene = make_scene()
     with tempfile.TemporaryDirectory() as name:
-        files = {"splats.ply": scene.splats, "cameras.json": scene.cameras, "features.safetensors": scene.features}
-        paths = [Path(name) / file for file in files]
-        for path, content in zip(paths, files.values(), strict=True):
-            path.write_bytes(content)
-        lift_files(paths[0], paths[1], paths[2:], LiftSettings.of(device="cpu"))
+        files = write_files(Path(name))
+        lift_files(files["splats"], files["cameras"], [files["features"]], LiftSettings.of(device="cpu"))
 
 
 if __name__ == "__main__":

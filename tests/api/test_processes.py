@@ -18,10 +18,9 @@ import pytest
 from service.errors import Busy, Fault, InvalidRequest
 from service.process import Children
 from service.query_client import QueryClient
+from tests.promises.bad_files import BAD_FILES, BadFile
 from tests.server import until
-from tests.tiny_scene import cameras_json, ply, splat_rows
-
-from .bombs import cameras, splats
+from tests.tiny_scene import cameras_document, cameras_json, ply, splat_rows
 
 pytestmark = pytest.mark.slow
 
@@ -108,13 +107,21 @@ def test_stopped_children_take_no_order(tmp_path: Path) -> None:
         children.check(check_of(tmp_path, "cameras", cameras_json()), 600, "cameras")
 
 
-@pytest.mark.parametrize(
-    ("kind", "name"), [("splats", name) for name in splats()] + [("cameras", name) for name in cameras()]
-)
-def test_bomb_is_refused_with_reasons(children: Children, tmp_path: Path, kind: str, name: str) -> None:
-    content = (splats() if kind == "splats" else cameras())[name]
+def names_in_emoji() -> bytes:
+    """Return cameras that a reader takes, with longer names than a reply has."""
+    frame = cameras_document()["frames"][0]
+    frames = [frame | {"file_path": str(number) + "\U0001f600" * 490} for number in range(10_000)]
+    return json.dumps(cameras_document() | {"frames": frames}).encode()
+
+
+BOMBS = [row for row in BAD_FILES if row.bomb and row.kind in ("splats", "cameras")]
+BOMBS.append(BadFile("cameras", "10,000 names in emoji", names_in_emoji, ""))
+
+
+@pytest.mark.parametrize("row", BOMBS, ids=lambda row: row.name)
+def test_bomb_is_refused_with_reasons(children: Children, tmp_path: Path, row: BadFile) -> None:
     with pytest.raises(Fault) as error:
-        children.check(check_of(tmp_path, kind, content, memory=1 << 30), 600, kind)
+        children.check(check_of(tmp_path, row.kind, row.data(), memory=1 << 30), 600, row.kind)
     fault = error.value.fault
     assert fault["status"] == 422 and fault["expected"] and fault["got"] and len(json.dumps(fault)) < 5000
 

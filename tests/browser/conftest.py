@@ -17,7 +17,8 @@ from service.app import create_app
 from service.commands.serve import bind, server_of
 from service.settings import ServiceSettings
 from service.store import Store
-from tests.server import until, wait_for_end
+from tests.promises.over_http import lift_of, upload_scene
+from tests.server import until
 from tests.tiny_scene import make_scene
 
 from .browser import PATIENCE_SECONDS, Browser, Chromium, launch, profile
@@ -58,12 +59,8 @@ def server(chromium: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Iter
         serving(folder / "data", encoder=f"table:{folder}/table.safetensors") as address,
         httpx.Client(base_url=address, timeout=PATIENCE_SECONDS) as client,
     ):
-        bodies = {kind: getattr(scene, kind) for kind in ("splats", "cameras", "features")}
-        ids = {kind: client.put(f"/assets/{kind}", content=body).json()["id"] for kind, body in bodies.items()}
-        order = ids | {"features": [ids["features"]], "settings": {"preset": "row-sum", "objects": True}}
-        job = wait_for_end(client, client.post("/lift", json=order).headers["location"])
-        assert job["state"] == "succeeded", job
-        yield PageServer(address, job["id"], folder / "data", client)
+        lift = lift_of(client, upload_scene(client, scene))
+        yield PageServer(address, lift["id"], folder / "data", client)
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,8 @@ from PIL import Image
 from liftcore.io.cameras import read_cameras
 from liftcore.io.splats import read_splats
 from tests.inria_file import write_inria_cameras
+from tests.promises.over_http import lift_of, upload_scene
+from tests.promises.tiny_files import write_files
 from tests.tiny_scene import DISTANCE, colmap_zip, make_scene
 
 from .browser import PATIENCE_SECONDS, Browser
@@ -28,11 +30,7 @@ LONG = 1200.0  # seconds, for what runs a job on a busy machine, kernels and all
 
 @pytest.fixture
 def files(tmp_path: Path) -> dict[str, Path]:
-    scene, paths = make_scene(), {}
-    for name in ("splats.ply", "cameras.json", "features.safetensors", "table.safetensors"):
-        paths[name.split(".")[0]] = tmp_path / name
-        (tmp_path / name).write_bytes(getattr(scene, name.split(".")[0]))
-    return paths
+    return write_files(tmp_path)
 
 
 @pytest.fixture
@@ -46,7 +44,8 @@ def empty(browser: Browser, files: dict[str, Path], tmp_path: Path) -> Iterator[
         browser.open("about:blank")
 
 
-def test_dropped_files_are_planned_compared_and_cancelled(empty: Browser, files: dict[str, Path]) -> None:
+def test_dropped_files_become_an_object_that_lights_up(empty: Browser, files: dict[str, Path]) -> None:
+    """The whole way: files are planned, compared and lifted, a phrase lights up the object, and all is deleted."""
     empty.drop([files[kind] for kind in ("splats", "cameras", "features")])
     empty.until("document.querySelector('#plan').textContent.includes('60 splats')")
     assert empty.value("fetch('jobs').then(reply => reply.json()).then(({jobs}) => jobs.length)") == 0
@@ -69,6 +68,16 @@ def test_dropped_files_are_planned_compared_and_cancelled(empty: Browser, files:
     empty.until(READY, LONG)
     lift_settings = empty.value("splatlift.lift.settings")
     assert all(lift_settings[name] == settings[name] for name in ("preset", "quality"))
+    ask(empty, "lamp")
+    assert min(columns(empty, AMBER)) > 50
+    low, high = empty.value("(({low, high}) => [low, high])(splatlift.query.current.objects[0].box)")
+    assert low[0] < 1.2 < high[0] and low[2] < -DISTANCE < high[2]  # where the lamp stands
+    empty.press("#tab-bring")
+    empty.until("document.querySelector('#jobs .succeeded')")
+    empty.value("splatlift.uploads.refresh()")
+    empty.press("#jobs button.danger")  # and away with it
+    empty.press("#jobs button.danger")
+    empty.until("!document.querySelector('#empty').hidden")
 
 
 def test_lift_file_asks_for_what_it_was_made_of_and_opens(
@@ -108,23 +117,23 @@ def test_folder_of_a_sog_and_cameras_is_sent_as_two_files(
     assert f"{read_splats(SOG_FILE).count} splats" in text_of(empty, "#sent")
 
 
-def test_wrong_file_leaves_the_good_one(empty: Browser, files: dict[str, Path], tmp_path: Path) -> None:
+def test_wrong_file_is_named_and_leaves_the_good_one(empty: Browser, files: dict[str, Path], tmp_path: Path) -> None:
     (tmp_path / "broken.ply").write_bytes(files["splats"].read_bytes()[:-40])
-    empty.drop([files["splats"]])
-    empty.until("document.querySelector('.file.done')")
-    empty.drop([tmp_path / "broken.ply"])
+    empty.choose_files("#files", [tmp_path / "broken.ply", files["cameras"]])
     empty.until("document.querySelector('.file.bad')")
-    assert text_of(empty, ".file.done .name") == "splats.ply"
+    assert "broken.ply" in text_of(empty, ".file.bad .name")
+    assert "expected" in text_of(empty, ".file.bad .state") and "got" in text_of(empty, ".file.bad .state")
+    assert empty.value("document.querySelector('#lift-it').disabled") is True
+    empty.press(".file.bad .away")
+    empty.drop([files["splats"]])
+    empty.until("document.querySelectorAll('.file.done').length === 2 && !document.querySelector('.file.bad')")
     empty.press(".file.done .actions button")  # it is shown before it is lifted
     empty.until("splatlift.viewer?.draft && splatlift.viewer.count === 60")
 
 
-def test_scenes_that_others_make_and_delete_are_followed(empty: Browser, files: dict[str, Path]) -> None:
+def test_scenes_that_others_make_and_delete_are_followed(empty: Browser) -> None:
     with httpx.Client(base_url=empty.value("location.origin"), timeout=PATIENCE_SECONDS) as other:
-        asset_ids = {kind: other.put(f"/assets/{kind}", content=file.read_bytes()) for kind, file in files.items()}
-        ids = {kind: reply.json()["id"] for kind, reply in asset_ids.items() if kind != "table"}
-        order = ids | {"features": [ids["features"]], "settings": {"preset": "row-sum"}}
-        job = other.post("/lift", json=order).json()["id"]
+        job = lift_of(other, upload_scene(other, make_scene()))["id"]
         empty.press("#tab-bring")
         empty.until(READY, LONG)  # nothing was open, so it is
         assert empty.value("splatlift.lift.id") == job
@@ -156,32 +165,3 @@ def test_lift_takes_a_name_and_photos(browser: Browser, server: PageServer, tmp_
     browser.press("#view-after")
     browser.until("document.querySelector('#layer-words').textContent === 'This view has no photo.'")
     assert browser.value("document.querySelector('#over').hidden") is True
-
-
-def test_strangers_files_become_an_object_that_lights_up(
-    empty: Browser, files: dict[str, Path], tmp_path: Path
-) -> None:
-    """The whole way: files are chosen and dropped, a lift runs, a phrase lights up the object, and all is deleted."""
-    (tmp_path / "broken.ply").write_bytes(files["splats"].read_bytes()[:-40])
-    empty.choose_files("#files", [tmp_path / "broken.ply", files["cameras"]])
-    empty.until("document.querySelector('.file.bad')")
-    assert "broken.ply" in text_of(empty, ".file.bad .name")
-    assert "expected" in text_of(empty, ".file.bad .state") and "got" in text_of(empty, ".file.bad .state")
-    assert empty.value("document.querySelector('#lift-it').disabled") is True
-    empty.press(".file.bad .away")
-    empty.drop([files["splats"], files["features"]])
-    empty.until("!document.querySelector('#lift-it').disabled")
-    empty.press("#lift-it")
-    empty.until("splatlift.lift || document.querySelector('#jobs .failed')", LONG)
-    assert empty.value("document.querySelector('#jobs .failed')") is None
-    empty.until(READY)
-    ask(empty, "lamp")
-    assert min(columns(empty, AMBER)) > 50
-    low, high = empty.value("(({low, high}) => [low, high])(splatlift.query.current.objects[0].box)")
-    assert low[0] < 1.2 < high[0] and low[2] < -DISTANCE < high[2]  # where the lamp stands
-    empty.press("#tab-bring")
-    empty.until("document.querySelector('#jobs .succeeded')")
-    empty.value("splatlift.uploads.refresh()")
-    empty.press("#jobs button.danger")  # and away with it
-    empty.press("#jobs button.danger")
-    empty.until("!document.querySelector('#empty').hidden")

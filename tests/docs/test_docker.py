@@ -14,20 +14,10 @@ from tests.server import Server
 from .readme import text
 
 
-def instructions() -> list[tuple[str, str]]:
-    """The instructions of the Dockerfile: name and arguments, continued lines joined."""
-    lines = [line for line in text("docker/Dockerfile").splitlines() if not line.startswith("#")]
-    joined_lines = re.sub(r"\\\n\s*", "", "\n".join(lines))
-    return [(line.split()[0], line.split(maxsplit=1)[1]) for line in joined_lines.splitlines() if line.strip()]
-
-
-def arguments_of(name: str) -> list[str]:
-    return [arguments for instruction, arguments in instructions() if instruction == name]
-
-
 def health_check() -> list[str]:
-    (check,) = arguments_of("HEALTHCHECK")
-    return json.loads(check.partition(" CMD ")[2])
+    command = re.search(r"^HEALTHCHECK .*?CMD (\[.*?\])", text("docker/Dockerfile"), re.MULTILINE | re.DOTALL)
+    assert command is not None
+    return json.loads(command[1])
 
 
 def test_health_check_tells_a_live_server_from_a_dead_one(tmp_path: Path) -> None:

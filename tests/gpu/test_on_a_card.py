@@ -12,7 +12,8 @@ import torch
 import liftcore as lc
 from tests import paper_card
 from tests.backends import needs_triton
-from tests.tiny_scene import WORDS, make_scene
+from tests.promises.tiny_files import write_files
+from tests.tiny_scene import WORDS
 
 pytestmark = needs_triton
 FEW: dict[str, Any] = {"diagnostic_rays": 6}  # as the interpreter traces one in a thirtieth of a second
@@ -32,11 +33,7 @@ def card(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def paths(tmp_path: Path) -> list[Path]:
     """Splats, cameras, features and a text table of the tiny scene."""
-    scene, names = make_scene(), ("splats.ply", "cameras.json", "features.safetensors", "table.safetensors")
-    paths = [tmp_path / name for name in names]
-    for path, content in zip(paths, (scene.splats, scene.cameras, scene.features, scene.table), strict=True):
-        path.write_bytes(content)
-    return paths
+    return list(write_files(tmp_path).values())
 
 
 def lifted(paths: list[Path], views: Any = None, **options: Any) -> lc.LiftResult:

@@ -194,8 +194,8 @@ def glb(place: str, value: Any) -> Callable[[], bytes]:
     return build
 
 
-def spz(version: int, count: int, streams: int = 0) -> bytes:
-    return struct.pack("<4sIIBBBB", b"NGSP", version, count, 0, 12, 0, streams) + bytes(1000)
+def spz(version: int, count: int) -> bytes:
+    return struct.pack("<4sIIBBBB", b"NGSP", version, count, 0, 12, 0, 0) + bytes(1000)
 
 
 def sog_of_zeros() -> bytes:
@@ -223,7 +223,9 @@ SPLAT_FILES = [
     ("big-endian", b"ply\nformat binary_big_endian 1.0\nend_header\n", "binary_little_endian"),
     ("list property", head("element vertex 1", "property list uchar int a") + bytes(8), "scalar"),
     ("count of 5,000 digits", head("element vertex " + "9" * 5000), "zero or more"),
+    ("count whose bytes overflow", head("element vertex 4611686018427387905", "property float x"), "zero or more"),
     ("no element", head(), "without one"),
+    ("property without a width", head("element vertex 1", "property void x"), "parse"),
     ("property twice", head("element vertex 1", "property float x", "property float x"), "same name"),
     ("other element first", head("element camera 1", "property float x"), "'vertex'"),
     ("foreign characters", HEADER + b"element vertex 1\nproperty float \xff\nend_header\n", "ASCII"),
@@ -329,6 +331,8 @@ CAMERA_FILES = [
     ("lens that folds", with_camera(k1=-9), "distortion"),
     ("lens of two models", with_camera(camera_model="OPENCV_FISHEYE", p1=0.1), "fisheye"),
     ("half of a pair in a name", cameras_json().replace(b"images/left", b"images/\\ud800left"), "name"),
+    ("zero byte in a name", cameras_json().replace(b"images/left", b"images/\\u0000left"), "printable"),
+    ("zip without its end", zipped(IN_ZIP)[:-30], "damaged"),
     ("zip of two disks", zipped(IN_ZIP)[:-22] + TWO_DISKS + zipped(IN_ZIP)[-22:], "zip"),
     ("zip in a zip", zipped({"sparse/0/model.zip": zipped(IN_ZIP)}), "zip"),
     ("zip of another size", patched(zipped(IN_ZIP), 24, 10), "zip"),

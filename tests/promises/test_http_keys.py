@@ -15,7 +15,17 @@ import pytest
 from tests.server import Server, run_command, until
 from tests.tiny_scene import TinyScene
 
-from .over_http import NO_ASSET, NO_ID, address_of, assert_problem, bearer, operations_of, request_to, upload_scene
+from .over_http import (
+    NO_ASSET,
+    NO_ID,
+    address_of,
+    assert_problem,
+    bearer,
+    lift_of,
+    operations_of,
+    request_to,
+    upload_scene,
+)
 
 OPEN = {"/healthz", "/readyz", "/openapi.json", "/docs", "/"}
 OWN_ROUTES = {"/key", "/metrics"}  # of whoever asks, and of operators
@@ -57,10 +67,7 @@ def keyed(tiny: TinyScene, encoder: str, tmp_path_factory: pytest.TempPathFactor
         }
         with httpx.Client(base_url=server.client.base_url, headers=bearer(secrets["alice"]), timeout=900) as alice:
             order = upload_scene(alice, tiny)
-            jobs = [alice.post("/lift", json=order).headers["location"] for _ in range(2)]
-            for job in jobs:
-                until(lambda job=job: alice.get(job).json()["state"] == "succeeded")
-        first, second = (job.rpartition("/")[2] for job in jobs)
+            first, second = (lift_of(alice, order)["id"] for _ in range(2))
         yield Keyed(server, secrets, order, (first, second))
 
 

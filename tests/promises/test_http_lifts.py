@@ -93,12 +93,6 @@ def test_views_have_the_cameras_of_their_file(client: httpx.Client, lift: dict[s
         np.testing.assert_allclose(-pose[:3, :3].T @ pose[:3, 3], (VIEWS[view["name"]], 0, 0), atol=1e-6)
 
 
-def test_views_and_channels_that_are_none_are_refused(client: httpx.Client, lift: dict[str, Any]) -> None:
-    for change, status, argument in (({"view": "behind"}, 404, "view"), ({"channel": "x-rays"}, 422, "channel")):
-        reply = client.get("/render", params={"lift": lift["id"], "view": "left"} | change)
-        assert assert_problem(reply, status)["argument"] == argument
-
-
 def test_photos_are_shown_as_they_were_uploaded(client: httpx.Client, lift: dict[str, Any]) -> None:
     photo, content = io.BytesIO(), io.BytesIO()
     Image.new("RGB", (WIDTH, HEIGHT), (1, 2, 3)).save(photo, "PNG")

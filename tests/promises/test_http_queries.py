@@ -136,6 +136,8 @@ WRONG: dict[str, tuple[str, dict[str, Any], int, str]] = {
     "an encoder that does not fit": ("/query", {"text": ["apple"], "encoder": "narrow"}, 422, "encoder"),
     "an unknown table": ("/query", {"text": ["apple"], "table": NO_ASSET}, 404, ""),
     "an unknown object": ("/query", {"sets": ["object:77"]}, 404, ""),
+    "a render of an unknown view": ("/render", {"view": "behind"}, 404, "view"),
+    "a render of no channel": ("/render", {"view": "left", "channel": "x-rays"}, 422, "channel"),
     "a mask of no view": ("/query/mask", {"text": ["apple"]}, 422, "view"),
     "too many examples": ("/query/scores", {"like": ["splat:1"] * 99}, 422, "like"),
 }

@@ -19,8 +19,10 @@ from liftcore import cli
 from PIL import Image
 
 from tests.promises.tiny_files import write_files
-from tests.server import serving, wait_for_end
-from tests.tiny_scene import HEIGHT, VIEWS, WORDS
+from tests.server import serving
+from tests.tiny_scene import HEIGHT, VIEWS, WORDS, make_scene
+
+from .over_http import lift_of, upload, upload_scene
 
 EXAMPLES = (
     "middle:6,12", f"middle:26,{HEIGHT // 2}", "splat:0", "splat:47", "middle:box:3,4,10,20",
@@ -71,20 +73,12 @@ class Interfaces:
     """One lift, which the service made of uploads, and which all others read by its downloaded file."""
 
     def __init__(self, client: TestClient, folder: Path) -> None:
-        self.client, self.folder = client, folder
+        self.client, self.folder, scene = client, folder, make_scene()
         self.files = write_files(folder)
-        assets = {}
-        for kind, path in self.files.items():
-            reply = client.put(f"/assets/{kind}", content=path.read_bytes())
-            assert reply.status_code == 201, reply.text
-            assets[kind] = reply.json()["id"]
-        self.table, self.encoder = assets["table"], f"table:{self.files['table']}"
-        order = {**assets, "features": [assets["features"]], "settings": {"preset": "row-sum"}}
-        job = wait_for_end(client, client.post("/lift", json=order).headers["location"])
-        assert job["state"] == "succeeded", job
-        self.lift = client.get(job["links"]["lift"]).json()
+        self.table, self.encoder = upload(client, "table", scene.table), f"table:{self.files['table']}"
+        self.lift = lift_of(client, upload_scene(client, scene) | {"table": self.table})
         self.path = folder / "downloaded.lift.safetensors"
-        self.path.write_bytes(client.get(job["links"]["features"]).content)
+        self.path.write_bytes(client.get(self.lift["links"]["features"]).content)
         self.scene = lc.Scene(self.path, self.files["splats"], self.files["cameras"])
 
     def get(self, path: str, **parameters: Any) -> Any:

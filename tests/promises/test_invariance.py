@@ -119,7 +119,10 @@ def test_several_blocks_of_splats_and_views_change_no_bit() -> None:
     assert lift(scene, engine=ShuffledEngine(2)) == lift(scene)
 
 
-def test_checkpoint_serves_the_same_geometry_and_features_alone(regions: RandomScene, tmp_path: Path) -> None:
+@pytest.mark.parametrize("engine", [None, lc.LocalEngine(1)], ids=["memory", "files"])
+def test_checkpoint_serves_the_same_geometry_and_features_alone(
+    engine: lc.LocalEngine | None, regions: RandomScene, tmp_path: Path
+) -> None:
     """A folder of another lift's weights never changes a result, whatever differs between the two."""
     moved_splats = replace(regions, splats=replace(regions.splats, means=regions.splats.means + 1e-3))
     relabelled = dict(regions.views)
@@ -139,10 +142,10 @@ def test_checkpoint_serves_the_same_geometry_and_features_alone(regions: RandomS
         (regions, {"alpha_cap": 0.5}),
         (regions, {"stride": 2}),
     ):
-        lift(regions, checkpoint=tmp_path, preset="row-sum")
+        lift(regions, checkpoint=tmp_path, preset="row-sum", engine=engine)
         assert any(tmp_path.iterdir())
         options = {"preset": "row-sum", **settings}
-        assert lift(scene, checkpoint=tmp_path, **options) == lift(scene, **options)
+        assert lift(scene, checkpoint=tmp_path, engine=engine, **options) == lift(scene, **options)
 
 
 @pytest.mark.parametrize("damage", ["cut", "noise"])

@@ -207,7 +207,18 @@ def test_selections_by_hand_are_asked_as_they_are(lift: Path) -> None:
 
 @pytest.mark.parametrize(
     "notation",
-    ["", ":1,2", "v:1.5,2", "v:1", "splat:-1", "region:v:1", "v:box:1,2,3", "v:box:1,2,3,inf", "v:stroke:1,2,3"],
+    [
+        "",
+        ":1,2",
+        "v:1.5,2",
+        "v:1",
+        "splat:-1",
+        "region:v:1",
+        "v:box:1,2",
+        "v:box:1,2,3",
+        "v:box:1,2,3,inf",
+        "v:stroke:1,2,3",
+    ],
 )
 def test_notation_of_no_example_is_refused(notation: str, lift: Path) -> None:
     with pytest.raises(lc.InvalidQuery, match="like"):

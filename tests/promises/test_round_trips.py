@@ -22,9 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from tests import tiny_scene
 from tests.camera_files import binary_files, text_files, write_files
-from tests.promises.bad_files import npy, png
-from tests.promises.scenes import CHANNELS, KERNELS, random_grid, random_scene, random_splats, regions_of, write_pack
-from tests.run_lengths import sam_records
+from tests.promises.scenes import KERNELS, random_scene, random_splats
 
 SPLATS = Path(__file__).parents[1] / "data" / "splats"
 FOREIGN = sorted(path for path in SPLATS.iterdir() if not path.name.endswith(".decoded.ply"))
@@ -183,48 +181,6 @@ def test_region_weights_come_back(tmp_path: Path) -> None:
     np.testing.assert_array_equal(copy.matrix(300).toarray(), weights.matrix(300).toarray())
 
 
-def test_pack_has_the_views_that_were_written(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    camera = random_scene(views=1).cameras["v0"]
-    views = {"a": regions_of(camera, rng), "folder/b": random_grid(rng)}
-    write_pack(tmp_path / "pack.safetensors", views)
-    copies = lc.read_features(tmp_path / "pack.safetensors")
-    regions, grid = copies["a"], copies["folder/b"]
-    assert list(copies) == ["a", "folder/b"] and isinstance(regions, lc.Regions) and isinstance(grid, lc.FeatureGrid)
-    assert torch.equal(regions.labels, views["a"].labels) and torch.equal(regions.codebook, views["a"].codebook)
-    assert torch.equal(grid.grid, views["folder/b"].grid)
-
-
-MASKS = np.zeros((3, 6, 8), bool)
-MASKS[0, :2, :4] = MASKS[1, 1:5, 3:7] = MASKS[2, 5:, 6:] = True  # the first two overlap
-VECTORS = np.random.default_rng(0).normal(size=(3, CHANNELS)).astype(np.float32)
-
-
-@pytest.mark.parametrize("kind", ["a_masks.npy", "a.json", "a.png"])
-def test_masks_of_every_kind_become_regions_that_cover_them(kind: str, tmp_path: Path) -> None:
-    masks = MASKS.copy()
-    if kind == "a.png":  # a picture has one label a pixel
-        masks[0] &= ~masks[1]
-    picture = np.zeros(masks.shape[1:], np.uint8)
-    for number, mask in enumerate(masks, start=1):
-        picture[mask] = number
-    contents = {"a_masks.npy": npy(masks), "a.json": json.dumps(sam_records(masks)).encode(), "a.png": png(picture)}
-    folder = tmp_path / "masks"
-    folder.mkdir()
-    (folder / "a.npy").write_bytes(npy(VECTORS))
-    (folder / kind).write_bytes(contents[kind])
-    lc.pack_folder(folder, tmp_path / "pack.safetensors", "masks", progress=False)
-    view = lc.read_features(tmp_path / "pack.safetensors")["a"]
-    assert isinstance(view, lc.Regions)
-    np.testing.assert_allclose(view.codebook.numpy(), VECTORS, rtol=1e-3)
-    for number, mask in enumerate(masks):
-        np.testing.assert_array_equal((view.labels == number).any(dim=0).numpy(), mask)
-    largest = max(range(3), key=lambda number: masks[number].sum())
-    np.testing.assert_array_equal((view.labels[0] == largest).numpy(), masks[largest], "the largest comes first")
-    from_masks = lc.Regions.from_masks(list(masks), VECTORS)
-    assert torch.equal(from_masks.labels, view.labels)
-
-
 POSES = {  # name of the photo -> quaternion w x y z and translation, from the world to the camera
     "frame 1.jpg": ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 2.0)),
     "left/b.png": ((0.5, 0.5, 0.5, 0.5), (1.0, 2.0, 3.0)),
@@ -355,14 +311,3 @@ def test_views_pair_with_the_one_camera_that_ends_like_them(
     views: list[str], cameras: list[str], pairs: dict[str, str]
 ) -> None:
     assert files.cameras_of_views(views, cameras) == pairs
-
-
-def test_colours_turn_with_their_splats() -> None:
-    """The harmonics of degree 1 are a vector along which a colour grows: it turns as positions do."""
-    splats = random_splats(5, 20, degree=1)
-    rotation = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
-    moved_splats = splats.transformed(np.column_stack([rotation, np.zeros(3)]))
-    assert splats.sh is not None and moved_splats.sh is not None
-    gradients = [-sh[:, [3, 1, 2]].numpy() * np.array([1, 1, -1])[:, None] for sh in (splats.sh, moved_splats.sh)]
-    np.testing.assert_allclose(gradients[1], np.einsum("ij,njc->nic", rotation, gradients[0]), atol=1e-5)
-    np.testing.assert_allclose(moved_splats.means.numpy(), splats.means.numpy() @ rotation.T, atol=1e-5)

@@ -124,15 +124,8 @@ ODD_FORMS: dict[str, tuple[dict[str, bytes], dict[str, bytes], dict[str, Any]]] 
     "run lengths as Python's text of bytes": (
         {"m.json": coco("123")}, {"m.json": coco("b'123'")}, {"kind": "prompts"},
     ),
-    "map in a batch of one": (
-        {"é.npy": npy(MAP)}, {"é.npy": npy(MAP[None])}, {"kind": "npy", "layout": "chw"},
-    ),
     "name in another form of Unicode": (
         {"é.npy": npy(MAP)}, {"e\u0301.npy": npy(MAP)}, {"kind": "npy", "layout": "chw"},
-    ),
-    "masks as SAM's predictor gives them": (
-        {"é.npy": npy(VECTORS), "é_masks.npy": npy(MASKS)},
-        {"é.npy": npy(VECTORS), "é_masks.npy": npy(MASKS[:, None])}, {"kind": "masks"},
     ),
     "files of an operating system": (
         {"é.npy": npy(MAP)},

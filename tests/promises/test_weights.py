@@ -168,23 +168,6 @@ def agreement(result: lc.LiftResult, truth: lc.LiftResult) -> float:
     return float(cosines.mean())
 
 
-def test_reweighting_mends_masks_that_merge_things() -> None:
-    """In a third of the views one mask covers all: others tell its halves apart, which row sums cannot weigh."""
-    scene = random_scene(13, count=300, views=9, wrong=0.0)
-    views, merged = {}, {}
-    for number, (name, view) in enumerate(scene.views.items()):
-        assert isinstance(view, lc.Regions)
-        halves = view.labels[:1].clamp(max=1)
-        book = np.eye(6, CHANNELS, dtype=np.float32)
-        views[name] = lc.Regions(halves, book)
-        merged[name] = lc.Regions(halves * 0 + 2, book) if number % 3 == 0 else views[name]
-    truth = lc.lift(scene.splats, scene.cameras, views, preset="row-sum", progress=False)
-    expected_rows = lc.lift(scene.splats, scene.cameras, merged, preset="row-sum", progress=False)
-    robust = lc.lift(scene.splats, scene.cameras, merged, progress=False)
-    assert agreement(expected_rows, truth) < 0.97
-    assert 1 - agreement(robust, truth) < 0.5 * (1 - agreement(expected_rows, truth))
-
-
 def test_masks_of_other_views_weigh_where_vectors_are_too_noisy() -> None:
     """A third of the masks cover all, and vectors are mostly noise: what views keep together still tells halves."""
     scene, rng = random_scene(13, views=9, wrong=0.0), np.random.default_rng(13)
@@ -240,22 +223,3 @@ def test_splats_of_a_cluster_take_its_feature_or_keep_their_own() -> None:
     np.testing.assert_array_equal(features[cluster < 0], expected_rows[cluster < 0])
     strict = lc.lift(*scene.arguments(), aggregation=True, aggregation_cluster_size=5, aggregation_iou=1, **settings)
     np.testing.assert_array_equal(strict.features.numpy(), expected_rows, "no silhouette is a region to the pixel")
-
-
-def test_smoothness_draws_neighbours_together_without_moving_their_mean() -> None:
-    scene = random_scene(23, grids=True)
-    settings: dict[str, Any] = {"preset": "row-sum", "dtype": "float32", "progress": False}
-    results = [lc.lift(*scene.arguments(), smoothness=weight, **settings) for weight in (0.0, 0.3, 30.0)]
-    row_sums, weak, strong = (float(result.features[result.has_feature].var(dim=0).sum()) for result in results)
-    assert row_sums > weak > strong
-    means = [result.total_weight @ result.features / result.total_weight.sum() for result in results]
-    for mean in means[1:]:
-        np.testing.assert_allclose(mean.numpy(), means[0].numpy(), atol=1e-3)
-
-
-def test_plan_names_the_views_of_the_lift_and_bounds_its_features() -> None:
-    scene = random_scene()
-    plan = lc.plan(*scene.arguments(), view_stride=2)
-    result = lc.lift(*scene.arguments(), view_stride=2, progress=False)
-    assert plan.views == result.views == ("v0", "v2")
-    assert plan.memory_bytes >= result.features.numpy().nbytes

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -51,15 +51,13 @@ def row_of_splats(count: int) -> lc.Splats:
     )
 
 
-def scene_with(
-    features: np.ndarray, weights: np.ndarray | None = None, splats: lc.Splats | None = None, **fields: object
-) -> lc.Scene:
+def scene_with(features: np.ndarray, weights: np.ndarray | None = None, **fields: object) -> lc.Scene:
     """Return a scene whose splats have features [P, F] of total weight one, or of weights [P].
 
     The splats are a row (`row_of_splats`), and its view is called "front". ``fields`` are others of the lift.
     """
     count, channels = features.shape
-    splats = row_of_splats(count) if splats is None else splats
+    splats = row_of_splats(count)
     width = count + 2
     K = np.array([[4.0, 0, width / 2], [0, 4.0, 1.5], [0, 0, 1]])
     cameras = {"front": lc.Camera(np.eye(4), K, width, 3)}
@@ -71,11 +69,9 @@ def scene_with(
     return lc.Scene(replace(result, **values, **fields), splats, cameras)
 
 
-def photo_vectors(words: Sequence[str], noise: float = 0.1, parts: Mapping[int, str] | None = None) -> np.ndarray:
+def photo_vectors(words: Sequence[str], noise: float = 0.1) -> np.ndarray:
     """Return vectors [n, 512] like those of photos of words of the shipped table: near to each other, and a cosine of
     .29 to their own word.
-
-    ``parts`` are rows that are of another word, too.
     """
     encoder = lc.open_encoder("lvis")
     rng = np.random.default_rng(0)
@@ -85,7 +81,4 @@ def photo_vectors(words: Sequence[str], noise: float = 0.1, parts: Mapping[int, 
     gap -= mean * (gap @ mean) / np.square(mean).sum()
     offsets = rng.normal(size=rows.shape)
     rows = 0.28 * rows + 0.9 * gap / np.linalg.norm(gap)
-    rows += noise * offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
-    for row, word in (parts or {}).items():
-        rows[row] = 0.4 * rows[row] + 0.6 * photo_vectors([word], noise)[0]
-    return rows
+    return rows + noise * offsets / np.linalg.norm(offsets, axis=1, keepdims=True)

@@ -17,6 +17,7 @@ from liftcore.scene.cameras import Camera
 from liftcore.scene.compositing import ALPHA_FLOOR, LOW_PASS, NEAR_PLANE, CompositingParams
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
+from tests.properties.oracle import pixels_of
 from tests.scenes import random_camera, random_splats
 
 SEEDS = range(5)
@@ -33,12 +34,6 @@ def of_gsplat(splats: Splats, camera: Camera) -> dict[str, np.ndarray]:
     assert compensations is not None
     parts = {"mean": means, "depth": depths, "conic": conics, "compensation": compensations}
     return {name: part[0].numpy() for name, part in parts.items()}
-
-
-def centres(camera: Camera) -> np.ndarray:
-    """Return the centres of the pixels, [H * W, 2] px."""
-    y, x = np.mgrid[: camera.height, : camera.width]
-    return np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
 
 
 def check_alpha(
@@ -62,7 +57,7 @@ def check_alpha(
 @pytest.mark.parametrize("seed", SEEDS)
 def test_gaussians_are_projected_and_drawn_as_gsplat_projects_them(seed: int) -> None:
     splats, camera = random_splats(seed, 50), random_camera(seed)
-    projection, pixels, ray_count = of_gsplat(splats, camera), centres(camera), 0
+    projection, pixels, ray_count = of_gsplat(splats, camera), pixels_of(camera).double().numpy() + 0.5, 0
     for j in np.flatnonzero(projection["depth"] > NEAR_PLANE).tolist():
         mean, conic, compensation = projected_gaussian(splats, j, camera)
         a, b, c = projection["conic"][j]
@@ -85,7 +80,7 @@ def test_discs_are_crossed_where_gsplats_ray_transforms_cross_them(seed: int) ->
         splats.means.double(), splats.quats.double(), scales, pose, K, camera.width, camera.height
     )
     depths, transforms = (part[0].numpy() for part in projection[2:4])
-    pixels, ray_count = centres(camera), 0
+    pixels, ray_count = pixels_of(camera).double().numpy() + 0.5, 0
     for j in np.flatnonzero(depths > NEAR_PLANE).tolist():
         u, v, w = transforms[j]
         cross = np.cross(pixels[:, :1] * w - u, pixels[:, 1:] * w - v)

@@ -28,6 +28,7 @@ from liftcore.solve.diagnostics import FAINT, order_warnings
 from liftcore.values.pack import read_features, write_pack
 from liftcore.values.views import ViewFeatures
 from tests.inria_file import write_inria_cameras
+from tests.properties.oracle import dense, one_region_a_ray, pixels_of
 from tests.scenes import camera_at_origin, splats_at
 
 KERNELS = (Kernel.GAUSSIAN_3D, Kernel.GAUSSIAN_2D, Kernel.BETA)
@@ -84,23 +85,15 @@ def weights_of(
     splats: lc.Splats, camera: lc.Camera, params: lc.CompositingParams, power: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:
     """A^p [H * W, P] and the total weight [P], through region weights with one region a pixel."""
-    rays = camera.width * camera.height
-    labels = torch.arange(rays, dtype=torch.int32).reshape(1, camera.height, camera.width)
-    every_ray = lc.Regions(labels, torch.ones(rays, 1))
-    got = CpuRaster(splats, threads=2).region_weights(camera, every_ray, params, Weighting(power))
-    A = np.zeros((rays, splats.count))
-    rows = np.repeat(got.splats.numpy(), np.diff(got.indptr.numpy()))
-    A[got.region.numpy(), rows] = got.weight.numpy()
+    got = CpuRaster(splats, threads=2).region_weights(camera, one_region_a_ray(camera), params, Weighting(power))
     total_weight = np.zeros(splats.count)
     total_weight[got.total_weight_splats.numpy()] = got.total_weight.numpy()
-    return A, total_weight
+    return dense(got, splats.count, camera.width * camera.height).T, total_weight
 
 
 def trace_weights(splats: lc.Splats, camera: lc.Camera, params: lc.CompositingParams) -> np.ndarray:
     """A [H * W, P] by single rays, as the diagnostics take it."""
-    y, x = np.mgrid[: camera.height, : camera.width]
-    pixels = torch.tensor(np.stack([x.ravel(), y.ravel()], axis=1), dtype=torch.int32)
-    rows = CpuRaster(splats, threads=1).ray_rows(camera, pixels, params)
+    rows = CpuRaster(splats, threads=1).ray_rows(camera, pixels_of(camera), params)
     A = np.zeros((camera.width * camera.height, splats.count))
     A[np.repeat(np.arange(A.shape[0]), np.diff(rows.indptr.numpy())), rows.splats.numpy()] = rows.weights.numpy()
     return A

@@ -43,6 +43,7 @@ OPAQUE = 1e4  # a logit
 ALPHA = 1 / (1 + math.exp(-1.0))  # of the logit 1
 ON_NEAR_PLANE = float(np.nextafter(np.float32(0.01), np.float32(1)))  # the first float32 that is not below 0.01
 DUST = math.log(1e-12)  # a log scale
+THIN, ASKEW = 1e-6, math.atan2(1.0, 2.0)  # scale and angle of a hair
 ENDLESS = lc.CompositingParams(transmittance_stop=0.0)
 
 
@@ -99,6 +100,23 @@ SHAPES: tuple[Extreme, ...] = (
 
     view_of("dust under the mip filter's compensation", at(ROW, DUST, params=lc.CompositingParams(antialiased=True)),
         lambda A: A.max() == 0, kernels=GAUSSIAN, text="smaller than 1e-07 scene units"),
+    view_of("700 discs behind each other, of which a ray meets few before it has stopped",
+        at([(0.0, 0.0, 1.0 + 0.01 * k) for k in range(700)], 1.0, logits=[2.0] * 8 + [-2.0] * 692),
+        lambda A: A[:, 12:].max() == 0 and A.sum(axis=1).max() <= 1.0, kernels=DISC),
+    view_of("a hair askew, .8 of its thickness off the centres: from pixel to pixel s changes by up to a million",
+        at([(-0.8 * THIN * math.sin(ASKEW), 0.8 * THIN * math.cos(ASKEW), 2.0)], [2.0, math.log(THIN), 0.0],
+            camera=camera_at_origin(64, 32), quats=(math.cos(ASKEW / 2), 0.0, 0.0, math.sin(ASKEW / 2))),
+        lambda A: A.reshape(32, 64)[7, 14] > 0.4, kernels=DISC),  # far from its middle
+    *(
+        view_of(f"a floor around the camera that ends at its horizon, turned by {tilt:g}",
+            at([(0.0, height, 0.5), (0.3, height, 3.0)], 2.0, camera=camera_at_origin(40, 40), quats=_about_x(tilt)),
+            lambda A: A.any() and (A == 0).any(axis=0).all(), kernels=DISC)
+        for height, tilt in ((-0.5, 1.4), (0.01, math.pi / 2), (0.3, 1.2))
+    ),
+    view_of("a floor that rises towards the camera and passes behind it: rays upwards meet it only backwards",
+        at([(0.0, 0.2, 0.1)], 3.0, camera=_pinhole(21, 21, 10.0, (10.5, 10.5), np.eye(4)),
+            quats=_about_x(math.pi / 2 + 1e-3)),
+        lambda A: A.reshape(21, 21)[:5, 10].max() == 0 and A.reshape(21, 21)[14:, 10].min() > 0.5, kernels=DISC),
     # Weight on the ray through the middle only.
     view_of("DBS: b of +30", at(MIDDLE, -0.5, betas=30.0), lambda A: (A > 0).sum() == 1, kernels=BETA),
 )
@@ -299,7 +317,8 @@ MAPS: tuple[Extreme, ...] = (
 
 
     lift_of("a grid finer than the pixels", _random_grid(50, 70)),
-    lift_of("squared weights and a gain of 16", checkerboard(), settings={"power": 2, "gain": 16.0}),
+    lift_of("squared weights and a gain of 16", checkerboard(), settings={"power": 2, "gain": 16.0},
+        kernels=GAUSSIAN),
     lift_of("weights of 1e-20, squared (DBS)", checkerboard(), lambda lift: float(lift.total_weight[0]) < 1e-15,
         splats=splats_at([(0.0, 0.0, 0.0)], 0.0, logits=-46.0, kernel=Kernel.BETA), settings={"power": 2},
         text="where float32 loses digits", kernels=BETA),

@@ -126,20 +126,6 @@ def few_views(seed: int, folder: str = "") -> dict[str, lc.FeatureGrid]:
     return {f"{folder}v{k}": lc.FeatureGrid(rng.normal(0, 1, (6, 8, 4)).astype(np.float32)) for k in range(3)}
 
 
-def test_features_in_the_place_of_others_are_lifted(tmp_path: Path) -> None:
-    names = "cam/v0", "cam/v1", "cam/v2"
-    cameras = lc.Cameras({name: look_at(np.array([0.3 * k, 0, -4]), name) for k, name in enumerate(names)})
-    splats, pack = random_splats(3, 300), tmp_path / "pack.safetensors"
-    for seed in (1, 2):
-        write_pack(pack, few_views(seed, "cam/"), {})
-        expected = lc.lift(splats, cameras, few_views(seed, "cam/"), "row-sum")
-        for views in (few_views(seed), few_views(seed, "cam/"), lc.read_features(pack)):  # named without folders too
-            result = lc.lift(splats, cameras, views, "row-sum", engine=LocalEngine(1), checkpoint=tmp_path / "work")
-            assert_same(result, expected)
-    maps = Path("/proc/self/maps")  # Linux
-    assert not maps.exists() or "scene.safetensors" not in maps.read_text()  # X alone stays mapped
-
-
 @pytest.mark.slow
 def test_other_engines_go_on_from_the_pieces_of_each_stage(scene: dict[str, Any], tmp_path: Path) -> None:
     write_pack(tmp_path / "pack.safetensors", scene["views"], {})

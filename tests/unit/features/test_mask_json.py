@@ -27,8 +27,8 @@ UNDECIDED = "-"  # of a pixel without a label
 MUG_POLYGON, BOWL_POLYGON = [[1, 1, 4, 1, 4, 4, 1, 4]], [[5, 2, 8, 2, 8, 5, 5, 5]]
 
 
-def rle(mask: np.ndarray, *, as_string: bool = True) -> dict[str, Any]:
-    return sam_records(mask[None], as_string=as_string)[0]["segmentation"]
+def rle(mask: np.ndarray) -> dict[str, Any]:
+    return sam_records(mask[None], as_string=True)[0]["segmentation"]
 
 
 def coco(*masks: tuple[int, int, Any], images: int = 2, **entries: dict[str, Any]) -> dict[str, Any]:

@@ -154,6 +154,8 @@ def test_every_mask_is_whole_on_one_level(masks: np.ndarray) -> None:
         assert np.array_equal(level_mask.any(axis=0), mask)
         assert level_mask.any(axis=(1, 2)).sum() == mask.any()
     assert all((level >= 0).any() for level in labels[1:])
+    largest = masks.sum(axis=(1, 2)).argmax()
+    assert np.array_equal(labels[0] == largest, masks[largest]), "the largest comes first"
 
 
 def test_too_many_masks_over_a_pixel_are_refused_with_their_number() -> None:

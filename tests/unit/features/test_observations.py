@@ -16,8 +16,8 @@ PINCUSHION = Brown(k1=0.2)
 WIDE = Fisheye(k1=0.02)
 
 
-def camera(distortion: Distortion, name: str = "v") -> Camera:
-    return behind_lens(Camera.pinhole(name, 60, 44, 48.0, 47.0, 29.0, 23.0, np.eye(4)), distortion)
+def camera(distortion: Distortion) -> Camera:
+    return behind_lens(Camera.pinhole("v", 60, 44, 48.0, 47.0, 29.0, 23.0, np.eye(4)), distortion)
 
 
 def photo_place(view: Camera, row: float, column: float) -> tuple[float, float]:

@@ -23,14 +23,11 @@ pytestmark = pytest.mark.slow
 VIEWS, CHANNELS = FEW_VIEWS + 8, 48
 
 
-def disagreeing(folder, error: float, gap: bool = False, labelled: bool = True):
+def disagreeing(folder, error: float):
     """Write a scene on a ring of cameras, a vector a view, with errors of this relative length; return its paths."""
     folder.mkdir()
     generator = torch.Generator().manual_seed(3)
     truth, labels = torch.eye(CHANNELS)[:1], torch.zeros(1, 6, 8, dtype=torch.int32)
-    labels[:, :, 4 if gap else 8 :] = -1
-    if not labelled:
-        labels[:] = -1
     errors = torch.randn(VIEWS, CHANNELS, generator=generator)
     errors *= error / CHANNELS**0.5
     cameras = [centred(camera) for camera in ring(VIEWS)]

@@ -187,12 +187,6 @@ def test_any_name_of_a_view_can_be_pointed_at(view: str, x: int, y: int) -> None
         assert parse_example(str(example)) == example
 
 
-@pytest.mark.parametrize("area", ["box", "stroke"])
-def test_an_area_without_its_corners_is_refused(scene: Scene, area: str) -> None:
-    with pytest.raises(InvalidQuery, match="VIEW:box:x0,y0,x1,y1"):
-        scene.ask(Query(like=[f"middle:{area}:6,12"]))
-
-
 def test_vectors_come_from_numpy_files(tmp_path: Path) -> None:
     np.save(tmp_path / "v.npy", np.arange(3, dtype=np.float16)[None])
     assert read_example(str(tmp_path / "v.npy")) == Vector((0.0, 1.0, 2.0))

@@ -22,10 +22,9 @@ def nested(scene: Scene, tmp_path: Path) -> Scene:
     return Scene(tmp_path / "parts.lift.safetensors", scene.splats, scene.cameras)
 
 
-def candidates_of(scene: Scene, *like: str, unlike: tuple[str, ...] = ()) -> list[tuple[int, str]]:
+def candidates_of(scene: Scene, like: str) -> list[tuple[int, str]]:
     """Return the id and kind of each candidate."""
-    query = Query(like=list(like), unlike=list(unlike))
-    return [(candidate.id, candidate.kind) for candidate in scene.ask(query).candidates]
+    return [(candidate.id, candidate.kind) for candidate in scene.ask(Query(like=[like])).candidates]
 
 
 def test_a_part_that_is_nearly_all_of_its_whole_is_not_offered_beside_it(scene: Scene, tmp_path: Path) -> None:

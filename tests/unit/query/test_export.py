@@ -8,7 +8,7 @@ import pytest
 from liftcore.io.splats import read_splats
 from liftcore.query.ask import ask
 from liftcore.query.colours import NOT_SEEN_COLOUR, colour_map
-from liftcore.query.question import Answer, Query
+from liftcore.query.question import Query
 from liftcore.query.scene import Scene
 from liftcore.query.terms import Vector
 from liftcore.scene.harmonics import SH_C0
@@ -24,12 +24,8 @@ def scene(tmp_path: Path) -> Scene:
     return Scene(write_lift(tmp_path, splats=ply(np.concatenate([splat_rows(), behind]))))
 
 
-def of_lamp(scene: Scene, threshold: float = 0.5) -> Answer:
-    return ask(scene, Query.of((Vector(tuple(AXES[2])),), threshold=threshold))
-
-
 def test_scores_have_the_colours_of_the_map_and_what_was_not_seen_is_grey(scene: Scene, tmp_path: Path) -> None:
-    answer = of_lamp(scene)
+    answer = ask(scene, Query.of((Vector(tuple(AXES[2])),), threshold=0.5))
     assert not answer.has_feature[-1]
     scene.export(tmp_path / "scores.ply", answer, "coloured")
     sh = read_splats(tmp_path / "scores.ply").sh

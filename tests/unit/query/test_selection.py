@@ -34,12 +34,6 @@ def lifted(scene: Scene, features: np.ndarray, **fields: Any) -> Scene:
     return Scene(replace(scene.lift, features=torch.from_numpy(features.astype(np.float32)), **defaults | fields))
 
 
-def noisy(vectors: np.ndarray, noise: float, seed: int = 0) -> np.ndarray:
-    """Return vectors [n, F] with an added offset of length ``noise`` each."""
-    offsets = np.random.default_rng(seed).normal(size=vectors.shape)
-    return vectors + noise * offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
-
-
 def pictures(table: TableEncoder, words: Sequence[str], noise: float, hub: float = 0.0) -> np.ndarray:
     """Return [n, 512], vectors like those of photos: cosine .29 to their word, .22 to others; ``hub`` adds hub words.
 
@@ -49,7 +43,9 @@ def pictures(table: TableEncoder, words: Sequence[str], noise: float, hub: float
     gap = np.random.default_rng(5).normal(size=512)
     gap -= mean * (gap @ mean) / np.square(mean).sum()
     hubs = (table.encode(table.words[::100]) - mean).sum(axis=0)
-    return noisy(0.28 * rows + 0.9 * gap / np.linalg.norm(gap) + hub * hubs / np.linalg.norm(hubs), noise)
+    offsets = np.random.default_rng(0).normal(size=rows.shape)
+    offsets *= noise / np.linalg.norm(offsets, axis=1, keepdims=True)
+    return 0.28 * rows + 0.9 * gap / np.linalg.norm(gap) + hub * hubs / np.linalg.norm(hubs) + offsets
 
 
 def test_presence_hidden_by_hubs_is_unsure_and_selected(scene: Scene, table: TableEncoder) -> None:
@@ -194,5 +190,9 @@ def test_word_of_a_part_takes_its_node_where_levels_disagree(
     assert ("the named parts are selected" in answer.threshold.explanation) == by_node
     assert np.flatnonzero(ask(subject, "mug", table).selected)[[0, -1]].tolist() == [0, 299]
     references = References(tuple(table.words), table.embeddings)
-    parts = list(part_nodes(subject, (CompetingWords.among(references, word[None]) for word in table.embeddings)))
+    parts = list(
+        part_nodes(
+            subject, (CompetingWords.among(references, word[None]) for word in table.encode(["mug", "handle", "cat"]))
+        )
+    )
     assert any(parts) == by_node

@@ -49,10 +49,10 @@ def zipped(root: Path, folder: str) -> Path:
     return Path(shutil.make_archive(f"{root}-zipped", "zip", root, folder))
 
 
-def named_model(*names: str, shift: float = 0.0) -> dict[str, bytes]:
+def named_model(*names: str) -> dict[str, bytes]:
     """Return the files of a model of images with these names, at distinct positions."""
     return binary_files(
-        images=[(1, (1.0, 0.0, 0.0, 0.0), (shift, 0.0, float(k)), name) for k, name in enumerate(names)]
+        images=[(1, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, float(k)), name) for k, name in enumerate(names)]
     )
 
 

@@ -89,9 +89,8 @@ WIDE = Fisheye(k1=0.01, k2=-0.003)
 LENSES = {"barrel": BARREL, "pincushion": PINCUSHION, "fisheye": WIDE}
 
 
-def camera(distortion: Distortion, width: int = 64, height: int = 48, focal: float = 50.0) -> Camera:
-    pinhole = Camera.pinhole("v", width, height, focal, 1.02 * focal, 0.49 * width, 0.52 * height, np.eye(4))
-    return behind_lens(pinhole, distortion)
+def camera(distortion: Distortion) -> Camera:
+    return behind_lens(Camera.pinhole("v", 64, 48, 50.0, 51.0, 31.36, 24.96, np.eye(4)), distortion)
 
 
 def corners(view: Camera) -> tuple[np.ndarray, np.ndarray]:

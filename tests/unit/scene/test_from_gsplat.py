@@ -13,8 +13,8 @@ from tests.scenes import random_camera
 P = 120
 
 
-def parameters(seed: int = 0) -> dict[str, Any]:
-    rng = np.random.default_rng(seed)
+def parameters() -> dict[str, Any]:
+    rng = np.random.default_rng(0)
     shapes = {"means": (P, 3), "quats": (P, 4), "scales": (P, 3), "opacities": (P,)}
     return {name: torch.tensor(rng.normal(-1, 2, shape), dtype=torch.float32) for name, shape in shapes.items()}
 

@@ -27,9 +27,9 @@ FILES = Path(__file__).parents[2] / "data" / "splats"
 P = 40
 
 
-def some_splats(kernel: Kernel = Kernel.GAUSSIAN_3D, degree: int = 3) -> Splats:
+def some_splats(kernel: Kernel = Kernel.GAUSSIAN_3D) -> Splats:
     generator = np.random.default_rng(7)
-    sh = generator.normal(size=(P, (degree + 1) ** 2, 3)).astype("f4")
+    sh = generator.normal(size=(P, 16, 3)).astype("f4")
     return replace(random_splats(3, kernel=kernel, count=P), sh=torch.from_numpy(sh))
 
 

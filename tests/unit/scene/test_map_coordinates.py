@@ -37,13 +37,13 @@ from tests.scenes import random_camera, random_regions, random_splats, splats_at
 UTM = np.array([500_000.25, 5_400_000.5, 300.125])
 
 
-def moved_splats(splats: Splats, offset: np.ndarray = UTM) -> Splats:
-    return replace(splats, means=splats.means.double() + torch.from_numpy(offset))
+def moved_splats(splats: Splats) -> Splats:
+    return replace(splats, means=splats.means.double() + torch.from_numpy(UTM))
 
 
-def moved_camera(camera: Camera, offset: np.ndarray = UTM) -> Camera:
+def moved_camera(camera: Camera) -> Camera:
     pose = camera.viewmat.copy()
-    pose[:3, 3] -= pose[:3, :3] @ offset
+    pose[:3, 3] -= pose[:3, :3] @ UTM
     return camera.replace(viewmat=pose)
 
 

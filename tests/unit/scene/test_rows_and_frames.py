@@ -17,10 +17,10 @@ TURN = Rotation.from_rotvec([0.4, -1.1, 0.7])
 MATRIX = np.block([[2.5 * TURN.as_matrix(), np.array([[3.0], [-1.0], [7.0]])], [np.array([[0.0, 0.0, 0.0, 1.0]])]])
 
 
-def coloured(kernel: Kernel, degree: int = 3) -> lc.Splats:
+def coloured(kernel: Kernel) -> lc.Splats:
     splats = random_splats(5, 60, kernel=kernel)
     rng = np.random.default_rng(1)
-    sh = torch.tensor(rng.normal(size=(60, (degree + 1) ** 2, 3)), dtype=torch.float32)
+    sh = torch.tensor(rng.normal(size=(60, 16, 3)), dtype=torch.float32)
     lobes = torch.tensor(rng.normal(size=(60, 2, 6)), dtype=torch.float32) if kernel is Kernel.BETA else None
     extras = {name: torch.tensor(rng.normal(size=60)) for name in ("nx", "ny", "nz")} | {"mask": torch.arange(60)}
     return replace(splats, sh=sh, sb_params=lobes, extras=extras)

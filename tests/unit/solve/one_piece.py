@@ -54,13 +54,11 @@ def algebra_of(
     return Algebra(pieces, LocalEngine(threads), silent, threads)
 
 
-def mask_consensus(
-    W: RegionWeights, levels: np.ndarray, threads: int | None = None, means: Tensor | None = None
-) -> np.ndarray:
+def mask_consensus(W: RegionWeights, levels: np.ndarray, means: Tensor | None = None) -> np.ndarray:
     """Return c of every entry of W [nnz] f32."""
-    algebra = algebra_of(W, levels=levels, means=means, threads=threads)
+    algebra = algebra_of(W, levels=levels, means=means)
     algebra.compare_masks()
-    consensus = steps.consensus_of(algebra.pieces, 0, steps.splat_block(algebra.pieces, 0).W, threads)
+    consensus = steps.consensus_of(algebra.pieces, 0, steps.splat_block(algebra.pieces, 0).W, None)
     assert consensus is not None
     return consensus.numpy()
 

@@ -22,11 +22,11 @@ def of_dense(view: np.ndarray) -> RegionWeights:
     return one_view(ids, indptr, regions, weights, ids, torch.ones(splats.size), regions=view.shape[1])
 
 
-def random_view(seed: int, regions: int, splats: int, share: float = 0.4) -> RegionWeights:
+def random_view(seed: int, regions: int, splats: int) -> RegionWeights:
     """W of a view: some splats, each with one to six entries."""
     rng = np.random.default_rng(seed)
     view = np.zeros((splats, regions))
-    for splat in np.flatnonzero(rng.random(splats) < share):
+    for splat in np.flatnonzero(rng.random(splats) < 0.4):
         row_regions = rng.choice(regions, rng.integers(1, min(6, regions) + 1), replace=False)
         view[splat, row_regions] = rng.uniform(0.01, 1, row_regions.size)
     return of_dense(view)

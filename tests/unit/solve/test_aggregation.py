@@ -23,8 +23,8 @@ pytestmark = pytest.mark.slow
 P, K = 40, 3
 
 
-def clustering_of(labels: np.ndarray, count: int = K) -> Clustering:
-    return Clustering(torch.tensor(labels, dtype=torch.int32), count, {})
+def clustering_of(labels: np.ndarray) -> Clustering:
+    return Clustering(torch.tensor(labels, dtype=torch.int32), K, {})
 
 
 @given(st.integers(0, 2**20), st.sampled_from([0.1, 0.3, 0.6]))

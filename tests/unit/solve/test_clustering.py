@@ -12,12 +12,12 @@ from liftcore.values.settings import LiftSettings
 SETTINGS = LiftSettings.of(aggregation=True, aggregation_cluster_size=20)
 
 
-def planted(count: int, channels: int = 24, groups: int = 4, seed: int = 0) -> tuple[torch.Tensor, np.ndarray]:
-    """Features [P, F] f16 around ``groups`` directions in a narrow cone, and the group of each row."""
-    rng = np.random.default_rng(seed)
-    group = rng.integers(0, groups, count)
-    vectors = 3 * np.ones(channels) / np.sqrt(channels) + rng.normal(0, 1, (groups, channels)) / np.sqrt(channels)
-    rows = vectors[group] + rng.normal(0, 0.1, (count, channels)) / np.sqrt(channels)
+def planted(count: int) -> tuple[torch.Tensor, np.ndarray]:
+    """Features [P, 24] f16 around four directions in a narrow cone, and the group of each row."""
+    rng = np.random.default_rng(0)
+    group = rng.integers(0, 4, count)
+    vectors = (3 * np.ones(24) + rng.normal(0, 1, (4, 24))) / np.sqrt(24)
+    rows = vectors[group] + rng.normal(0, 0.1, (count, 24)) / np.sqrt(24)
     return torch.tensor(rows * rng.uniform(0.2, 1.0, (count, 1)), dtype=torch.float16), group
 
 

@@ -18,11 +18,6 @@ from tests.unit.solve.sparse_views import codebook_of, dense, of_dense
 SPLATS = 60
 
 
-def consensus_of(W: RegionWeights, levels: np.ndarray, means: torch.Tensor | None = None) -> np.ndarray:
-    """c of every entry of W [nnz]."""
-    return mask_consensus(W, levels, means=means)
-
-
 def random_scene(seed: int, views: int = 4, levels: int = 2) -> tuple[RegionWeights, np.ndarray]:
     """W of views whose levels part the splats in three to five regions, some on two of them; and the levels."""
     rng = np.random.default_rng(seed)
@@ -98,15 +93,15 @@ def test_consensus_equals_its_definition(seed: int, levels: int) -> None:
     W, levels_of_regions = random_scene(seed, levels=levels)
     means = torch.from_numpy(np.random.default_rng(seed).normal(size=(SPLATS, 3)))
     for order in (None, means):  # in which splats are read
-        got = entries(W, consensus_of(W, levels_of_regions, order))
+        got = entries(W, mask_consensus(W, levels_of_regions, means=order))
         np.testing.assert_allclose(got, defined(W, levels_of_regions), rtol=2e-5, atol=1e-6)
 
 
 def test_cells_of_grids_take_no_part() -> None:
     W, levels = random_scene(5)
     levels[W.offsets[1] : W.offsets[2]] = -1
-    np.testing.assert_allclose(entries(W, consensus_of(W, levels)), defined(W, levels), rtol=2e-5, atol=1e-6)
-    assert (consensus_of(W, np.full_like(levels, -1)) == 1.0).all()
+    np.testing.assert_allclose(entries(W, mask_consensus(W, levels)), defined(W, levels), rtol=2e-5, atol=1e-6)
+    assert (mask_consensus(W, np.full_like(levels, -1)) == 1.0).all()
 
 
 def test_more_tuples_than_the_first_table_holds_are_distinguished() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from liftcore.lifting.pieces import stacked
 from liftcore.solve import objects
-from liftcore.solve.objects import CONTAINS, OBSERVES, RegionObjects
+from liftcore.solve.objects import CONTAINS, OBSERVES
 from liftcore.solve.region_tree import LEAST_VIEWS, MERGE_RATE
 from liftcore.values.region_weights import RegionWeights
 from tests.unit.solve.one_piece import region_objects
@@ -15,15 +15,11 @@ from tests.unit.solve.sparse_views import dense, of_dense
 from tests.unit.solve.test_consensus import SPLATS, belonging, of_things, random_scene
 
 
-def objects_of(W: RegionWeights, levels: np.ndarray, total_weight: np.ndarray) -> RegionObjects:
-    return region_objects(W, levels, total_weight)
-
-
-def mistaken_scene(seed: int, views: int = 7) -> tuple[RegionWeights, np.ndarray]:
+def mistaken_scene(seed: int) -> tuple[RegionWeights, np.ndarray]:
     """Five things of two parts, masks of them and of their parts, with splats astray, unseen, and masks merged."""
     rng, parts, levels = np.random.default_rng(seed), [], []
     part = np.arange(SPLATS) // 6
-    for _ in range(views):
+    for _ in range(7):
         columns = []
         for level, right in enumerate((part // 2, part)):
             labels = np.where(rng.random(SPLATS) < 0.1, rng.integers(0, right.max() + 1, SPLATS), right)
@@ -78,7 +74,7 @@ def defined(W: RegionWeights, levels: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(3))
 def test_objects_are_those_of_the_definition(seed: int) -> None:
     W, levels = mistaken_scene(seed)
-    objects, expected = objects_of(W, levels, np.ones(SPLATS)), defined(W, levels)
+    objects, expected = region_objects(W, levels, np.ones(SPLATS)), defined(W, levels)
     sums = np.zeros((SPLATS, expected.max() + 2))
     for m, group in enumerate(expected):
         sums[:, group + 1] += dense(W, SPLATS)[:, m]
@@ -94,7 +90,7 @@ def test_merged_and_split_masks_do_not_change_the_objects() -> None:
     right = [0, 1, 2, 3]
     merged, split = [0, 0, 1, 2], [0, 1, 2, 2]
     W, levels = of_things([right, merged, right, split, right, right])
-    objects = objects_of(W, levels, np.arange(SPLATS) + 1.0)
+    objects = region_objects(W, levels, np.arange(SPLATS) + 1.0)
     np.testing.assert_array_equal(objects.labels, np.repeat([3, 2, 1, 0], SPLATS // 4))  # largest total weight first
     assert len(objects.views) == 4 and set(objects.views[0][objects.views[0] >= 0]) <= set(range(6))
 
@@ -104,14 +100,14 @@ def test_a_splat_between_two_objects_has_the_one_of_its_first_region(swapped: bo
     rows = np.zeros((SPLATS, 2))
     rows[:40, 0] = rows[20:, 1] = 1.0  # twenty splats have both
     W = stacked([of_dense(rows[:, ::-1] if swapped else rows), *[of_dense(rows)] * 3], SPLATS)
-    labels = objects_of(W, np.zeros(8, np.int8), np.ones(SPLATS)).labels
+    labels = region_objects(W, np.zeros(8, np.int8), np.ones(SPLATS)).labels
     assert labels[0] != labels[-1] and min(labels) >= 0
     np.testing.assert_array_equal(labels[20:40], labels[-1 if swapped else 0])
 
 
 def test_grids_have_no_objects() -> None:
     W, levels = random_scene(0)
-    objects = objects_of(W, np.full_like(levels, -1), np.ones(SPLATS))
+    objects = region_objects(W, np.full_like(levels, -1), np.ones(SPLATS))
     assert (objects.labels == -1).all() and objects.views.shape[0] == 0
 
 
@@ -119,7 +115,7 @@ def test_views_beyond_the_bound_join_what_the_others_found(monkeypatch: pytest.M
     monkeypatch.setattr(objects, "MOST_REGIONS", 20)
     monkeypatch.setattr(objects, "FEWEST_VIEWS", 5)
     W, levels = of_things([[0, 1, 2, 3]] * 12)
-    scene_objects = objects_of(W, levels, np.ones(SPLATS))
+    scene_objects = region_objects(W, levels, np.ones(SPLATS))
     regions = scene_objects.tree.region
     assert len(scene_objects.views) == 4 and (regions >= 0).all()
     np.testing.assert_array_equal(regions.reshape(12, 4), regions[:4][None].repeat(12, axis=0))

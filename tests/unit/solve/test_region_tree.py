@@ -12,7 +12,6 @@ from liftcore.solve.objects import NodeVectors, RegionObjects, object_facts
 from liftcore.values.region_weights import RegionWeights
 from tests.unit.solve.one_piece import region_objects
 from tests.unit.solve.sparse_views import of_dense
-from tests.unit.solve.test_objects import objects_of
 
 SPLATS, VIEWS = 240, 12
 PART = np.arange(SPLATS) // 20  # twelve parts of twenty splats
@@ -21,12 +20,12 @@ BACKGROUND = np.zeros(SPLATS, int)
 
 
 def three_levels(
-    seed: int, *, wrong: float = 0.3, backgrounds: bool = False, parts_in: float = 1.0
+    seed: int, *, wrong: float = 0.3, backgrounds: bool = False
 ) -> tuple[RegionWeights, np.ndarray, Codebook]:
     """Return W, levels and codebooks of masks of parts, objects and, optionally, backgrounds, with noisy vectors.
 
     Args:
-        wrong: share of the masks that are merged with a neighbour, or cut anywhere. parts_in: of views with parts.
+        wrong: share of the masks that are merged with a neighbour, or cut anywhere.
     """
     rng = np.random.default_rng(seed)
     vectors = np.random.default_rng(99).normal(size=(17, 32))
@@ -34,7 +33,7 @@ def three_levels(
     for _ in range(VIEWS):
         columns, rows = [], []
         masks: list[np.ndarray] = [BACKGROUND] if backgrounds else []
-        masks += [OBJECT, PART] if rng.random() < parts_in else [OBJECT]
+        masks += [OBJECT, PART]
         for level, right in enumerate(masks):
             labels, base = right.copy(), {0: 16, 3: 12, 11: 0}[int(right.max())]
             for label in np.unique(right):
@@ -73,7 +72,7 @@ def mean_iou(nodes: list[np.ndarray], owners: np.ndarray) -> float:
 @pytest.mark.parametrize("seed", range(2))
 def test_objects_and_their_parts_are_nodes_with_a_third_of_the_masks_wrong(seed: int) -> None:
     W, levels, _ = three_levels(seed)
-    objects = objects_of(W, levels, np.ones(SPLATS))
+    objects = region_objects(W, levels, np.ones(SPLATS))
     nodes, parents = members(objects), objects.tree.parents
     assert objects.count == 4 and (parents[:4] < 0).all()
     assert mean_iou(nodes, OBJECT) > 0.95
@@ -97,7 +96,7 @@ def test_masks_of_a_part_and_of_what_lies_behind_it_hold_it_together() -> None:
 
 def test_what_holds_the_whole_scene_is_a_group_and_its_parts_are_the_objects() -> None:
     W, levels, codebook = three_levels(1, wrong=0.0, backgrounds=True)
-    objects = objects_of(W, levels, np.arange(SPLATS) + 1.0)
+    objects = region_objects(W, levels, np.arange(SPLATS) + 1.0)
     assert objects.count == 4 and set(objects.tree.parents[:4]) == {4} and objects.tree.parents[4] < 0
     np.testing.assert_array_equal(objects.labels, 3 - OBJECT)  # the largest total weight first
     totals = np.bincount(W.region.numpy(), W.weight.numpy(), levels.size)
