@@ -55,24 +55,21 @@ def command_line(module: str, doc: str | None, *arguments: Sequence[Any]) -> arg
     return parser
 
 
-def table_of(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] = ()) -> str:
-    """Rows as a Markdown table, columns as they first appear unless they are named."""
-    rows = list(rows)
-    columns = columns or list(dict.fromkeys(key for row in rows for key in row))
+def table_of(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Rows as a Markdown table, columns as they first appear."""
+    columns = list(dict.fromkeys(key for row in rows for key in row))
     lines = [[key.replace("_", " ") for key in columns], ["---"] * len(columns)]
     lines += [[_cell(row.get(key)) for key in columns] for row in rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def print_rows(
-    rows: Iterable[Mapping[str, Any]], *, as_json: bool, note: str = "", columns: Sequence[str] = ()
-) -> None:
+def print_rows(rows: Iterable[Mapping[str, Any]], *, as_json: bool, note: str = "") -> None:
     """Print the rows with the machine: a Markdown table, or one JSON object."""
     rows = list(rows)
     if as_json:
         print(json.dumps({"rows": rows, "note": note, "hardware": hardware()}))
         return
-    print(table_of(rows, columns))
+    print(table_of(rows))
     print("\n".join(["", *([note] if note else []), machine_line(hardware())]))
 
 

@@ -14,7 +14,7 @@ warm question, and the bytes of the file.
 import json
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -27,7 +27,6 @@ from torch import Tensor
 import liftcore as lc
 from liftcore.evaluate.accuracy import shared_pixels
 from liftcore.query.scene import Scene
-from liftcore.raster.base import Raster
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.values.views import NO_LABEL, ViewFeatures
 from tests.benchmarks.base import command_line, print_rows, read_pack, read_scene
@@ -41,7 +40,6 @@ class Figures:
 
     accuracy: float  # over the splats that count
     miou: float  # over the classes, in the held-out views
-    worst: float  # the least IoU of a class: a thing that vanishes has none
 
 
 @dataclass(frozen=True)
@@ -71,34 +69,16 @@ class Truth:
         """Compute the score of each class at each splat, [P, K] f32."""
         return lifted.features.float() @ self.classes.T
 
-    def rendered(self, scores: Tensor, params: lc.CompositingParams, raster: Raster | None = None) -> list[Tensor]:
-        """The scores [P, K] in each held-out view, [H, W, K] f32; rendering is linear, so features need not be."""
-        return [(raster or self.raster).render(self.cameras[view], scores, params) for view in self.held_out]
-
-    def evaluate(self, lifted: lc.LiftResult, raster: Raster | None = None) -> Figures:
-        """The figures of a lift; the raster is of the same splats in another form."""
-        return self.evaluate_scores(self.scores(lifted), lifted.settings.compositing, raster)
-
-    def evaluate_scores(self, scores: Tensor, params: lc.CompositingParams, raster: Raster | None = None) -> Figures:
-        """The figures of scores [P, K], rendered with these parameters."""
-        return self.judge_each([scores], params, raster)[0]
-
-    def judge_each(
-        self, tables: Sequence[Tensor], params: lc.CompositingParams, raster: Raster | None = None
-    ) -> list[Figures]:
-        """The figures of several tables of scores [P, K], rendered at once."""
-        images = self.rendered(torch.cat(list(tables), dim=1), params, raster)
-        parts = zip(*(image.split(len(self.classes), dim=2) for image in images), strict=True)
-        return [self._figures(scores, part) for scores, part in zip(tables, parts, strict=True)]
-
-    def _figures(self, scores: Tensor, images: Sequence[Tensor]) -> Figures:
+    def evaluate(self, lifted: lc.LiftResult) -> Figures:
+        """The figures of a lift; rendering is linear, so that scores are rendered in place of features."""
+        scores, params = self.scores(lifted), lifted.settings.compositing
         accuracy = float((scores.argmax(dim=1) == self.objects)[self.evaluated].float().mean())
+        images = (self.raster.render(self.cameras[view], scores, params) for view in self.held_out)
         best = torch.stack([image.argmax(dim=2) for image in images])
         truth_labels = torch.stack(list(self.held_out.values()))
         best[truth_labels < 0] = NO_LABEL  # rays that meet nothing show no class
         shared, union = shared_pixels(best, truth_labels, len(self.classes))
-        ious = torch.where(union > 0, shared.double() / union, float("nan"))
-        return Figures(accuracy, float(ious.nanmean()), float(ious[~ious.isnan()].min()))
+        return Figures(accuracy, float((shared.double() / union)[union > 0].mean()))
 
 
 def tabletop(folder: Path) -> Truth:
