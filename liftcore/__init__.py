@@ -13,8 +13,8 @@ scene, ``B`` [rays x channels] the 2D features of its photos, ``X`` [splats x ch
     result.save("scene.lift.safetensors")
 
 What ``__init__.pyi`` lists is the public interface, with ``__all__`` of the modules `liftcore.errors`,
-`liftcore.evaluate`, `liftcore.files`, `liftcore.models` and `liftcore.text`; the command line and the service import
-nothing else. Modules are loaded on first use: ``import liftcore`` loads neither torch nor numba.
+`liftcore.evaluate`, `liftcore.files`, `liftcore.models`, `liftcore.text` and `liftcore.text.table`; the command line
+and the service import nothing else. Modules are loaded on first use: ``import liftcore`` loads neither torch nor numba.
 """
 
 from liftcore.runtime.lazy_names import lazy_names

@@ -11,7 +11,7 @@ from service.errors import Busy, InvalidRequest, ProcessDied, TimedOut
 from service.process import Children
 
 WAITING = 16  # calls that wait or run
-# Without the first two, each array of a query is mapped again and its pages fault one by one: a fifth of its time.
+# Without these, each array of a query is mapped again and its pages fault one by one: a fifth of its time.
 ENVIRONMENT = {"MALLOC_MMAP_THRESHOLD_": str(64 << 20), "MALLOC_TRIM_THRESHOLD_": str(256 << 20)}
 
 

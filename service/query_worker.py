@@ -45,7 +45,7 @@ from service.settings import encoder_version
 if TYPE_CHECKING:
     from service.process import Reporter
 
-EDITED = "edited"  # the name of a selection during an edit; names of questions are hexadecimal
+EDITED = "edited"  # the name of a selection during an edit; those of stored selections are hexadecimal
 SCENES = 2  # lifts that are kept open
 CACHE_BYTES = 256 << 20  # of answers and views that are kept
 ENTRY_BYTES = 2 << 10  # of what is no array in a cached value: an object, a word
@@ -54,7 +54,7 @@ DOCUMENTS = ("query", "objects", "segment", "what", "askable", "catalogue", "tre
 VALUES = ("views", "edit", "count_objects")  # for the HTTP process
 WORD_COSINES = 1 << 31  # of splats times words: about a minute and a half on one core
 MASK_PIXELS = 1 << 26  # of all views of an export: a minute, as for the largest picture
-# Files of an answer and of many words, by operation: what `Scene.blocks_of` calls them
+# Files of many words by operation, and of splats by `what`: what `Scene.blocks_of` calls them
 WORD_FILES = {"labels": "splat_labels", "map": "labels", "picture": "picture"}
 SPLATS_FILES = {"object": "object", "scores": "coloured"}
 VIEW_LINKS = ("render", "mask", "attention")  # links of an answer that end with a view

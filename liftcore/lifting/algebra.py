@@ -67,7 +67,7 @@ class Algebra:
     engine: Engine
     progress: Progress
     threads: int | None = None
-    is_related: bool = False  # True if tuples are there, which objects and consensus share
+    is_related: bool = False  # True once tuples were made, which objects and consensus share
 
     def run(self, stage: str, step: Step, count: int) -> None:
         """Run a step for all its pieces, and report progress."""

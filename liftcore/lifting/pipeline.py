@@ -76,8 +76,9 @@ def lift(
         preset: a published choice of weights (`Preset`), or `LiftSettings` in place of preset and settings.
         progress: called ``progress(stage, completed, total, unit)``; an exception from it stops the lift. None: bars
             where stderr is a terminal. True: bars there and lines elsewhere. False: nothing.
-        on_plan: called with the plan before the first view; it is to show the plan's warnings. None: the warnings of
-            the plan are logged, and at the end those of the diagnostics.
+        on_plan: called with the plan before the first view, in memory after the first eight, which show if the inputs
+            contradict each other; it is to show the plan's warnings. None: the warnings of the plan are logged, and
+            at the end those of the diagnostics.
         threads: None uses the cores that this process may use. The result is bitwise identical for any value.
         checkpoint: a folder that stores the weights of finished views. The same lift resumes from it with a bitwise
             identical result; so does a lift that differs in features alone (another encoder, the same regions).
@@ -147,13 +148,13 @@ def _run(
             else:
                 on_plan(plan)
                 pieces, statistics = weigh_in_files(engine, folder, inputs, plan, timings)
-        lift = _solve(pieces, engine or LocalEngine(threads), inputs, statistics, timings, threads)
+        lift = _run_steps(pieces, engine or LocalEngine(threads), inputs, statistics, timings, threads)
         limit = plan.features_room
         is_mapped = folder is not None or (limit is not None and lift.features.nbytes > limit)
         return lift if is_mapped else lift.to(plan.device.place)
 
 
-def _solve(
+def _run_steps(
     pieces: Pieces,
     engine: Engine,
     inputs: LiftInputs,

@@ -255,7 +255,7 @@ def compared_levels(pieces: Pieces) -> np.ndarray:
 
 @saved_as("cosines")
 def compare(pieces: Pieces, piece: int, threads: int | None) -> Saved:
-    """Save the cosines of regions with their sums over the scene."""
+    """Save the cosines of regions with the other views, and their sums over the scene."""
     block, levels = splat_block(pieces, piece), pieces.load("regions")["levels"]
     reweighter = BlockReweighter(block.W, compared_levels(pieces), block.means, threads)
     cosines, sums = reweighter.cosines(_directions(pieces), by_region=bool((levels >= 0).any()))

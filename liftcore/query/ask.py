@@ -105,9 +105,10 @@ def ask(scene: Scene, query: Query | str, encoder: TextEncoder | None = None) ->
     """Score every splat for a query and select those that answer it.
 
     The threshold `auto` comes from a histogram of scores, in which each splat counts by its total weight, as splats
-    hit by few rays have noisy scores. The selection uses the score alone. The threshold is compared with other words,
+    hit by few rays have noisy scores. The threshold is compared with other words,
     and objects of the region graph may be selected as a whole (`liftcore.query.selection`). Any other threshold
-    selects by the score alone. Scores that are all equal or zero select nothing. Absent words
+    selects by the score alone. Scores that are all equal or zero select nothing, unless all
+    of the scene is of one thing. Absent words
     (`liftcore.query.presence`) are left out of the scores, and without another positive nothing is selected, unless
     the query keeps absent words. The presence of negatives and examples is not estimated.
 
@@ -143,7 +144,7 @@ def _vectors(values: Any) -> tuple[Vector, ...]:
 
 
 def resolve_query(scene: Scene, query: Query, encoder: TextEncoder | None) -> ResolvedQuery:
-    """Resolve the terms of a query to directions; all errors of a query are raised here (see `ask`)."""
+    """Resolve the terms of a query to directions; all errors of its terms are raised here (see `ask`)."""
     encoder = encoder or scene.table
     query, phrases = read_query(query, encoder)
     text = query.text[0] if query.text and len(query.positives) == 1 else ""  # that may name a part
@@ -390,7 +391,7 @@ def _select(
 def _select_rows(
     scene: Scene, request: ResolvedQuery, mask: np.ndarray, scores: np.ndarray
 ) -> tuple[Threshold, np.ndarray, CompetingWords | None]:
-    """Return the threshold of a query, the splats above it, [P] bool, and the words by which objects correct them."""
+    """Return the threshold of a query, the rows above it [K] bool, and the words by which objects correct them."""
     query, positives = request.query, len(request.query.positives)
     valid_scores = scores if scene.all_have_features else scores[scene.has_feature]
     in_words = (request.by_cosine & mask)[:positives]

@@ -1,4 +1,4 @@
-"""Answers as files: the selected splats alone, the whole scene in the colours of its scores, or the scores.
+"""Answers, segmentations, objects and scenes as files (`FILES`).
 
 Splat files are copies of the lifted file, in its dialect and row order: programs that open that file open them, too,
 and they can be lifted again.

@@ -445,7 +445,7 @@ class Answer(SelectionSummary):
 
     @property
     def has_feature(self) -> np.ndarray:
-        """[P] bool, True if a splat has a feature."""
+        """[P] bool, True if a splat has a feature; for sets all are."""
         return self._arrays[1]
 
     @property

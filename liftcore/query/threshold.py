@@ -62,7 +62,7 @@ def find_threshold(
     """Find a threshold on scores by one of the methods above.
 
     Degenerate inputs have a defined result. Without scores it is infinity: nothing is selected. Equal scores give
-    that score: a query then selects nothing (`explain_no_selection`).
+    that score: a query then selects nothing, or all (`explain_no_selection`).
 
     Args:
         scores: [n] f32, finite.

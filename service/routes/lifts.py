@@ -1,4 +1,4 @@
-"""/lifts and /tradeoffs: what jobs made, with the id of its job; who reads a lift; what a viewer draws of it."""
+"""/lifts and /tradeoffs: what jobs made; /key and shares: who reads a lift; what a viewer draws of it."""
 
 from __future__ import annotations
 

@@ -23,7 +23,8 @@ ENGINES = ("local", "ray")
 
 
 class Engine(Protocol):
-    """A runner of the pieces of a lift, each at least once. A piece reads files and writes others atomically.
+    """A runner of the pieces of a lift, each at least once. In blocks a piece reads files and writes others
+    atomically.
 
     So a piece may be repeated elsewhere: the lift is bitwise identical for any assignment and order of pieces.
     """
@@ -45,7 +46,7 @@ class Engine(Protocol):
 class LocalEngine:
     """An engine that runs one piece after the other in this process, with threads.
 
-    The memory of a lift is bounded by the size of a block, for any number of views and splats.
+    The memory of a lift in blocks is bounded by their size, for any number of views and splats.
 
     Args:
         threads: None uses the cores that this process may use. The result is bitwise identical for any value.
