@@ -14,7 +14,7 @@ scene, ``B`` [rays x channels] the 2D features of its photos, ``X`` [splats x ch
 
 What ``__init__.pyi`` lists is the public interface, with ``__all__`` of the modules `liftcore.errors`,
 `liftcore.evaluate`, `liftcore.files`, `liftcore.models`, `liftcore.text` and `liftcore.text.table`; the command line
-and the service import nothing else. Modules are loaded on first use: ``import liftcore`` loads neither torch nor numba.
+and the service import nothing else. Modules are loaded on first use: ``import liftcore`` loads no torch.
 """
 
 from liftcore.runtime.lazy_names import lazy_names

@@ -211,10 +211,10 @@ class BlockReweighter:
             return
         level_of_entry, end = self.level[self.W.region.numpy()], 0
         for number in range(self.levels):
-            kept = torch.from_numpy(level_of_entry == number)
-            part = {"region": self.W.region[kept], "weight": self.W.weight[kept]}
+            of_level = torch.from_numpy(level_of_entry == number)
+            part = {"region": self.W.region[of_level], "weight": self.W.weight[of_level]}
             begin, end = end, end + part["region"].shape[0]
-            yield replace(self.W, indptr=from_zero(kept)[self.W.indptr], **part), slice(begin, end), kept
+            yield replace(self.W, indptr=from_zero(of_level)[self.W.indptr], **part), slice(begin, end), of_level
 
     def _arrays(self, W: RegionWeights) -> list[np.ndarray]:
         """Return the arrays of W, and the view of each region."""
