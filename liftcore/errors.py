@@ -20,6 +20,7 @@ Every error names the argument, the expected value and the actual one, and has a
 from __future__ import annotations
 
 from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -61,17 +62,10 @@ class SplatliftError(Exception):
         line = f"{line}; {self.hint}" if self.hint else line
         return " ".join(line.split())
 
-    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
+    def __reduce__(self) -> tuple[object, tuple[()]]:
         # Errors are pickled between processes (jobs run in a child), which keyword-only arguments prevent by default.
-        return _rebuild, (type(self), self.argument, self.expected, self.got, self.hint, self.nearest)
-
-
-def _rebuild(
-    cls: type[SplatliftError], argument: str, expected: str, got: str, hint: str, nearest: Sequence[str] | None = None
-) -> SplatliftError:
-    error = cls(argument, expected=expected, got=got, hint=hint)
-    error.nearest = None if nearest is None else tuple(nearest)
-    return error
+        names = {"expected": self.expected, "got": self.got, "hint": self.hint, "nearest": self.nearest}
+        return partial(type(self), self.argument, **names), ()
 
 
 MOST_SEEN = 1000  # characters of what a reader saw, such as two paths

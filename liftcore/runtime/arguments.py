@@ -82,12 +82,6 @@ def device_name(device: object) -> object:
 
 
 def nearest(text: str, names: Iterable[str], count: int) -> str:
-    """Return a hint with the ``count`` names most similar to the text, of the first thousands, by their first
-    letters.
-
-    Names that begin with the text as a word come first: "car (automobile)" for "car", before "scarf".
-    """
-    text, cut = text[:_CHARACTERS], [name[:_CHARACTERS] for name in islice(names, _MAX_NAMES)]
-    begin = [name for name in cut if text and name.startswith(f"{text} ")]
-    ranked = get_close_matches(text, cut, count, cutoff=0.0)
-    return f"nearest: {', '.join(list(dict.fromkeys([*begin, *ranked]))[:count])}"
+    """Return a hint with the ``count`` most similar names, of the first thousands, by their first letters."""
+    compared = [name[:_CHARACTERS] for name in islice(names, _MAX_NAMES)]
+    return f"nearest: {', '.join(get_close_matches(text[:_CHARACTERS], compared, count, cutoff=0.0))}"

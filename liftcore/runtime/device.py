@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 OLDEST_CAPABILITY = (7, 5)  # compute capability that Triton and current builds of torch support
 COMPILERS = ("gcc", "clang", "cc")
 MEMORY_SIGNS = ("out of memory", "alloc_failed", "memoryallocation")  # of CUDA's libraries, lower case
-_EXPECTED = "a GPU that torch and Triton can use"
-_OR_CPU = "or use device=cpu"
 
 
 @dataclass(frozen=True)
@@ -127,7 +125,8 @@ def choose_device(name: str | torch.device) -> Device:
         return Device("cuda", torch.device("cuda", torch.cuda.current_device()))
     if requested == "cuda":
         got, hint = missing
-        raise Unavailable("device", expected=_EXPECTED, got=got, hint=f"{hint}, {_OR_CPU}")
+        expected = "a GPU that torch and Triton can use"
+        raise Unavailable("device", expected=expected, got=got, hint=f"{hint}, or use device=cpu")
     return CPU
 
 

@@ -1,12 +1,13 @@
 """Lazy import of a package's names, as its stub lists them."""
 
-TYPE_CHECKING = False
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from typing import Any
+import re
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
 
 
-def lazy_names(package: str, file: str) -> "tuple[Callable[[str], Any], Callable[[], list[str]]]":
+def lazy_names(package: str, file: str) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
     """Return ``__getattr__`` and ``__dir__`` of a module with a stub (``.pyi``) of imports beside its file.
 
     Args:
@@ -17,21 +18,15 @@ def lazy_names(package: str, file: str) -> "tuple[Callable[[str], Any], Callable
     modules: dict[str, str] = {}
 
     def read_stub() -> dict[str, str]:
-        import re
-        from pathlib import Path
-
         if not modules:
             stub = Path(file).with_suffix(".pyi").read_text(encoding="utf-8")
             modules.update((name, module) for module, name in re.findall(r"(?m)^from (\S+) import (\w+)", stub))
         return modules
 
-    def get(name: str) -> "Any":
-        import sys
-        from importlib import import_module
-
+    def get(name: str) -> object:
         homes = read_stub()
         if name == "__all__":
-            value = sorted(homes.keys() - {"__version__"})
+            value: object = sorted(homes.keys() - {"__version__"})
         elif name in homes:
             value = getattr(import_module(homes[name]), name)
         else:
@@ -40,8 +35,6 @@ def lazy_names(package: str, file: str) -> "tuple[Callable[[str], Any], Callable
         return value
 
     def names() -> list[str]:
-        import sys
-
         return sorted({*vars(sys.modules[package]), *read_stub()})
 
     return get, names

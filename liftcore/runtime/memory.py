@@ -104,23 +104,15 @@ def _no_disk(size: int, name: str, got: str) -> Unavailable:
 
 def free_memory() -> int | None:
     """Return the bytes that this process may still allocate, by machine and control group; None if unknown."""
-    limits = []
+    limits: list[int] = []
     with suppress(OSError, ValueError):  # not Linux
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
         limits += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
-    with suppress(OSError, ValueError):  # no control group
+    with suppress(OSError, ValueError):  # no control group, or one without a limit, which is "max"
         names = ("memory.max", "memory.current", "memory.stat")
-        limits += [group_memory(*((CONTROL_GROUP / name).read_text(encoding="ascii") for name in names))]
-    return min((free_bytes for free_bytes in limits if free_bytes is not None), default=None)
-
-
-def group_memory(limit: str, usage: str, stat: str) -> int | None:
-    """Return the free bytes of a control group, from the texts of its files; None if it has no limit.
-
-    The usage includes the page cache of files, which is dropped on demand: it counts as free.
-    """
-    if limit.strip() == "max":
-        return None
-    counts = dict(line.split() for line in stat.splitlines())
-    cached = sum(int(counts.get(name, 0)) for name in ("inactive_file", "active_file"))
-    return max(0, int(limit) - max(0, int(usage) - cached))
+        limit, usage, stat = ((CONTROL_GROUP / name).read_text(encoding="ascii") for name in names)
+        counts = dict(line.split() for line in stat.splitlines())
+        # The usage includes the page cache of files, which is dropped on demand: it counts as free.
+        cached = sum(int(counts.get(name, 0)) for name in ("inactive_file", "active_file"))
+        limits.append(max(0, int(limit) - max(0, int(usage) - cached)))
+    return min(limits, default=None)

@@ -1,11 +1,10 @@
 """One-line representations of values and of lists of names."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence, Sized
 from typing import Any
 
 MAX_CHARACTERS = 120  # as wide as terminals and notebooks print without a break
 MAX_TEXT = 40  # characters of a name, a sentence or a list within
-MAX_ITEMS = 3  # of a list that is printed in full
 
 
 def one_line(value: object, *parts: str) -> str:
@@ -25,14 +24,9 @@ def point_text(point: Sequence[float]) -> str:
 
 
 def value_text(value: Any) -> str:
-    """Return a field as text: a number to three digits, a point, the start of a text, a short list, or its length."""
+    """Return a field as text: a number to three digits, a short value, or the length of a long list."""
     if isinstance(value, float):
         return f"{value:.3g}"
-    if isinstance(value, str):
-        return repr(value[:MAX_TEXT])
-    if isinstance(value, tuple) and 0 < len(value) <= 3 and all(isinstance(number, float) for number in value):
-        return point_text(value)
-    if isinstance(value, Mapping | list | tuple):
-        text = repr(value) if len(value) <= MAX_ITEMS else ""
-        return text if 0 < len(text) <= MAX_TEXT else f"[{len(value)}]"
-    return repr(value)[:MAX_TEXT]
+    text = repr(value)
+    is_list = isinstance(value, Sized) and not isinstance(value, str)
+    return f"[{len(value)}]" if is_list and len(text) > MAX_TEXT else text[:MAX_TEXT]

@@ -70,27 +70,19 @@ def shown_progress(progress: Progress | bool | None) -> Iterator[Progress]:
         progress = sys.stderr is not None and sys.stderr.isatty()
     if callable(progress):
         yield progress
+    elif progress is True and sys.stderr.isatty():
+        bars = _Bars()
+        try:
+            yield bars
+        finally:
+            bars.close()
     elif progress is False:
         yield silent
     elif progress is True:
-        with progress_bars() as bars:
-            yield bars
+        yield _Lines()
     else:
         expected = "a function of (stage, completed, total, unit), True, False or None"
         raise InvalidSettings("progress", expected=expected, got=repr(progress)[:80])
-
-
-@contextmanager
-def progress_bars() -> Iterator[Progress]:
-    """Yield progress that draws one bar a stage on a terminal, and elsewhere prints a line every LINE_SECONDS."""
-    if not sys.stderr.isatty():
-        yield _Lines()
-        return
-    bars = _Bars()
-    try:
-        yield bars
-    finally:
-        bars.close()
 
 
 class _Lines:
