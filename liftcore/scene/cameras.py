@@ -16,7 +16,7 @@ from liftcore.scene.compositing import MAX_SIDE
 from liftcore.scene.distortion import Distortion, Lens, Rectangle, shared_lens
 from liftcore.scene.origin import FILE_ORIGIN, MAP_REACH, Origin
 from liftcore.scene.similarity import NEAR, Similarity, similarity_of
-from liftcore.scene.views import cameras_of_views, composed, without_image_suffix
+from liftcore.scene.views import cameras_of_views, composed, require_few, without_image_suffix
 from liftcore.scene.world import UNKNOWN, WorldFrame
 
 if TYPE_CHECKING:  # torch is taken, and not loaded for it
@@ -38,8 +38,6 @@ MIN_PIXELS = 8  # of a side, from which intrinsics of shares of the size are tol
 OFF_CENTRE, SAME_CENTRE = 1.25, 0.05  # of principal points off the middle, and the spread of their places
 MIN_FOCAL, MAX_FOCAL = 1e-3, 1e9  # pixels; float64 squares of what they project stay finite
 MAX_OFF_CENTRE = 1e9  # pixels of the principal point
-MAX_VIEWS = 100_000  # of a scene: far more than real ones have, and still read and checked in seconds
-FEWER_VIEWS = "lift fewer photos, such as every second one"
 NEAREST = 3  # views in the error of an unknown one
 NEARLY_ALL = 0.995  # a share that would be printed as 100%
 MAX_TEXT = 120  # characters of a value in an error
@@ -338,9 +336,7 @@ class Cameras(Mapping[str, Camera]):
             named_views = [*views.items()]
         if not named_views:
             raise InvalidCameras("cameras", expected="at least one view", got="none")
-        if len(named_views) > MAX_VIEWS:
-            expected, got = f"at most {MAX_VIEWS} views", str(len(named_views))
-            raise InvalidCameras("cameras", expected=expected, got=got, hint=FEWER_VIEWS)
+        require_few(named_views)
         self._by_name: dict[str, Camera] = {}
         for name, view in named_views:
             if not isinstance(view, Camera) or not isinstance(name, str):

@@ -24,6 +24,8 @@ NAMED_AFTER = (
 )
 NOT_UTF8 = "names of cameras are not UTF-8: rename the photos, and their names in the camera file"
 REPLACED = "\ufffd"  # in the place of bytes that are no UTF-8
+MAX_VIEWS = 100_000  # of a scene: far more than real ones have, and still read and checked in seconds
+FEWER_VIEWS = "lift fewer photos, such as every second one"
 UNSAYABLE = re.compile("[\\x00-\\x1f\\x7f\\ud800-\\udfff]")
 
 
@@ -38,11 +40,19 @@ def view_names(images: Sequence[str]) -> list[str]:
     Were it only those that collide, the longer of two cameras of a rig would have its last photos named otherwise
     than its first.
     """
+    require_few(images)
     for image in images:
         require_name(image, "image name", InvalidCameras)
     paths = [without_image_suffix(image) for image in images]
     stems = [PurePosixPath(path).name for path in paths]
     return stems if len(set(stems)) == len(stems) else paths
+
+
+def require_few(views: Collection[object]) -> None:
+    """Refuse more views than MAX_VIEWS."""
+    if len(views) > MAX_VIEWS:
+        expected, got = f"at most {MAX_VIEWS} views", str(len(views))
+        raise InvalidCameras("cameras", expected=expected, got=got, hint=FEWER_VIEWS)
 
 
 def require_name(name: str, argument: str, fault: type[InvalidInput]) -> str:

@@ -33,8 +33,8 @@ from liftcore.runtime.arguments import as_path, nearest
 from liftcore.runtime.folders import scratch_folder
 from liftcore.runtime.progress import Progress, silent
 from liftcore.runtime.torch_modes import callers_modes
-from liftcore.scene.cameras import FEWER_VIEWS, MAX_VIEWS, Camera
-from liftcore.scene.views import composed, require_name, require_pairs
+from liftcore.scene.cameras import Camera
+from liftcore.scene.views import FEWER_VIEWS, MAX_VIEWS, composed, require_name, require_pairs
 from liftcore.text.table import TableEncoder
 from liftcore.values.fit import Fit, Window, window_of
 from liftcore.values.lens import as_pinhole_sees, grid_sides
