@@ -34,7 +34,6 @@ from liftcore.text.table import normalize_text
 
 PHRASE_KEYS = ("phrase", "class_name", "label", "text", "category")  # of a record
 SIZE_KEYS = (("img_height", "img_width"), ("height", "width"))
-OTHER_PROGRAMS = {"shapes", "objects", "item", "videos"}  # of LabelMe, ISAT and Supervisely, Darwin, YouTube-VIS
 TRACKED_PREFIX = "mask_"  # of Grounded SAM 2, before the name of the image
 VOID = None  # in place of a phrase: pixels that are unlabelled
 OVERHANG = 0.02  # of the image's sides, by which polygons drawn by hand may extend beyond it
@@ -74,8 +73,6 @@ def read_mask_document(path: Path, *, unannotated_negative: bool = False) -> Mas
     with reading(path, InvalidFeatures, "COCO's JSON, or records with masks and phrases", AS_COCO):
         content = read_mask_json(path)
         fields = content if isinstance(content, dict) else {}
-        if foreign := sorted(OTHER_PROGRAMS & fields.keys()):
-            raise ValueError(f"COCO's JSON, or records with masks and phrases, got {foreign[0]!r}; {AS_COCO}")
         if "mask_name" in fields and isinstance(fields.get("labels"), dict):
             document.images = [_tracked(fields)]
         elif isinstance(fields.get("images"), list):
@@ -148,7 +145,9 @@ def _add_data_set(document: MaskDocument, content: Mapping[str, Any], *, unannot
     entries = {entry["id"]: entry for entry in content["images"]}
     category_names = [(entry["id"], _text_of(entry, "name")) for entry in content.get("categories") or ()]
     categories = {number: name for number, name in category_names if name is not None}
-    names = {number: _file_name(entry) for number, entry in entries.items()}
+    names = {number: _text_of(entry, "file_name") or "" for number, entry in entries.items()}
+    if "" in names.values():
+        raise ValueError("a file_name of each image, got an image without one")
     images = {number: ImageMasks(ROBOFLOW.sub("", name), file=name) for number, name in names.items()}
     _drop_upload_prefixes([*images.values()])
     for number, record in enumerate(mask_records(content)):
@@ -162,13 +161,6 @@ def _add_data_set(document: MaskDocument, content: Mapping[str, Any], *, unannot
     document.images = [*images.values()]
     for image in document.images:
         image.annotated = bool(image.phrases) or unannotated_negative
-
-
-def _file_name(entry: Mapping[str, Any]) -> str:
-    name = _text_of(entry, "file_name")
-    if name is None:
-        raise ValueError(f"a file_name of each image, got {repr(entry.get('file_name'))[:80]}")
-    return name
 
 
 def _drop_upload_prefixes(images: Sequence[ImageMasks]) -> None:

@@ -33,7 +33,6 @@ VECTORS = ".npy"
 ARRAY, RUNS, PICTURE = "_masks.npy", ".json", ".png"
 ZIPPED_ARRAY = "_masks.npz"
 UNLABELLED = np.full((1, 1, 1), NO_LABEL, np.int32)
-OVERLAP = "move photos to another folder than their masks"
 
 
 def mask_files(folder: Path) -> dict[str, Path]:
@@ -42,9 +41,7 @@ def mask_files(folder: Path) -> dict[str, Path]:
     vectors = [path.name for path in arrays if not path.name.endswith((ARRAY, ZIPPED_ARRAY))]
     if vectors:
         raise ValueError(f"masks without vectors, got {vectors[0]}; omit the encoder: these masks have vectors")
-    by_view = files_by_view(
-        [*arrays, *_pictures(folder)], folder, ARRAY, ZIPPED_ARRAY, noun="file of masks", hint=OVERLAP
-    )
+    by_view = _by_view(folder, arrays)
     if not by_view:
         raise ValueError(f"masks as IMG{RUNS}, IMG{ARRAY} or IMG{PICTURE}, got no such files")
     return by_view
@@ -75,8 +72,7 @@ def mask_views(
 
         return ViewFolder(by_view, add_masks)
     arrays = npy_files(folder, VECTORS, ZIPPED_ARRAY)
-    files = [*(path for path in arrays if path.name.endswith((ARRAY, ZIPPED_ARRAY))), *_pictures(folder)]
-    masks = files_by_view(files, folder, ARRAY, ZIPPED_ARRAY, noun="file of masks", hint=OVERLAP)
+    masks = _by_view(folder, [path for path in arrays if path.name.endswith((ARRAY, ZIPPED_ARRAY))])
     files = [path for path in arrays if not path.name.endswith((ARRAY, ZIPPED_ARRAY))]
     vectors = files_by_view(files, folder, noun="file of vectors")
     for view in sorted(vectors.keys() ^ masks.keys()):
@@ -104,8 +100,11 @@ def _regions(labels: np.ndarray, codebook: np.ndarray, all_vectors: Iterable[np.
     return Regions(labels, codebook, context=f"view {view!r}")
 
 
-def _pictures(folder: Path) -> list[Path]:
-    return [path for path in files_below(folder) if path.suffix.lower() in (RUNS, PICTURE)]
+def _by_view(folder: Path, arrays: list[Path]) -> dict[str, Path]:
+    """Return view -> its file of masks: one of the arrays, run lengths or a picture."""
+    files = [*arrays, *(path for path in files_below(folder) if path.suffix.lower() in (RUNS, PICTURE))]
+    hint = "move photos to another folder than their masks"
+    return files_by_view(files, folder, ARRAY, ZIPPED_ARRAY, noun="file of masks", hint=hint)
 
 
 def _labels(path: Path, rows: int | None, unlabelled: int) -> tuple[np.ndarray, int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 from liftcore.errors import InvalidFeatures, InvalidInput, reading
 from liftcore.features.folders import Layout, ViewFolder, array_views, folders_of, langsplat_views
@@ -19,10 +19,6 @@ from liftcore.text import OWN_WORDS
 from liftcore.values.fit import FITS
 from liftcore.values.pack import read_features, write_pack
 
-if TYPE_CHECKING:
-    from liftcore.text.table import TableEncoder
-
-MAX_LISTED = 6  # phrases in a warning
 OPTIONS = {  # of each kind of files
     "langsplat": (),
     "npy": ("layout", "map_fit"),
@@ -83,7 +79,10 @@ def pack_folder(
             elif kind == "npy":
                 views = array_views(folder, options.get("layout", "hwc"), options.get("map_fit", ""))
             elif kind == "prompts":
-                views, table, warnings = _prompt_views(folder, options)
+                value_names = None if options.get("names") is None else as_path(options["names"], "names")
+                choices = {name: options[name] for name in ("unlabelled", "unannotated") if name in options}
+                prompts = prompt_views(folder, value_names, **choices)
+                views, table, warnings = prompts.views, prompts.table, [*prompts.warnings]
                 names = {"encoder": encoder_name or "masks by prompt", "text_space": OWN_WORDS, "normalised": True}
             elif options.get("encoder") is not None:
                 views, own_names, warnings = _encoded_masks(folder, out, options, normalised, reporter)
@@ -120,21 +119,6 @@ def _check_options(kind: str, options: Mapping[str, Any], names: Mapping[str, st
         if name == "normalised":
             raise InvalidInput(name, expected="True, False or None", got=repr(value)[:80])
         check_text("encoder_name" if name == "encoder" else name, value)
-
-
-def _prompt_views(folder: Path, options: Mapping[str, Any]) -> tuple[ViewFolder[Any], TableEncoder, list[str]]:
-    """Open masks by prompt, the table of their phrases, and warnings."""
-    names = options.get("names")
-    prompts = prompt_views(
-        folder,
-        None if names is None else as_path(names, "names"),
-        unlabelled=options.get("unlabelled"),
-        unannotated=options.get("unannotated", "skip"),
-    )
-    empty = [phrase for phrase, views in prompts.counts.items() if not views]
-    examples = ", ".join(empty[:MAX_LISTED]) + (f", ... ({len(empty)})" if len(empty) > MAX_LISTED else "")
-    warnings = [f"no view has a mask of {examples}: phrases omitted"] if empty else []
-    return prompts.views, prompts.table, [*prompts.warnings, *warnings]
 
 
 def _encoded_masks(

@@ -47,16 +47,11 @@ from liftcore.text.table import TableEncoder, normalize_text
 from liftcore.values.views import NO_LABEL, Regions, label_levels
 
 MAX_PHRASES = 4_096
+MAX_LISTED = 6  # phrases in a warning
 LEGEND = "legend"  # the text of a label picture that names its values
 LAYOUTS = "PHRASE/VIEW.png, COCO's JSON, or label pictures VIEW.png with --names"
 NAMES = 'JSON from values to names, {"1": "red mug"}'
 PICTURE = ".png"
-OTHER_FILES = {
-    **dict.fromkeys((".jpg", ".jpeg"), "JPEG blurs the edges of masks: write them as PNG"),
-    **dict.fromkeys((".bmp", ".tif", ".tiff", ".webp", ".gif"), "convert them to PNG"),
-    **dict.fromkeys((".pt", ".pth"), "save them as .npy: numpy.save(name, mask.cpu().numpy())"),
-    **dict.fromkeys((".txt", ".xml"), AS_COCO),
-}
 BOXES = (
     "{count} annotations of {files} have at most a box and no mask: pixels in the boxes have no label; create masks "
     "from the boxes, for example with SAM"
@@ -123,8 +118,7 @@ class Prompts:
 
     views: ViewFolder[Regions]
     table: TableEncoder
-    counts: Mapping[str, int]  # number of views with a mask of each phrase; phrases with 0 are not in the table
-    warnings: tuple[str, ...] = ()  # of omitted images and unlabelled pixels
+    warnings: tuple[str, ...] = ()  # of omitted images and phrases, and of unlabelled pixels
 
 
 def prompt_views(
@@ -152,7 +146,10 @@ def prompt_views(
             raise InvalidFeatures("unlabelled", expected="None without pictures", got=got)
         warnings += _add_documents(index, documents, folder, [*arrays, *pictures], negative=unannotated == "negative")
     elif pictures and (names is not None or LEGEND in label_texts(pictures[0])):
-        value_names = None if names is None else _read_names(names)
+        value_names = None
+        if names is not None:
+            with reading(names, InvalidFeatures, NAMES, "0 is outside of all masks, and needs no name"):
+                value_names = _names_of_json(names.read_text(encoding="utf-8-sig"))
         for path in pictures:
             with reading(path, InvalidFeatures, "a label picture"):
                 _add_labels(index, path, _view_of(path, folder), value_names, unlabelled)
@@ -161,17 +158,15 @@ def prompt_views(
             with reading(path, InvalidFeatures, "a mask [h, w]"):
                 _add_binary(index, path, path.relative_to(folder), unlabelled)
     else:
-        suffix, count = Counter(path.suffix.lower() for path in files).most_common(1)[0] if files else ("", 0)
-        hint = "give the folder that also contains json_data" if arrays else OTHER_FILES.get(suffix, "")
-        got = f"{len(files)} other files" + (f", {count} of them {suffix}" if suffix else "")
-        raise ValueError(f"one of {LAYOUTS}, got {got}; {hint}")
+        suffixes = ", ".join(sorted({path.suffix for path in files}))
+        hint = f"write masks as PNG, or {AS_COCO}; of arrays of tracking give the folder that also contains json_data"
+        raise ValueError(f"one of {LAYOUTS}, got {len(files)} other files ({suffixes[:80]}); {hint}")
     return _prompts(index, files, warnings)
 
 
 def _prompts(index: _MaskIndex, files: Sequence[Path], warnings: list[str]) -> Prompts:
     """Number the phrases that have masks, and leave out the views without labels."""
-    seen_in = Counter(phrase for view in index.views.values() for phrase in view.phrases)
-    order = sorted(seen_in)
+    order = sorted({phrase for view in index.views.values() for phrase in view.phrases})
     if not 1 <= len(order) <= MAX_PHRASES:
         got = f"{len(order)} of {len(index.phrases)} phrases"
         raise ValueError(f"1 to {MAX_PHRASES} phrases with masks, got {got}; {'; '.join(warnings)}")
@@ -191,8 +186,9 @@ def _prompts(index: _MaskIndex, files: Sequence[Path], warnings: list[str]) -> P
 
     views = ViewFolder({name: view.file for name, view in labelled_views.items()}, read_view, files)
     table = TableEncoder("phrases", [index.phrases[phrase] for phrase in order], vectors[:-1])
-    counts = {text: seen_in[phrase] for phrase, text in sorted(index.phrases.items())}
-    return Prompts(views, table, counts, tuple(warnings))
+    if empty := [text for phrase, text in sorted(index.phrases.items()) if phrase not in rows]:
+        warnings.append(f"no view has a mask of {join_names(empty, MAX_LISTED)}: phrases omitted")
+    return Prompts(views, table, tuple(warnings))
 
 
 def label_texts(path: Path) -> dict[str, str]:
@@ -291,11 +287,6 @@ def _add_ids(index: _MaskIndex, name: str, path: Path, values: np.ndarray, phras
     present = {value: phrases[value] for value in np.unique(values).tolist() if value in phrases}
     present = {value: phrase for value, phrase in present.items() if value or phrase is None}
     index.add(name, path, present.values(), partial(_id_masks, path, present))
-
-
-def _read_names(path: Path) -> dict[int, str]:
-    with reading(path, InvalidFeatures, NAMES, "0 is outside of all masks, and needs no name"):
-        return _names_of_json(path.read_text(encoding="utf-8-sig"))
 
 
 def _names_of_json(text: str) -> dict[int, str]:

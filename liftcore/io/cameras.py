@@ -13,7 +13,6 @@ import re
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -134,9 +133,8 @@ def _read(path: Path) -> Cameras:
     if is_zip(source.file):
         return _from_zip(source.file, source.frame)
     if start[:1] not in (b"[", b"{"):
-        got = f"a file that begins with {first_bytes(start)}" if start else "an empty file"
         hint = "of a COLMAP model give the folder, or a zip of its cameras.* and images.* together"
-        raise ValueError(f"{FORMATS}, got {got}; {hint}")
+        raise ValueError(f"{FORMATS}, got a file that begins with {first_bytes(start)}; {hint}")
     return source.read()
 
 
@@ -309,7 +307,8 @@ def _source_in_zip(names: list[str], root: Path, frame_file: Path | None) -> Cam
         if len(places) > 1:
             raise ValueError(f"one {noun}, got {' and '.join(places[:2])}; zip those of one run alone")
     if not scenes:
-        raise ValueError(f"a COLMAP model (cameras and images, .bin or .txt) in the zip, got {_what_else(names)}")
+        hint = "zip the folder that has both files together, or give a cameras.json itself"
+        raise ValueError(f"a COLMAP model (cameras and images, .bin or .txt) in the zip, got none; {hint}")
     folder = root / scenes.pop()
     source = _source_in_folder(folder, root / frames[0] if frames else frame_file)
     if source.file is None and source.model is None:  # transforms of another name
@@ -340,15 +339,3 @@ def _is_of_cameras(name: str) -> bool:
 
 def _is_transforms(name: str) -> bool:
     return name.startswith("transforms") and name.endswith(".json")
-
-
-def _what_else(names: Iterable[str]) -> str:
-    """Describe a zip without a complete model, and say what to do."""
-    for name in sorted(names):
-        file = PurePosixPath(name).name
-        if file in MODEL_FILES:
-            parts = ("cameras", "images") if file.startswith("cameras") else ("images", "cameras")
-            return f"{name!r} without {file.replace(*parts)!r}; zip both files together"
-        if file == "cameras.json":
-            return f"{name!r}; give the JSON file itself"
-    return "none; zip the folder that has cameras.bin and images.bin"

@@ -16,7 +16,6 @@ import numpy as np
 from liftcore.io.npy import is_stored, load_tensors
 from liftcore.io.ply import EXPORT_PLY, TRAINED
 from liftcore.io.quantised import Fields
-from liftcore.runtime.one_line import join_names
 from liftcore.scene.render_mode import mode_beside
 
 # Fields of `Splats` -> names of the two trainers.
@@ -32,15 +31,9 @@ def _require_whole(path: Path) -> None:
     match = _RANK.fullmatch(path.name)
     if match is None:
         return
-    other_ranks = [
-        file.name
-        for file in sorted(path.parent.glob("*_rank*"))
-        if (other := _RANK.fullmatch(file.name)) and other["step"] == match["step"] and file.name != path.name
-    ]
-    if int(match["rank"]) or other_ranks:
-        got = f"{path.name}, the splats of one of several GPUs" + (
-            f" beside {join_names(other_ranks, 3)}" if other_ranks else ""
-        )
+    others = (_RANK.fullmatch(file.name) for file in path.parent.iterdir() if file.name != path.name)
+    if int(match["rank"]) or any(other and other["step"] == match["step"] for other in others):
+        got = f"{path.name}, the splats of one of several GPUs"
         hint = "join the tensors of all ranks in one checkpoint, or export the scene as .ply"
         raise ValueError(f"a checkpoint of the complete scene, got {got}; {hint}")
 

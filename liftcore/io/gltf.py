@@ -337,13 +337,6 @@ class _Binary:
         self.views: list[dict[str, Any]] = []
         self.accessors: list[dict[str, Any]] = []
 
-    def view(self, content: bytes, **members: Any) -> int:
-        """Add a buffer view, and return its number."""
-        self.views.append({"buffer": 0, "byteOffset": self.size, "byteLength": len(content), **members})
-        self.parts.append(content + b"\0" * (-len(content) % 8))
-        self.size += len(self.parts[-1])
-        return len(self.views) - 1
-
     def attribute(self, values: np.ndarray, **members: Any) -> int:
         """Add an accessor of values [P] or [P, n], aligned to 4 bytes, and return its number."""
         width = 1 if values.ndim == 1 else values.shape[1]
@@ -351,11 +344,15 @@ class _Binary:
         stride = row_bytes + -row_bytes % 4
         rows = np.zeros((len(values), stride), np.uint8)
         rows[:, :row_bytes] = np.ascontiguousarray(values).view(np.uint8).reshape(len(values), row_bytes)
-        view = self.view(rows.tobytes(), target=34962, byteStride=stride)
+        view = {"buffer": 0, "byteOffset": self.size, "byteLength": rows.size, "target": 34962, "byteStride": stride}
+        self.parts.append(rows.tobytes() + b"\0" * (-rows.size % 8))
+        self.size += len(self.parts[-1])
+        number = len(self.views)  # of the view, and of its accessor
         kind = next(name for name, components in WIDTHS.items() if components == width)
-        accessor = {"bufferView": view, "componentType": CODES[values.dtype], "count": len(values), "type": kind}
+        accessor = {"bufferView": number, "componentType": CODES[values.dtype], "count": len(values), "type": kind}
+        self.views.append(view)
         self.accessors.append(accessor | members)
-        return len(self.accessors) - 1
+        return number
 
 
 def _primitive(

@@ -13,7 +13,7 @@ import re
 import stat
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import IO, Any, TypeVar
@@ -98,7 +98,6 @@ _VIDEO = FileKind(
     None, "a video", "take frames of it, reconstruct their cameras with COLMAP, and train splats on them"
 )
 _MESH = FileKind(None, "a mesh", TRAINED)
-_CLOUD = FileKind(None, "a point cloud", TRAINED)
 _ARCHIVE = FileKind(None, "an archive", UNPACK)
 _PACK_ARRAYS = "of features, 'splatlift pack npy' makes a pack of a folder of them"
 _ARRAY = FileKind(None, "a NumPy array", f"{_PACK_ARRAYS}; of splats, export PLY")
@@ -133,8 +132,6 @@ _MAGIC: tuple[tuple[int, bytes, FileKind], ...] = (
     )),
     *((8, magic, _PICTURE) for magic in (b"WEBP", b"heic", b"heix", b"mif1", b"avif")),
     (4, b"ftyp", _VIDEO),
-    (0, b"\x1a\x45\xdf\xa3", _VIDEO),
-    (8, b"AVI ", _VIDEO),
 )  # fmt: skip
 # By the suffix, if the content is ambiguous.
 _BY_SUFFIX: dict[str, FileKind] = {
@@ -142,7 +139,6 @@ _BY_SUFFIX: dict[str, FileKind] = {
     **dict.fromkeys((".usdz", ".usdc", ".usda", ".usd"), _USD),
     **dict.fromkeys((".html", ".htm"), _WEB_PAGE),
     **dict.fromkeys((".obj", ".fbx", ".stl"), _MESH),
-    **dict.fromkeys((".las", ".laz", ".e57", ".pcd", ".xyz"), _CLOUD),
     **dict.fromkeys((".mp4", ".mov", ".avi", ".mkv", ".webm"), _VIDEO),
     **dict.fromkeys((".pkl", ".pickle"), _PICKLE),
     **dict.fromkeys((".gz", ".tgz", ".bz2", ".xz", ".zst", ".tar", ".7z", ".rar"), _ARCHIVE),
@@ -202,10 +198,6 @@ def _replacement_hint(path: Path, identified: FileKind, kind: str) -> str:
         ("features", "masks"): "masks to judge by have no vectors; 'splatlift pack' makes feature packs",
         ("features", "table"): "a table of text embeddings belongs to a query, as --table",
         ("features", "lift"): "a lift belongs to 'splatlift query'; give the feature packs that it was made of",
-        ("table", "features"): "a table has 'embeddings' [n, F] and the metadata 'words'; a pack's own words answer "
-        "without one",
-        ("table", "lift"): "a table has 'embeddings' [n, F] and the metadata 'words'; a lift's own words answer "
-        "without one",
         ("cameras", "photos"): "give the COLMAP model, transforms.json or cameras.json of these photos",
         ("lift", "features"): "'splatlift lift SPLATS CAMERAS FEATURES -o LIFT' makes a lift of them",
         ("lift", "splats"): "'splatlift lift SPLATS CAMERAS FEATURES -o LIFT' makes a lift of them",
@@ -257,9 +249,6 @@ def _file(path: Path) -> FileKind:  # noqa: PLR0911 - a rule each
     is_unknown = by_content is None and suffix not in _BY_SUFFIX
     if suffix == ".splat" or (is_unknown and looks_like_splat(head, size)):
         return _splats_as(SplatFormat.SPLAT)
-    meta = path.parent / META
-    if by_content is _PICTURE and meta.is_file() and _is_sog(meta):
-        return FileKind(None, "a picture of a SOG", f"give {meta}")
     unknown = FileKind(None, f"a file that begins with {first_bytes(head)}", recognised=False)
     return by_content or _BY_SUFFIX.get(suffix, unknown)
 
@@ -363,12 +352,6 @@ def _document(document: Any, path: Path) -> FileKind:
     return next((kind for keys, kind in _BY_KEYS if document.keys() >= keys), by_suffix)
 
 
-def _is_sog(path: Path) -> bool:
-    with suppress(OSError, ValueError):
-        return path.stat().st_size <= MAX_JSON_BYTES and _json(path, path.stat().st_size).format is SplatFormat.SOG
-    return False
-
-
 # ---- zips
 
 
@@ -401,11 +384,9 @@ def _of_names_in_zip(names: list[str], splats: tuple[str, ...]) -> FileKind:  # 
         return FileKind("cameras", "a zip of cameras", splats=splats)
     if not splats and suffixes & IMAGE_SUFFIXES:
         return FileKind("photos", "photos")
-    packs = [name for name in names if name.endswith(".safetensors")]
-    if splats or packs:
-        return _zip_with(splats or packs)
-    hints = [_BY_SUFFIX[suffix].hint for suffix in sorted(suffixes & _BY_SUFFIX.keys())]
-    return replace(_zip_with(names), hint=hints[0] if hints else "unzip it and give the file itself")
+    if splats:
+        return _zip_with(splats)
+    return _zip_with(names)
 
 
 def _zip_with(names: Sequence[str]) -> FileKind:
@@ -440,7 +421,7 @@ def _splat_files(names: Iterable[str], has_splats: Callable[[str], bool]) -> tup
 
 
 def _folder(path: Path) -> FileKind:  # noqa: PLR0911 - a rule each
-    if (path / META).is_file() and _is_sog(path / META):
+    if (path / META).is_file() and _file(path / META).format is SplatFormat.SOG:
         return _splats_as(SplatFormat.SOG)
     if (path / LOD_META).is_file():
         return _STREAMED

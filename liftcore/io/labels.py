@@ -50,11 +50,6 @@ class Labels:
         return Labels(columns, document)
 
 
-def id_column(values: np.ndarray) -> np.ndarray:
-    """Convert ids [P] of any type to i32; any other than a number from 1 to 2^31 - 1 becomes 0, none."""
-    return np.where((values >= 1) & (values <= np.iinfo(np.int32).max), values, 0).astype(np.int32)
-
-
 def stored_columns(splats: Splats) -> dict[str, np.ndarray]:
     """Return the extras of splats without normals, each [P] i32 or f32, for formats with columns of 32 bits."""
     columns: dict[str, np.ndarray] = {}
@@ -63,7 +58,8 @@ def stored_columns(splats: Splats) -> dict[str, np.ndarray]:
         if name in NORMALS:
             continue
         if name in IDS:
-            values = id_column(values)
+            in_range = (values >= 1) & (values <= np.iinfo(np.int32).max)
+            values = np.where(in_range, values, 0).astype(np.int32)  # all else is none
         elif values.dtype.kind in "iu" and not -(2**31) <= int(values.min()) <= int(values.max()) < 2**31:
             got = f"{values.min()}..{values.max()}"
             raise InvalidSplats(f"columns[{name!r}]", expected="whole numbers of 32 bits", got=got)

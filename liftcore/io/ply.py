@@ -276,9 +276,11 @@ def _apply_filter(
 
 
 def _default_layout(splats: Splats) -> tuple[str, ...]:
+    """Return the column order of the kernel's own trainer, and the further columns behind it."""
     sh_rows = 0 if splats.sh is None else splats.sh.shape[1]
     lobes = 0 if splats.sb_params is None else splats.sb_params.shape[1]
-    layout = usual_layout(splats.kernel, sh_rows, lobes)
+    first, *remaining = _columns(splats.kernel, sh_rows, lobes, beta_names=splats.kernel is Kernel.BETA)
+    layout = (first, *remaining[:2], *NORMALS, *remaining[2:])
     return (*layout, *(name for name in splats.extras if name not in layout))
 
 
@@ -354,12 +356,6 @@ def dialect_of(names: Collection[str]) -> str:
     if kernel is Kernel.GAUSSIAN_3D:
         return "Inria 3DGS" if "nx" in names else "gsplat"
     return kernel.upper()
-
-
-def usual_layout(kernel: Kernel, sh_rows: int, lobes: int) -> tuple[str, ...]:
-    """Return the column order of the kernel's own trainer, for ``sh_rows`` coefficients a channel and S lobes."""
-    first, *remaining = _columns(kernel, sh_rows, lobes, beta_names=kernel is Kernel.BETA)
-    return (first, *remaining[:2], *NORMALS, *remaining[2:])
 
 
 def model_slots(names: Sequence[str], kernel: Kernel) -> dict[str, Slot]:

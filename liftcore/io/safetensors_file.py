@@ -44,12 +44,6 @@ def check_header(path: Path) -> None:
     with open_regular(path) as handle:
         start = handle.read(_START)
         length = struct.unpack("<Q", start[:8])[0] if len(start) == _START else 0
-        # A header may be as long as such a signature reads as a number: 640 bytes are b"\x80\x02". Then it is JSON.
-        signed = start[:2] in (b"PK", b"\x80\x02") and not (start[8:] == b"{" and length <= MAX_HEADER_BYTES)
-        if signed or path.suffix.lower() in (".pt", ".pth", ".pkl"):
-            hint = "save its arrays as .npy files ('splatlift pack npy' makes packs of those), or as safetensors"
-            got = "a Python pickle or a zip, which may run code when it is opened"
-            raise ValueError(f"a safetensors file, got {got}; {hint}")
         if len(start) < _START or start[8:] != b"{":
             got = f"a file that begins with {first_bytes(start)}" if start else "an empty file"
             raise ValueError(f"a safetensors file, got {got}")

@@ -30,7 +30,8 @@ Point = tuple[Number, Number, Number]  # x y z, frame of the splats
 def _direction(direction: Point) -> Point:
     length = math.hypot(*direction)
     if not 1 / LARGEST <= length <= LARGEST:
-        raise _wrong("a direction x y z, finite and not zero")
+        expected = "a direction x y z, finite and not zero"
+        raise PydanticCustomError("world", "{expected}", {"expected": expected})
     x, y, z = (axis / length + 0.0 for axis in direction)  # 0.0 of -0.0
     return x, y, z
 
@@ -101,7 +102,3 @@ def world_of(entry: Any) -> WorldFrame:
         return WorldFrame.model_validate(entry if isinstance(entry, dict) else {})
     except InvalidInput:
         return UNKNOWN
-
-
-def _wrong(expected: str) -> PydanticCustomError:
-    return PydanticCustomError("world", "{expected}", {"expected": expected})

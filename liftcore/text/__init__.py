@@ -72,13 +72,9 @@ def encoder_file(spec: str) -> Path | None:
 
 def check_encoder(spec: str) -> None:
     """Check that a specification is valid, that its file opens, and that a table is one."""
-    file = encoder_file(spec)
-    if file is None:
-        if spec not in BUILT_IN and not spec.startswith("open_clip:"):
-            raise InvalidInput("encoder", expected=f"one of {', '.join(ENCODER_SPECS)}", got=repr(spec))
-        return
-    with reading(f"encoder {file}", InvalidInput, "a readable file", "check the path and its permissions"):
-        file.open("rb").close()
+    if (file := encoder_file(spec)) is not None:
+        with reading(f"encoder {file}", InvalidInput, "a readable file", "check the path and its permissions"):
+            file.open("rb").close()
     if not spec.startswith("open_clip:"):
         open_encoder(spec)
 

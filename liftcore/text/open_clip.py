@@ -47,8 +47,10 @@ def open_model(kind: str, spec: str) -> OpenedModel:
     """
     model_name, at, file = spec.partition("@")
     model_name, _, tag = (model_name, "", "") if at else spec.partition("/")
-    label = f"encoder {kind}:{spec}"
-    _check_model(label, model_name)
+    label, model_names = f"encoder {kind}:{spec}", library().list_models()
+    if model_name not in model_names:
+        hint = nearest(model_name, model_names, 3)
+        raise InvalidQuery(label, expected="a model of open_clip", got=repr(model_name), hint=hint)
     if at:
         return OpenedModel(f"open_clip:{model_name}", model_name, _from_file(label, model_name, Path(file)))
     return OpenedModel(f"open_clip:{model_name}/{tag}", model_name, _from_tag(kind, model_name, tag))
@@ -83,17 +85,6 @@ def library() -> Any:
         expected = "the package open_clip_torch"
         raise Unavailable("encoder open_clip", expected=expected, got=str(error), hint=hint) from None
     return open_clip
-
-
-def _check_model(label: str, model_name: str) -> None:
-    model_names = library().list_models()
-    if model_name not in model_names:
-        raise InvalidQuery(
-            label,
-            expected="a model of open_clip",
-            got=repr(model_name),
-            hint=nearest(model_name, model_names, 3),
-        )
 
 
 def _from_tag(kind: str, model_name: str, tag: str) -> Any:

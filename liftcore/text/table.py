@@ -46,7 +46,7 @@ class TableEncoder:
         self.name = name
         self.words = tuple(words)
         self.channels = int(embeddings.shape[1])
-        self._unit = (wide / lengths).astype(np.float32)
+        self.embeddings = (wide / lengths).astype(np.float32)  # [n, F], unit rows of the words
         # Of two equal words the first one counts, so the order is reversed and the first is written last.
         self._rows = {normalize_text(word): row for row, word in reversed(list(enumerate(words)))}
 
@@ -62,18 +62,14 @@ class TableEncoder:
         if not path.is_file():
             raise InvalidTable(name, expected="a file", got=f"nothing at {path}")
         try:
-            return cls._read(path, name)
+            with reading(name, InvalidTable, EXPECTED):
+                check_header(path)
+                tensors, metadata = map_tensors(path)
+                if "embeddings" not in tensors:
+                    raise ValueError(f"{EXPECTED}, got no embeddings")
+                return cls.of(name, metadata.get("words", "null"), tensors["embeddings"])
         except InvalidTable as error:
             raise wrong_kind(path, "table", InvalidTable, argument=name, expected=EXPECTED) or error from None
-
-    @classmethod
-    def _read(cls, path: Path, name: str) -> Self:
-        with reading(name, InvalidTable, EXPECTED):
-            check_header(path)
-            tensors, metadata = map_tensors(path)
-            if "embeddings" not in tensors:
-                raise ValueError(f"{EXPECTED}, got no embeddings")
-        return cls.of(name, metadata.get("words", "null"), tensors["embeddings"])
 
     @classmethod
     def of(cls, name: str, words: str, embeddings: np.ndarray) -> Self:
@@ -87,21 +83,13 @@ class TableEncoder:
             check_arrays({"embeddings": embeddings}, {"embeddings": ("f2 f4", "n F")})
         return cls(name, word_list, embeddings)
 
-    @property
-    def embeddings(self) -> np.ndarray:
-        """Unit rows of the words, [n, F] f32."""
-        return self._unit
-
     def encode(self, texts: Sequence[str]) -> np.ndarray:
         """Encode n words as [n, F] f32 unit rows."""
         check_texts(texts)
-        return self._unit[[self._row(text) for text in texts]]
-
-    def _row(self, text: str) -> int:
-        row = self._rows.get(normalize_text(text))
-        if row is None:
-            raise self.refusal(text)
-        return row
+        rows = [self._rows.get(normalize_text(text)) for text in texts]
+        if None in rows:
+            raise self.refusal(texts[rows.index(None)])
+        return self.embeddings[rows]
 
     @cached_property
     def vocabulary(self) -> Vocabulary:

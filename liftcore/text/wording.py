@@ -122,7 +122,7 @@ class Vocabulary:
 
     def has_word(self, text: str) -> bool:
         """Return True if a word matches a text as a whole."""
-        return self.word_of(text) is not None
+        return text in self or self._look_up(text) is not None
 
     def find_part(self, text: str) -> PartPhrase | None:
         """Return the words of a part and its object if a text names both and is not itself a word, else None.
@@ -157,13 +157,6 @@ class Vocabulary:
             if (match := self._look_up(head)) is not None:
                 return head, match[0]
         return None
-
-    def word_of(self, text: str) -> str | None:
-        """Return the word that matches a text as a whole, not by its head alone."""
-        if text in self:
-            return self._exact[normalize_text(text)]
-        match = self._look_up(text)
-        return None if match is None else match[0]
 
     def _look_up(self, text: str) -> tuple[str, str] | None:
         """Return the word that matches a text as a whole, and the kind of match."""

@@ -178,13 +178,10 @@ def input_files(splats: Path, cameras: Path, features: Sequence[Path]) -> list[I
 def input_file(path: Path) -> InputFile:
     """Return the path and the digest of a file, or of a SOG that is not bundled."""
     from liftcore.io.sog import META, sog_files
-    from liftcore.values.lift import InputFile
 
     resolved = path.resolve()
-    folder = resolved if resolved.is_dir() else resolved.parent
-    if resolved in (folder, folder / META):
-        return InputFile(path=str(resolved), sha256=_digest_of_several(sog_files(resolved), folder))
-    return InputFile(path=str(resolved), sha256=sha256_of(resolved))
+    is_folder = resolved.is_dir() or resolved.name == META
+    return _input_of(resolved, sog_files(resolved) if is_folder else [resolved])
 
 
 def camera_input(path: Path) -> InputFile:
@@ -193,22 +190,21 @@ def camera_input(path: Path) -> InputFile:
     Photos, features and lifts that lie in the same folder do not count: they may come and go.
     """
     from liftcore.io.cameras import camera_source
-    from liftcore.values.lift import InputFile
 
     absolute = Path(os.path.abspath(path))  # links stay: other files count beside them than where they lead
-    files = camera_source(absolute).files
-    if files == [absolute]:
-        return InputFile(path=str(absolute), sha256=sha256_of(absolute))
-    return InputFile(
-        path=str(absolute), sha256=_digest_of_several(files, absolute if absolute.is_dir() else absolute.parent)
-    )
+    return _input_of(absolute, camera_source(absolute).files)
 
 
-def _digest_of_several(files: Sequence[Path], folder: Path) -> str:
-    total = hashlib.sha256()
+def _input_of(path: Path, files: Sequence[Path]) -> InputFile:
+    """Return an input with the digest of its file or, of several, of their names and digests."""
+    from liftcore.values.lift import InputFile
+
+    if [*files] == [path]:
+        return InputFile(path=str(path), sha256=sha256_of(path))
+    total, folder = hashlib.sha256(), path if path.is_dir() else path.parent
     for part in files:
         total.update(f"{os.path.relpath(part, folder)} {sha256_of(part)}\n".encode())
-    return total.hexdigest()
+    return InputFile(path=str(path), sha256=total.hexdigest())
 
 
 def found_input(role: str, recorded: InputFile, metadata: LiftMetadata, lift: Path | None) -> Path | None:

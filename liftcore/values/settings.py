@@ -15,7 +15,6 @@ from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, model_validat
 from liftcore.errors import InvalidSettings
 from liftcore.runtime.arguments import device_name
 from liftcore.runtime.fields import Body, takes
-from liftcore.runtime.one_line import one_line
 from liftcore.scene.compositing import (
     LARGEST_ALPHA,
     MOST_OF_A_RAY,
@@ -246,11 +245,6 @@ class LiftSettings(Body):
         settings = handler({**weights, **level, **values})
         settings.model_fields_set.intersection_update(values)  # set by the caller; they stay when the preset changes
         return settings
-
-    def __repr__(self) -> str:
-        overrides = self.model_dump(mode="json", include=self.model_fields_set - {"preset", "quality"})
-        arguments = {"preset": str(self.preset), "quality": str(self.quality), **overrides}
-        return one_line(self, *(f"{name}={value!r}" for name, value in arguments.items()))
 
     @property
     def compositing(self) -> CompositingParams:
