@@ -16,6 +16,7 @@ import liftcore as lc
 from liftcore.text.table import TableEncoder
 from liftcore.values.pack import write_pack
 from tests import tiny_scene
+from tests.promises.tiny_files import write_files
 from tests.run_lengths import sam_records
 from tests.scenes import write_scene
 
@@ -35,20 +36,16 @@ def run(script: str, *arguments: object) -> str:
 
 @pytest.fixture
 def tiny(tmp_path: Path) -> Path:
-    """A folder with the files of the tiny scene, whose cluster k is class k and word k, and its lift."""
-    scene = tiny_scene.make_scene()
-    for name in ("splats.ply", "cameras.json", "features.safetensors", "table.safetensors"):
-        (tmp_path / name).write_bytes(getattr(scene, name.partition(".")[0]))
+    """A folder with the files of the tiny scene, whose cluster k is class k and word k."""
+    write_files(tmp_path)
     (tmp_path / "labels").mkdir()
     for view, labels in tiny_scene.labels().items():
         Image.fromarray(labels[0].astype(np.uint8)).save(tmp_path / "labels" / f"{view}.png")
-    paths = (tmp_path / "splats.ply", tmp_path / "cameras.json", [tmp_path / "features.safetensors"])
-    lc.lift_files(*paths).save(tmp_path / "lift.safetensors")
     return tmp_path
 
 
 def test_label_voting_gives_each_splat_its_class_and_how_sure_it_is(tiny: Path) -> None:
-    run("label_voting.py", tiny / "splats.ply", tiny / "cameras.json", tiny / "labels", tiny / "voted.ply")
+    run("label_voting.py", tiny / "s.ply", tiny / "c.json", tiny / "labels", tiny / "voted.ply")
     columns = lc.read_splats(tiny / "voted.ply").extras
     expected = np.repeat(np.arange(3), tiny_scene.SPLATS_A_CLUSTER)
     assert np.array_equal(np.asarray(columns["class_id"]), expected)
@@ -60,7 +57,7 @@ def test_sam_masks_become_things_that_are_exported(tiny: Path) -> None:
     for view, labels in tiny_scene.labels().items():
         masks = labels[0] == np.arange(3)[:, None, None]
         np.savez(tiny / "masks" / f"{view}.npz", masks=masks, vectors=tiny_scene.codebook())
-    output = run("sam_masks.py", tiny / "splats.ply", tiny / "cameras.json", tiny / "masks", tiny / "things.ply")
+    output = run("sam_masks.py", tiny / "s.ply", tiny / "c.json", tiny / "masks", tiny / "things.ply")
     assert output.count("20 splats about") == 3
     assert sorted(np.unique(lc.read_splats(tiny / "things.ply").extras["instance_id"])) == [1, 2, 3]  # 0 is none
 
@@ -89,7 +86,7 @@ def test_written_pack_has_the_labels_and_vectors_of_its_folders(tiny: Path) -> N
         np.save(tiny / "ids" / f"{view}.npy", labels[0])
         np.save(tiny / "vectors" / f"{view}.npy", tiny_scene.codebook())
     run("write_pack.py", tiny / "ids", tiny / "vectors", tiny / "own.safetensors")
-    expected = lc.read_features(tiny / "features.safetensors")
+    expected = lc.read_features(tiny / "f.safetensors")
     for name, view in lc.read_features(tiny / "own.safetensors").items():
         right = expected[name]
         assert isinstance(view, lc.Regions) and isinstance(right, lc.Regions)

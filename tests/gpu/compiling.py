@@ -124,15 +124,8 @@ def _views(kernel: Kernel, params: CompositingParams, weighting: Weighting) -> N
         gpu.ray_rows(camera, torch.zeros(17, 2, dtype=torch.int32), params)
 
 
-def _every_product() -> None:
-    """One of each for 3DGS."""
-    splats, camera = random_splats(3), random_camera(3)
-    gpu = raster.GpuRaster(splats, torch.device("cpu"))
-    gpu.region_weights(camera, random_regions(3), CompositingParams(), Weighting(2))
-
-
 def main() -> None:
-    """The kernels of lifts of every kind of splat and all others on an H100, and some of them on more cards."""
+    """The kernels of lifts of every kind of splat on an H100, and some of them on more cards."""
     raster.check_device = lambda _device: None
     launches: dict[Launch, None] = {}
     for kernel in Kernel:
@@ -146,7 +139,6 @@ def main() -> None:
         later = sorted({launch.name for launch in lift if launch not in warm})
         print(json.dumps({"kernel": str(kernel), "launches": len(lift), "compiled_in_the_lift": later}), flush=True)
         launches |= lift
-    launches |= launches_of(_every_product)
     names = ("_weigh", "_add_runs", "_cut")
     everywhere = [next(launch for launch in launches if launch.name == name) for name in names]
     for launch in launches:

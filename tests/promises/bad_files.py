@@ -23,7 +23,6 @@ import torch
 from PIL import Image
 from safetensors.numpy import save
 
-from tests import tiny_scene
 from tests.tiny_scene import PROPERTIES, cameras_document, cameras_json, ply, splat_rows
 
 SPLATS = Path(__file__).parents[1] / "data" / "splats"
@@ -237,7 +236,6 @@ SPLAT_FILES = [
     ("gap in harmonics", with_columns("f_rest_1"), "f_rest_0"),
     ("NaN everywhere", with_values("rot_3", np.nan), "finite"),
     ("Git LFS", POINTER, "git lfs pull"),
-    ("web page", b"<!DOCTYPE html>\n<html>", "web page"),
     ("pickle", PICKLE, "pickle"),
     ("a pickle of code", checkpoint({"splats": {"means": Intruder()}}), "more than tensors"),
     ("another checkpoint", checkpoint({"model": {"weight": torch.zeros(2)}}), "'model'"),
@@ -372,7 +370,6 @@ FEATURE_FILES = [
     ("views of other channels", save({"v/grid": ONES, "w/grid": np.ones((1, 1, 4), np.float32)}), "channels"),
     ("label beyond the codebook", save(REGIONS | {"v/labels": LABELS + 4}), "the label 4"),
     ("NaN in a codebook", save(REGIONS | {"v/codebook": BOOK * np.nan}), "finite"),
-    ("text table", tiny_scene.text_table(), "text embeddings"),
     ("zip of a pickle", zipped({"archive/data.pkl": b"\x80\x02."}), "code"),
     ("pickle", PICKLE, "pickle"),
 ]
@@ -392,7 +389,6 @@ def table_of(words: Any, rows: Any = ((1.0,),)) -> bytes:
 
 TABLE_FILES = [
     ("empty", b"", "empty file"),
-    ("features", save(REGIONS), "features"),
     ("vectors alone", npy(np.eye(3)), "safetensors.numpy.save_file({'embeddings': array}"),
     ("no words", tensors(4, **WORD), "words"),
     ("zeros", table_of(["a"], [[0.0]]), "zero"),
@@ -442,7 +438,6 @@ PHOTO_BOMBS = [
 ]
 LIFT_FILES = [
     ("empty", b"", "empty file"),
-    ("features", save(REGIONS), "features"),
     ("tensors of no lift", save({"a": ONES}), "lift"),
     ("metadata of no lift", save({"features": ONES[0]}, metadata={"splatlift": "{"}), "lift"),
     ("pickle", PICKLE, "pickle"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -105,25 +104,6 @@ def test_overlay_tints_the_selection_and_dims_the_rest(lift: Path, tmp_path: Pat
     assert pixels.shape[1] == WIDTH and pixels[HEIGHT:].min() < 128  # a caption below
     rest = pixels[:HEIGHT][~mask, 0]
     assert (pixels[:HEIGHT][mask, 0] > 100).all() and np.mean((rest > 10) & (rest < 50)) > 0.5
-
-
-def test_labels_are_columns_with_names_and_boxes(lift: Path, table: list[object], tmp_path: Path) -> None:
-    out = tmp_path / "labels.ply"
-    document = run("segment", lift, *table, "--labelled", out, "--json").document
-    assert document["files"] == {"labelled": str(out), "names": f"{out}.json"}
-    names, splats, source = json.loads(Path(f"{out}.json").read_text()), lc.read_splats(out), lc.Scene(lift).splats
-    assert torch.equal(splats.means, source.means) and torch.equal(splats.quats, source.quats)
-    words = {entry["class_id"]: entry["name"] for entry in names["classes"]}
-    class_ids, instance_ids = (splats.extras[name].numpy() for name in ("class_id", "instance_id"))
-    assert [words[value] for value in class_ids] == [WORDS[number] for number in CLUSTER]
-    assert len(names["instances"]) == 3 and float(splats.extras["score"].min()) > 0.5
-    for entry in names["instances"]:
-        inside = instance_ids == entry["instance_id"]
-        assert set(class_ids[inside]) == {entry["class_id"]} and inside.sum() == entry["splats"]
-        box = entry["oriented_box"]
-        sides = (splats.means.numpy()[inside] - box["centre"]) @ np.array(box["axes"]).T
-        assert (np.abs(sides) <= np.array(box["half_sizes"]) + 1e-5).all()
-        assert np.linalg.det(box["axes"]) == pytest.approx(1)  # right-handed, each of length one
 
 
 def test_objects_are_written_one_by_one_and_as_a_table(lift: Path, tmp_path: Path) -> None:

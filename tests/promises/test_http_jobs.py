@@ -132,13 +132,6 @@ def test_events_tell_the_whole_story_and_go_on_after_the_last(client: httpx.Clie
     assert client.get(path, headers={"Last-Event-ID": str(numbers[-1])}).status_code == 204
 
 
-def test_stream_of_events_ends_with_its_job(client: httpx.Client, order: dict[str, Any]) -> None:
-    path = order_job(client, order).headers["location"]
-    story = list(events_of(client.get(f"{path}/events").text))  # which returns when the stream ends
-    assert story[-1][2]["state"] == client.get(path).json()["state"] == "succeeded"
-    delete_lift(client, path.removeprefix("/jobs/"))
-
-
 def test_succeeded_job_tells_its_plan_its_times_and_its_lift(client: httpx.Client, lift: dict[str, Any]) -> None:
     job = client.get(lift["links"]["job"]).json()
     assert (job["id"], job["state"], job["attempt"], job["problem"]) == (lift["id"], "succeeded", 1, None)
@@ -185,8 +178,10 @@ def test_job_and_lift_keep_what_the_plan_warned_of(client: httpx.Client, order: 
     assert client.get("/jobs").json() == before  # a plan is no job
     warnings = plan["warnings"]
     assert any("no camera can see" in line for line in warnings)
-    job = wait_for_end(client, order_job(client, body).headers["location"])
-    assert job["state"] == "succeeded", job
+    path = order_job(client, body).headers["location"]
+    story = list(events_of(client.get(f"{path}/events").text))  # which returns when the stream ends, with the job
+    job = client.get(path).json()
+    assert story[-1][2]["state"] == job["state"] == "succeeded", job
     assert set(warnings) <= set(job["plan"]["warnings"])
     kept_state = client.get(job["links"]["lift"]).json()["diagnostics"]["warnings"]
     assert any("no camera can see" in line for line in kept_state)

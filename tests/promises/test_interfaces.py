@@ -324,6 +324,8 @@ def test_labels_of_many_words_are_the_same(interfaces: Interfaces) -> None:
     options = ["--words", interfaces.folder / "words.txt", "--table", interfaces.files["table"]]
     output = interfaces.command("segment", *options)
     assert output is not None and output["answer"] == expected
+    labelled = interfaces.exported("labelled.ply", segmentation, "labelled")
+    assert interfaces.written_file("segment", "--labelled", "labelled.ply", *options) == labelled
     labels = [interfaces.post("/query/segment/labels", **body).content]
     labels.append(interfaces.written_file("segment", "--splat-labels", "labels.npy", *options))
     assert all(np.array_equal(np.load(io.BytesIO(content)), segmentation.values) for content in labels)

@@ -186,24 +186,6 @@ def test_masks_of_other_views_weigh_where_vectors_are_too_noisy() -> None:
     assert agreement(expected_rows, truth) < 0.82 and agreement(robust, truth) > 0.852
 
 
-def test_objects_and_their_parts_are_those_of_the_masks() -> None:
-    """Halves are two objects, quarters their four parts: each splat lies in those of its place."""
-    scene = random_scene(17, count=300, views=9, wrong=0.02)
-    result = lc.lift(*scene.arguments(), progress=False)
-    assert result.object is not None and result.node is not None and result.node_parents is not None
-    x, y = scene.splats.means[:, 0].numpy(), scene.splats.means[:, 1].numpy()
-    tiny = scene.splats.log_scales.amax(dim=1).numpy() < -1.5
-    inside = tiny & (np.abs(x) > 0.3) & (np.abs(y) > 0.3) & (result.node.numpy() >= 0)
-    assert inside.sum() > 20
-    objects, nodes = result.object.numpy()[inside], result.node.numpy()[inside]
-    parents = result.node_parents.numpy()
-    assert int((parents < 0).sum()) == 2 and int((parents >= 0).sum()) == 4
-    for labels, places in ((objects, x[inside] > 0), (nodes, (x[inside] > 0) * 2 + (y[inside] > 0))):
-        pairs, counts = np.unique(np.stack([labels, places]), axis=1, return_counts=True)
-        largest = sum(counts[pairs[0] == label].max() for label in np.unique(labels))
-        assert largest > 0.9 * len(labels)
-
-
 def test_splats_of_a_cluster_take_its_feature_or_keep_their_own() -> None:
     """The published aggregation: a cluster without a region that overlaps it enough changes nothing."""
     scene = random_scene(19, count=300, views=6, wrong=0.0)

@@ -145,7 +145,5 @@ def test_cluster_that_others_reach_must_ask_for_a_token(monkeypatch: pytest.Monk
 def test_engines_are_named() -> None:
     assert open_engine(None) is None
     assert isinstance(open_engine("local", threads=1), LocalEngine)
-    with pytest.raises(lc.InvalidSettings, match="engine: expected local or ray, got 'dask'"):
-        open_engine("dask")
     with pytest.raises(lc.InvalidSettings, match="an address beside the engine ray alone"):
         open_engine("local", "auto")

@@ -46,10 +46,8 @@ class MeanColour:
 
     def __init__(self, scale: float = 1.0) -> None:
         self.scale = scale
-        self.batches: list[int] = []
 
     def encode(self, images: Tensor) -> Tensor:
-        self.batches.append(len(images))
         return self.scale * torch.nn.functional.avg_pool2d(images, 4).permute(0, 2, 3, 1)
 
 

@@ -17,7 +17,7 @@ from liftcore.features.prompts import prompt_views
 from liftcore.values.pack import read_features
 from liftcore.values.views import Regions
 from tests.promises.command_line import run
-from tests.run_lengths import sam_records, write_files
+from tests.run_lengths import write_files
 from tests.tiny_scene import labels
 
 PHRASES = {0: "red_apple", 2: "Lamp"}  # the cluster between them has no phrase
@@ -27,33 +27,12 @@ MASKS = {
 }
 
 
-def records(view: str, key: str = "class_name", *, as_string: bool = False) -> list[dict[str, Any]]:
-    entries = sam_records(np.stack(list(MASKS[view].values())), as_string=as_string)
-    return [{**record, key: phrase} for record, phrase in zip(entries, MASKS[view], strict=True)]
-
-
 def binary(name: str) -> dict[str, np.ndarray]:
     return {
         f"{name.format(view=view, phrase=phrase)}.png": 255 * mask.astype(np.uint8)
         for view, masks in MASKS.items()
         for phrase, mask in masks.items()
     }
-
-
-def run_lengths(*, as_string: bool = False) -> dict[str, Any]:
-    return {f"{view}.jpg.json": {"annotations": records(view, as_string=as_string)} for view in MASKS}
-
-
-def data_set() -> dict[str, Any]:
-    numbers = {phrase: number for number, phrase in PHRASES.items()}
-    masks = [
-        {**record, "image_id": number, "category_id": numbers[record.pop("phrase")]}
-        for number, view in enumerate(MASKS)
-        for record in records(view, "phrase")
-    ]
-    images = [{"id": number, "file_name": f"{view}.jpg"} for number, view in enumerate(MASKS)]
-    categories = [{"id": number, "name": phrase} for number, phrase in PHRASES.items()]
-    return {"instances.json": {"images": images, "categories": categories, "annotations": masks}}
 
 
 def numbered_masks(view: str) -> np.ndarray:
@@ -72,8 +51,6 @@ COLOURS = {name: np.repeat(mask[..., None] // 255, 3, axis=2) for name, mask in 
 KINDS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "binary PNGs": (binary("{phrase}/{view}"), {}),
     "binary PNGs in colours": (COLOURS, {}),
-    "run lengths as strings": (run_lengths(as_string=True), {}),
-    "COCO's data set": (data_set(), {}),
     "label PNGs": (LABELS, {"names": "names.json"}),
     "label PNGs with a legend": ({f"{view}.png": with_legend(view) for view in MASKS}, {}),
 }  # fmt: skip

@@ -7,6 +7,8 @@ import pytest
 from liftcore.query.scene import Scene
 from tests.promises.tiny_files import write_lift
 
+from .made_up import with_parts
+
 
 @pytest.fixture(scope="session")
 def tiny_lift(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -17,3 +19,10 @@ def tiny_lift(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def scene(tiny_lift: Path) -> Scene:
     """The lifted tiny scene, open for queries."""
     return Scene(tiny_lift)
+
+
+@pytest.fixture
+def nested(scene: Scene, tmp_path: Path) -> Scene:
+    """The scene with its first object in two parts, nodes 3 and 4."""
+    with_parts(scene).save(tmp_path / "parts.lift.safetensors")
+    return Scene(tmp_path / "parts.lift.safetensors", scene.splats, scene.cameras)

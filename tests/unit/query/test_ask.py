@@ -26,6 +26,8 @@ from liftcore.values.lift_file import save_lift
 from tests.promises.tiny_files import write_lift
 from tests.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH
 
+from .made_up import lifted
+
 COUNT = 3 * SPLATS_A_CLUSTER
 NAMES = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=12)
 
@@ -44,19 +46,12 @@ class Axes:
         return np.eye(self.channels, dtype=np.float32)[["xyz".index(text) for text in texts]]
 
 
-def of(scene: Scene, rows: np.ndarray, **fields: torch.Tensor) -> Scene:
-    """Return the scene with these features [P, F]: every splat has a feature, of total weight one."""
-    ones = torch.ones(len(rows))
-    values = {"total_weight": ones, "has_feature": ones > 0} | fields
-    return Scene(replace(scene.lift, features=torch.from_numpy(rows.astype(np.float32)), **values))
-
-
 @pytest.fixture
 def exact(scene: Scene) -> Scene:
     """Splats j, j + 3, .. have the feature of one axis; the last splat has none."""
     rows = np.eye(CHANNELS)[np.arange(COUNT) % 3] + 0.01
     rows[-1] = 0
-    return of(scene, rows, has_feature=torch.arange(COUNT) < COUNT - 1)
+    return lifted(scene, rows, has_feature=torch.arange(COUNT) < COUNT - 1)
 
 
 def test_splats_without_weight_do_not_decide_the_threshold(exact: Scene) -> None:
@@ -64,7 +59,7 @@ def test_splats_without_weight_do_not_decide_the_threshold(exact: Scene) -> None
     outliers = np.zeros((COUNT, CHANNELS))
     outliers[:, 0], outliers[:, 1] = 1.0, np.linspace(0.0, 3.0, COUNT)  # scores all over the range
     weights = torch.cat([torch.ones(COUNT), torch.full((COUNT,), 1e-4)])
-    crowd = of(
+    crowd = lifted(
         exact,
         np.concatenate([exact.features.rows, outliers]),
         total_weight=weights,
@@ -128,9 +123,10 @@ def test_box_is_what_is_in_it_and_not_around_it(scene: Scene) -> None:
     """Half of each neighbour lies in the box, together more than the object, as around a thin object."""
     near, target = np.eye(2, CHANNELS)
     rows = np.repeat([near, target, near], SPLATS_A_CLUSTER, axis=0)
-    (boxed,) = directions(of(scene, rows), Query(like=["middle:box:5,2,28,22"]), None)
+    (boxed,) = directions(lifted(scene, rows), Query(like=["middle:box:5,2,28,22"]), None)
     assert boxed @ target > 0.9
-    (full_image,) = directions(of(scene, rows), Query(like=["middle:box:0,0,32,24"]), None)  # nothing is around it
+    # Nothing is around all of the image.
+    (full_image,) = directions(lifted(scene, rows), Query(like=["middle:box:0,0,32,24"]), None)
     assert full_image @ near > 0.9
     (within,) = directions(scene, Query(like=["middle:box:15,8,18,15"]), None)  # the same is around it
     assert within @ target > 0.9
@@ -145,15 +141,15 @@ def test_threshold_of_examples_is_above_a_least_likeness(scene: Scene) -> None:
     """Ten splats like the example and fifteen a little like it: the widest gap is between these 25 and the rest."""
     rows = np.zeros((COUNT, CHANNELS))
     rows[:10, 0], rows[10:25, :3], rows[25:, 1] = 1.0, [0.3, 0.3, 0.9], -1.0
-    lifted = of(scene, rows + np.random.default_rng(0).normal(0, 0.01, rows.shape))
-    by_example = ask(lifted, Query.of((SplatTerm(0),)))
+    subject = lifted(scene, rows + np.random.default_rng(0).normal(0, 0.01, rows.shape))
+    by_example = ask(subject, Query.of((SplatTerm(0),)))
     assert np.flatnonzero(by_example.selected).tolist() == list(range(10))
     assert by_example.threshold.value > 0.4 and find_threshold(by_example.scores).value < 0.0
-    in_words = ask(lifted, Query.of(("x",)), Axes())
+    in_words = ask(subject, Query.of(("x",)), Axes())
     assert in_words.threshold.value == find_threshold(in_words.scores).value
-    combined = ask(lifted, Query.of((SplatTerm(0), "x")), Axes())
+    combined = ask(subject, Query.of((SplatTerm(0), "x")), Axes())
     assert combined.threshold.value == find_threshold(combined.scores).value
-    assert ask(lifted, Query.of((SplatTerm(0),), threshold=0.1)).count == 25
+    assert ask(subject, Query.of((SplatTerm(0),), threshold=0.1)).count == 25
 
 
 @pytest.mark.parametrize(

@@ -6,20 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 
 from liftcore.query.question import Query
 from liftcore.query.scene import Scene
 from liftcore.text.table import TableEncoder
-from tests.unit.query.test_catalogue import with_parts
 
-
-@pytest.fixture
-def nested(scene: Scene, tmp_path: Path) -> Scene:
-    """The scene with its first object in two parts, 3 and 4."""
-    with_parts(scene).save(tmp_path / "parts.lift.safetensors")
-    return Scene(tmp_path / "parts.lift.safetensors", scene.splats, scene.cameras)
+from .made_up import with_parts
 
 
 def candidates_of(scene: Scene, like: str) -> list[tuple[int, str]]:

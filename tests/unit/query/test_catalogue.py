@@ -16,7 +16,7 @@ from liftcore.values.lift_file import NODE_TENSORS, save_lift
 from liftcore.values.settings import LiftSettings
 from tests.tiny_scene import CHANNELS, WORDS
 
-EYE = np.eye(3, CHANNELS, dtype=np.float32)
+from .made_up import EYE, with_parts
 
 
 def test_a_draft_says_that_it_looked_for_no_objects_and_what_finds_them(scene: Scene, tmp_path: Path) -> None:
@@ -30,23 +30,8 @@ def test_a_draft_says_that_it_looked_for_no_objects_and_what_finds_them(scene: S
         draft.export(tmp_path / "object.ply", source=0)
 
 
-def with_parts(scene: Scene) -> LiftResult:
-    """Return the lift with its first object in two halves, whose features differ from the object's."""
-    lift = LiftResult.of(scene.lift.cpu())
-    assert lift.object is not None and lift.object_views is not None and lift.node_features is not None
-    node, first = lift.object.clone(), torch.nonzero(lift.object == 0)[:, 0]
-    node[first[::2]], node[first[1::2]] = 3, 4
-    vectors = torch.from_numpy(np.concatenate([EYE, 3 * EYE[[1, 2]]])).half()
-    return replace(
-        lift, node=node, node_parents=torch.tensor([-1, -1, -1, 0, 0]).int(), node_features=vectors,
-        node_views=torch.cat([lift.object_views, lift.object_views[[0, 0]]]), node_confidence=torch.ones(5) / 2,
-    )  # fmt: skip
-
-
-def test_parts_have_paths_places_and_names_of_what_their_own_masks_say(scene: Scene, tmp_path: Path) -> None:
-    with_parts(scene).save(tmp_path / "parts.lift")
-    saved = Scene(tmp_path / "parts.lift", scene.splats, scene.cameras)
-    tree = saved.tree(WORDS, EYE)
+def test_parts_have_paths_places_and_names_of_what_their_own_masks_say(nested: Scene) -> None:
+    tree = nested.tree(WORDS, EYE)
     assert [(node.id, node.kind, node.parent) for node in tree.nodes[:3]] == [(n, "object", None) for n in range(3)]
     assert tree.objects == tree.nodes[:3] and {node.name for node in tree.objects} == set(WORDS)
     assert [(node.kind, node.path, node.name) for node in tree.nodes[3:]] == [
@@ -54,12 +39,12 @@ def test_parts_have_paths_places_and_names_of_what_their_own_masks_say(scene: Sc
     ]  # fmt: skip
     assert tree.nodes[0].parts == (3, 4) and tree.nodes[0].splats == sum(node.splats for node in tree.nodes[3:])
     for node in tree.nodes:
-        inside = saved.members(node.id)
+        inside = nested.members(node.id)
         assert inside.sum() == node.splats and set(np.flatnonzero(inside)) <= set(
-            np.flatnonzero(saved.members(node.path[0]))
+            np.flatnonzero(nested.members(node.path[0]))
         )
     with pytest.raises(NotFound, match="from 0 to 4"):
-        saved.members(5)
+        nested.members(5)
 
 
 def test_rows_of_a_lift_keep_their_part_of_the_tree(scene: Scene) -> None:

@@ -17,8 +17,9 @@ from liftcore.query.question import Query
 from liftcore.query.scene import Scene
 from liftcore.query.terms import Vector
 from tests.tiny_scene import AXES, CHANNELS, WORDS, text_table
-from tests.unit.query.test_catalogue import with_parts
 from tests.unit.scene.test_gltf import document_of
+
+from .made_up import EYE
 
 
 def read_labels(path: Path) -> Labels:
@@ -27,9 +28,6 @@ def read_labels(path: Path) -> Labels:
     if path.suffix == ".glb":
         return Labels(columns, document_of(path))
     return Labels(columns, json.loads(path.with_name(f"{path.name}.json").read_text(encoding="utf-8")))
-
-
-EYE = np.eye(3, CHANNELS, dtype=np.float32)
 
 
 def test_every_source_gives_instances_that_lie_in_their_boxes(scene: Scene) -> None:
@@ -46,6 +44,10 @@ def test_every_source_gives_instances_that_lie_in_their_boxes(scene: Scene) -> N
             places = scene.splats.positions()[inside]
             low, high = instance["box"]["low"], instance["box"]["high"]
             assert (places >= np.array(low) - 1e-6).all() and (places <= np.array(high) + 1e-6).all()
+            box = instance["oriented_box"]
+            sides = (places - box["centre"]) @ np.array(box["axes"]).T
+            assert (np.abs(sides) <= np.array(box["half_sizes"]) + 1e-5).all()
+            assert np.linalg.det(box["axes"]) == pytest.approx(1)  # right-handed, each of length one
     with pytest.raises(InvalidQuery, match="an answer with selected splats"):
         scene.labels(scene.ask(Query.of((Vector((1.0,) * CHANNELS),), threshold=1.0)))
 
@@ -67,27 +69,20 @@ def test_masks_in_views_are_those_of_the_instances(scene: Scene, tmp_path: Path)
         assert WORDS.index(names[entry["category_id"]]) == int(3 * centre / view["width"])
 
 
-@pytest.fixture
-def tree_scene(scene: Scene, tmp_path: Path) -> Scene:
-    """The scene with its first object in two parts, nodes 3 and 4."""
-    with_parts(scene).save(tmp_path / "parts.lift.safetensors")
-    return Scene(tmp_path / "parts.lift.safetensors", scene.splats, scene.cameras)
-
-
 @pytest.mark.parametrize("suffix", [".ply", ".glb"])
 def test_files_of_a_tree_come_back_with_paths_and_the_smallest_nodes(
-    tree_scene: Scene, tmp_path: Path, suffix: str, capsys: pytest.CaptureFixture[str]
+    nested: Scene, tmp_path: Path, suffix: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "words.safetensors").write_bytes(text_table())
     options = ["--table", str(tmp_path / "words.safetensors")]
-    assert main(["export", str(tree_scene.path), "-o", str(tmp_path / f"x{suffix}"), *options, "--json"]) == 0
+    assert main(["export", str(nested.path), "-o", str(tmp_path / f"x{suffix}"), *options, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["nodes"] == 5
     labels = read_labels(tmp_path / f"x{suffix}")
-    assert tree_scene.node is not None and tree_scene.object is not None
-    np.testing.assert_array_equal(labels.columns["node_id"], tree_scene.node + 1)
-    np.testing.assert_array_equal(labels.columns["instance_id"], tree_scene.object + 1)
+    assert nested.node is not None and nested.object is not None
+    np.testing.assert_array_equal(labels.columns["node_id"], nested.node + 1)
+    np.testing.assert_array_equal(labels.columns["instance_id"], nested.object + 1)
     nodes = {tree_node["node_id"]: tree_node for tree_node in labels.document["nodes"]}
-    tree = tree_scene.tree(WORDS, EYE).nodes
+    tree = nested.tree(WORDS, EYE).nodes
     assert set(nodes) == {tree_node.id + 1 for tree_node in tree}
     for tree_node in tree:
         entry = nodes[tree_node.id + 1]
@@ -101,8 +96,8 @@ def test_files_of_a_tree_come_back_with_paths_and_the_smallest_nodes(
         assert list(tree_node["path"]) == [tree_node["instance_id"]]
 
 
-def test_rows_of_labels_keep_the_nodes_that_hold_theirs(tree_scene: Scene) -> None:
-    labels = tree_scene.labels(tree_scene.tree())
+def test_rows_of_labels_keep_the_nodes_that_hold_theirs(nested: Scene) -> None:
+    labels = nested.labels(nested.tree())
     subset = labels.subset(labels.columns["node_id"] == 4)
     assert [node["node_id"] for node in subset.document["nodes"]] == [1, 4]
 
@@ -114,8 +109,8 @@ def test_run_lengths_are_columns_and_begin_with_zeros() -> None:
 
 
 @pytest.mark.parametrize("suffix", [".splat", ".spz"])
-def test_a_format_without_labels_is_refused_for_a_tree(tree_scene: Scene, tmp_path: Path, suffix: str) -> None:
+def test_a_format_without_labels_is_refused_for_a_tree(nested: Scene, tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"tree{suffix}"
     with pytest.raises(InvalidSplats, match="which hold labels"):
-        tree_scene.export(path, tree_scene.tree())
+        nested.export(path, nested.tree())
     assert not path.exists()

@@ -14,7 +14,7 @@ from liftcore.query import scene as scenes
 from liftcore.query.ask import ask
 from liftcore.query.colours import cluster_colours
 from liftcore.query.objects import objects
-from liftcore.query.question import Answer, Query
+from liftcore.query.question import Query
 from liftcore.query.render import (
     expected_depth,
     render,
@@ -37,6 +37,7 @@ from tests.scenes import look_at, random_camera, random_splats
 from tests.tiny_scene import AXES, HEIGHT, SPLATS_A_CLUSTER, WIDTH
 
 from .made_up import answer_with
+from .test_objects import of
 
 
 @pytest.fixture(scope="module")
@@ -48,16 +49,6 @@ def lifted(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def scene(lifted: Path) -> Scene:
     return Scene(lifted)
-
-
-def of(scene: Scene, *clusters: int, keep: str = "all", rows: tuple[int, ...] = ()) -> Answer:
-    """Return an answer that selected these clusters and rows."""
-    answer = ask(scene, Query.of((Vector(tuple(AXES[0])),), threshold=0.5, keep=keep))
-    selected = np.zeros_like(answer.selected)
-    for cluster in clusters:
-        selected[cluster * SPLATS_A_CLUSTER : (cluster + 1) * SPLATS_A_CLUSTER] = True
-    selected[list(rows)] = True
-    return answer_with(answer, selected=selected)
 
 
 def mostly(scene: Scene, members: np.ndarray) -> np.ndarray:

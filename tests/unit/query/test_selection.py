@@ -1,7 +1,6 @@
 """Rules of a selection: other words compete, zero scores select nothing, objects are selected as a whole."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,26 +11,16 @@ from liftcore.query.ask import ask
 from liftcore.query.presence import References
 from liftcore.query.question import Query
 from liftcore.query.scene import Scene
-from liftcore.query.selection import CompetingWords, correct_by_objects, part_nodes
+from liftcore.query.selection import CompetingWords, correct_by_objects
 from liftcore.text import LVIS_TABLE
 from liftcore.text.table import TableEncoder
-from liftcore.values.lift_file import NODE_TENSORS
+
+from .made_up import lifted
 
 
 @pytest.fixture(scope="module")
 def table() -> TableEncoder:
     return TableEncoder.open(LVIS_TABLE)
-
-
-def lifted(scene: Scene, features: np.ndarray, **fields: Any) -> Scene:
-    """Return the scene with these features [P, F], of total weight one."""
-    ones = torch.ones(len(features))
-    defaults = {
-        "total_weight": ones,
-        "has_feature": ones > 0,
-        **dict.fromkeys(("object", "object_views", *NODE_TENSORS)),
-    }
-    return Scene(replace(scene.lift, features=torch.from_numpy(features.astype(np.float32)), **defaults | fields))
 
 
 def pictures(table: TableEncoder, words: Sequence[str], noise: float, hub: float = 0.0) -> np.ndarray:
@@ -189,10 +178,3 @@ def test_word_of_a_part_takes_its_node_where_levels_disagree(
     assert (np.flatnonzero(answer.selected).tolist() == list(range(60))) == by_node
     assert ("the named parts are selected" in answer.threshold.explanation) == by_node
     assert np.flatnonzero(ask(subject, "mug", table).selected)[[0, -1]].tolist() == [0, 299]
-    references = References(tuple(table.words), table.embeddings)
-    parts = list(
-        part_nodes(
-            subject, (CompetingWords.among(references, word[None]) for word in table.encode(["mug", "handle", "cat"]))
-        )
-    )
-    assert any(parts) == by_node

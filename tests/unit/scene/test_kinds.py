@@ -29,6 +29,7 @@ from service.errors import Misconfigured
 from service.models import AssetKind
 from service.process import Reporter
 from service.settings import ServiceSettings, require_encoder_files
+from tests.promises.bad_files import zipped
 from tests.scenes import random_splats
 
 SOG = Path(__file__).parents[2] / "data" / "splats" / "degree3.sog"
@@ -74,10 +75,8 @@ def test_what_is_no_input_is_named_with_what_to_do(name: str, tmp_path: Path) ->
             reader(path)
 
 
-def zipped(path: Path, files: dict[str, bytes]) -> Path:
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, content in files.items():
-            archive.writestr(name, content)
+def write_zip(path: Path, files: dict[str, bytes]) -> Path:
+    path.write_bytes(zipped(files))
     return path
 
 
@@ -88,12 +87,12 @@ def splat_bytes(folder: Path) -> bytes:
 
 def test_a_zip_is_what_is_in_it_and_names_the_file_to_give(tmp_path: Path) -> None:
     splats = splat_bytes(tmp_path)
-    single = zipped(tmp_path / "one.zip", {"__MACOSX/._gs.ply": b"x", "3dgs/gs.ply": splats, "cloud.ply": CLOUD})
+    single = write_zip(tmp_path / "one.zip", {"__MACOSX/._gs.ply": b"x", "3dgs/gs.ply": splats, "cloud.ply": CLOUD})
     with pytest.raises(InvalidSplats, match=r"a zip with 3dgs/gs\.ply in it; unzip it and give 3dgs/gs\.ply"):
         read_splats(single)
     with pytest.raises(InvalidCameras, match=r"a zip with 3dgs/gs\.ply in it"):
         read_cameras(single)
-    several = zipped(
+    several = write_zip(
         tmp_path / "two.zip", {"a.spz": b"", "iteration_7000/p.ply": splats, "iteration_30000/p.ply": splats}
     )
     assert identify(several).splats == ("iteration_30000/p.ply", "iteration_7000/p.ply", "a.spz")
@@ -102,14 +101,14 @@ def test_a_zip_is_what_is_in_it_and_names_the_file_to_give(tmp_path: Path) -> No
         "cameras": {"a.jpg": b"", "sparse/0/cameras.bin": b"", "sparse/0/images.bin": b"", "input.ply": CLOUD},
     }
     for kind, files in cases.items():
-        assert identify(zipped(tmp_path / f"{kind}.zip", files)).kind == kind
+        assert identify(write_zip(tmp_path / f"{kind}.zip", files)).kind == kind
     words = {
         "features.npz": ({"a.npy": b""}, r"\.npz"),
         "pack.zip": ({"pack.safetensors": b""}, r"unzip it and give pack\.safetensors"),
     }
     for name, (files, word) in words.items():
         with pytest.raises(InvalidSplats, match=word):
-            read_splats(zipped(tmp_path / name, files))
+            read_splats(write_zip(tmp_path / name, files))
 
 
 @pytest.mark.parametrize(
@@ -157,7 +156,9 @@ def test_folders_of_features_and_photos_name_the_command(tmp_path: Path) -> None
 def test_a_sog_is_its_folder_its_meta_json_and_a_zip_of_its_folder(tmp_path: Path) -> None:
     with zipfile.ZipFile(SOG) as archive:
         archive.extractall(tmp_path / "scene")
-        folder_zip = zipped(tmp_path / "z.zip", {f"scene/{name}": archive.read(name) for name in archive.namelist()})
+        folder_zip = write_zip(
+            tmp_path / "z.zip", {f"scene/{name}": archive.read(name) for name in archive.namelist()}
+        )
     expected, meta = read_splats(SOG), tmp_path / "scene" / "meta.json"
     for path in (tmp_path / "scene", meta, folder_zip):
         assert identify(path).format is SplatFormat.SOG
@@ -193,7 +194,7 @@ def test_a_file_in_the_place_of_another_kind_is_named_for_what_it_is_everywhere(
         "masks": save({"v/mask": np.zeros((2, 2), np.uint8)}),
         "table": save({"embeddings": rows}, metadata={"words": '["a", "b"]'}),
         "lift": save({"features": rows}, metadata={"splatlift": "{}"}),
-        "photos": zipped(tmp_path / "zip", {"a.png": b"\x89PNG\r\n"}).read_bytes(),
+        "photos": write_zip(tmp_path / "zip", {"a.png": b"\x89PNG\r\n"}).read_bytes(),
         "page": b"<!DOCTYPE html><title>404</title>",
     }
     for name, content in contents.items():

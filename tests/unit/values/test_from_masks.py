@@ -7,7 +7,6 @@ import pytest
 import torch
 
 import liftcore as lc
-from tests.scenes import random_camera, random_splats
 
 OVERLAPPING = np.array([[[1, 1, 0, 0]], [[0, 1, 1, 0]], [[0, 0, 0, 1]], [[0, 0, 0, 0]]], dtype=bool)  # [4, 1, 4]
 VECTORS = np.eye(4, 3, dtype=np.float32)
@@ -23,18 +22,6 @@ def test_each_pixel_has_a_label_of_each_mask_that_it_lies_under(form: Any) -> No
         on = (regions.labels == number).numpy()
         assert np.array_equal(on.any(axis=0), mask) and on.sum() == mask.sum()
     assert regions.labels.shape == (2, 1, 4)
-
-
-def test_overlapping_masks_lift_as_the_sum_of_what_each_says() -> None:
-    splats, camera = random_splats(1), random_camera(1)
-    rng = np.random.default_rng(0)
-    masks = rng.random((5, 9, 11)) < 0.4
-    regions = lc.Regions.from_masks(masks, rng.normal(size=(5, 6)))
-    W = lc.region_weights(splats, {"v0": camera}, {"v0": regions}, "row-sum").matrix(splats.count)
-    for number in range(5):
-        single = lc.Regions.from_masks(masks[number : number + 1], np.ones((1, 6)))
-        column = lc.region_weights(splats, {"v0": camera}, {"v0": single}, "row-sum").matrix(splats.count)
-        np.testing.assert_allclose(W[:, [number]].toarray(), column.toarray(), rtol=1e-6)
 
 
 @pytest.mark.parametrize(
