@@ -110,7 +110,7 @@ SHAPES: tuple[Extreme, ...] = (
     *(
         view_of(f"a floor around the camera that ends at its horizon, turned by {tilt:g}",
             at([(0.0, height, 0.5), (0.3, height, 3.0)], 2.0, camera=camera_at_origin(40, 40), quats=_about_x(tilt)),
-            lambda A: A.any() and (A == 0).any(axis=0).all(), kernels=DISC)
+            lambda A: bool(A.any() and (A == 0).any(axis=0).all()), kernels=DISC)
         for height, tilt in ((-0.5, 1.4), (0.01, math.pi / 2), (0.3, 1.2))
     ),
     view_of("a floor that rises towards the camera and passes behind it: rays upwards meet it only backwards",
