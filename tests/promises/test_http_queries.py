@@ -184,12 +184,6 @@ def test_newest_lift_answers_where_none_is_named_in_the_words_of_its_order(
     delete_lift(client, newest["id"])
 
 
-def test_order_with_a_table_of_other_channels_is_refused(client: httpx.Client, order: dict[str, Any]) -> None:
-    narrow = upload(client, "table", text_table(CHANNELS - 1))
-    assert assert_problem(client.post("/lift", json=order | {"table": narrow}), 422)["argument"] == "table"
-    assert client.delete(f"/assets/{narrow}").status_code == 204
-
-
 def test_answer_from_the_cache_is_the_answer(client: httpx.Client, lift: dict[str, Any]) -> None:
     paths = {
         "/query": LAMP, "/query/scores": LAMP, "/query/objects": LAMP,
