@@ -400,7 +400,6 @@ TABLE_FILES = [
         save({"embeddings": np.ones((1, 2)), "more": np.ones(2)}, metadata={"words": '["a"]'}),
         "'more'",
     ),
-    ("pickle", PICKLE, "pickle"),
 ]
 TABLE_BOMBS = [
     ("deep words", table_of("[" * 100_000), "words"),
@@ -440,7 +439,6 @@ LIFT_FILES = [
     ("empty", b"", "empty file"),
     ("tensors of no lift", save({"a": ONES}), "lift"),
     ("metadata of no lift", save({"features": ONES[0]}, metadata={"splatlift": "{"}), "lift"),
-    ("pickle", PICKLE, "pickle"),
 ]
 BAD_FILES = [
     BadFile(kind, name, content, word, bomb)

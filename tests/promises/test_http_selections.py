@@ -106,7 +106,6 @@ def test_edit_of_an_older_version_is_refused(client: httpx.Client, route: str) -
         ({"operation": "add", "bits": "AA=="}, 422, "bits"),
         ({"operation": "add", "area": "nowhere:box:0,0,3,3"}, 404, "view"),
         ({"operation": "add", "query": {"sets": ["object:77"]}}, 404, ""),
-        ({"operation": "add", "query": {"text": ["zeppelin"]}}, 422, ""),
     ],
     ids=str,
 )

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
-from liftcore.lifting.files import lift_files
 from liftcore.lifting.planning.views import (
     count_covering_views,
     view_order,
@@ -15,8 +13,7 @@ from liftcore.lifting.planning.views import (
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.compositing import CompositingParams, Weighting
 from liftcore.scene.splats import Kernel
-from liftcore.values.settings import LiftSettings
-from tests.scenes import look_at, random_camera, random_regions, random_splats, write_scene
+from tests.scenes import look_at, random_camera, random_regions, random_splats
 
 
 def ring(count: int) -> list:
@@ -65,13 +62,3 @@ def test_views_are_added_until_each_splat_is_shown_often_enough_and_the_choice_r
         )
     assert count_covering_views(visible, order, 0) == 1
     assert count_covering_views(visible, order, 1_000) == 12
-
-
-def test_a_lift_with_coverage_is_the_lift_of_the_chosen_views(tmp_path):
-    paths = write_scene(tmp_path, 2)
-    result = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(coverage=1, preset="row-sum"))
-    plan = result.metadata.diagnostics["plan"]
-    assert len(result.metadata.views) == plan["views"] == 3 - plan["views_left_out"] < 3
-    full = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(preset="row-sum"))
-    assert not torch.equal(result.features, full.features)
-    assert bool((result.total_weight <= full.total_weight + 1e-4).all())

@@ -36,8 +36,8 @@ def test_maps_as_encoders_make_them_give_no_warning(tmp_path: Path) -> None:
         assert shape_warnings_of(tmp_path, grid(*cells), size) == [], cells
 
 
-CROPS = [((23, 23), (990, 742)), ((24, 24), (1280, 720)), ((16, 16), (480, 640)), ((9, 12), (500, 500))]
-SWAPPED = [((40, 30), (640, 480)), ((512, 30), (640, 480)), ((6, 30), (400, 400))]
+CROPS = [((23, 23), (990, 742)), ((16, 16), (480, 640))]
+SWAPPED = [((40, 30), (640, 480)), ((512, 30), (640, 480))]
 
 
 @pytest.mark.parametrize(("cells", "size"), [*CROPS, *SWAPPED])
