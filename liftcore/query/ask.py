@@ -18,7 +18,6 @@ from liftcore.query.directions import (
     read_query,
     wordings,
 )
-from liftcore.query.objects import point_of
 from liftcore.query.presence import (
     NOT_IN_WORDS,
     References,
@@ -33,12 +32,10 @@ from liftcore.query.presence import (
 )
 from liftcore.query.question import (
     Answer,
-    Box,
     Candidate,
     Presence,
     Query,
     Threshold,
-    TopSplat,
     WordMatch,
 )
 from liftcore.query.scene import Scene, as_numpy
@@ -221,41 +218,6 @@ def _part_answer(scene: Scene, request: ResolvedQuery) -> Answer:
     return answer.with_selected(answer.selected, request.query, reason=reason, wording=part.wording, **changes)
 
 
-def locate(scene: Scene, answer: Answer, count: int | None = None) -> Answer:
-    """Add to an answer its best splats, and the box around all selected ones.
-
-    A single outlier stretches the box; boxes of ``objects`` are without outliers.
-
-    Args:
-        count: of the best splats; None = the query's. Equal scores are ordered by their rows.
-
-    Raises:
-        InvalidLift: the splats moved or changed since the lift.
-    """
-    places, count = scene.axes, answer.query.top if count is None else count
-    rows = np.flatnonzero(answer.has_feature)
-    scores = answer.scores[rows]
-    if 0 < count < len(scores):
-        last = np.partition(scores, len(scores) - count)[len(scores) - count]
-        rows = np.concatenate([rows[scores > last], rows[scores == last]])[:count]
-    best = rows[np.argsort(-answer.scores[rows], kind="stable")][:count]
-    top = tuple(
-        TopSplat(splat=int(row), score=float(answer.scores[row]), position=point_of(places[:, row])) for row in best
-    )
-    selected = places.take(np.flatnonzero(answer.selected), axis=1)
-    box = Box(point_of(selected.min(axis=1)), point_of(selected.max(axis=1))) if answer.count else None
-    return answer.replace(top=top, box=box)
-
-
-def best_view(scene: Scene, answer: Answer) -> str | None:
-    """Return the view that shows most of the object with the most selected splats, or else the first view."""
-    views, objects = scene.metadata.views, scene.object
-    if objects is not None and scene.object_views is not None and (answer.selected & (objects >= 0)).any():
-        largest = np.bincount(objects[answer.selected & (objects >= 0)]).argmax()
-        return views[max(int(scene.object_views[largest, 0]), 0)]
-    return views[0] if views else None
-
-
 def _similarities(scene: Scene, request: ResolvedQuery) -> np.ndarray:
     """Compute the cosines of every row of the features to each term of a query, [K, n] f32."""
     features, norms, of_words = scene.features.rows, scene.features.norms, request.by_cosine
@@ -273,8 +235,7 @@ def _answer(scene: Scene, request: ResolvedQuery, similarities: np.ndarray) -> A
         return _set_answer(scene, query)
     presence, mask = _presence(rows, request, similarities)
     scores = combine(similarities if mask.all() else similarities[:, mask], int(mask[: len(query.positives)].sum()))
-    if not rows.all_have_features:
-        scores = np.where(rows.has_feature, scores, np.float32(LOWEST_COSINE))
+    scores = np.where(rows.has_feature, scores, np.float32(LOWEST_COSINE))
     if presence.present is False and query.absent == "drop":
         threshold, selected = _select_nothing(scene, query, presence.reason)
     else:
@@ -291,11 +252,7 @@ def _answer(scene: Scene, request: ResolvedQuery, similarities: np.ndarray) -> A
         competitors = members
         named_members = ", ".join(map(repr, members))
         presence = presence.replace(reason=f"{presence.reason} Of its kind in this scene: {named_members}.")
-    counts = None if rows.row_counts is None else rows.row_counts[rows.has_feature]
-    statistics = _statistics(scores[rows.has_feature], counts)
-    scores = scene.features.of_splats(scores)
-    if not scene.all_have_features:
-        scores = np.where(has_feature, scores, np.float32(LOWEST_COSINE))
+    scores = np.where(has_feature, scene.features.of_splats(scores), np.float32(LOWEST_COSINE))
     nodes = request.candidates
     if request.unknown_part is not None and selected.any():
         nodes = parts_of(scene, objects_within(scene, selected))
@@ -303,8 +260,8 @@ def _answer(scene: Scene, request: ResolvedQuery, similarities: np.ndarray) -> A
         sentence = presence.reason.replace(repr(query.text[0]), repr(request.unknown_part.object_phrase))
         presence = presence.replace(reason=f"{sentence} {_without_word(request.unknown_part, len(nodes))}")
     return Answer.of(
-        query, scores, has_feature, selected, wording=request.wording, rivals=competitors,
-        candidates=nodes, threshold=threshold, clear=clear, statistics=statistics, **dict(presence),
+        query, scores, has_feature, selected, wording=request.wording, rivals=competitors, candidates=nodes,
+        threshold=threshold, clear=clear, statistics=_statistics(scores[has_feature]), **dict(presence),
     )  # fmt: skip
 
 
@@ -361,7 +318,7 @@ def _set_answer(scene: Scene, query: Query) -> Answer:
     presence = Presence(present=count > 0, presence=float(count > 0), reason=f"{label} has {count} splats.")
     return Answer.of(
         query, scores, np.ones_like(members), members,
-        threshold=threshold, clear=count > 0, statistics=_statistics(scores, None), **dict(presence),
+        threshold=threshold, clear=count > 0, statistics=_statistics(scores), **dict(presence),
     )  # fmt: skip
 
 
@@ -393,7 +350,7 @@ def _select_rows(
 ) -> tuple[Threshold, np.ndarray, CompetingWords | None]:
     """Return the threshold of a query, the rows above it [K] bool, and the words by which objects correct them."""
     query, positives = request.query, len(request.query.positives)
-    valid_scores = scores if scene.all_have_features else scores[scene.has_feature]
+    valid_scores = scores[scene.has_feature]
     in_words = (request.by_cosine & mask)[:positives]
     competitors = _competing_words(request, request.rows[:positives][in_words])
     is_automatic = query.threshold == "auto" and in_words.any() and in_words.sum() == mask[:positives].sum()
@@ -529,9 +486,8 @@ def _presence(scene: Scene, request: ResolvedQuery, similarities: np.ndarray) ->
     return presence, mask
 
 
-def _statistics(scores: np.ndarray, counts: np.ndarray | None) -> dict[str, float]:
-    """Return the least, the largest and the mean of scores [n] f32, each of ``counts`` [n] splats; None: of one."""
+def _statistics(scores: np.ndarray) -> dict[str, float]:
+    """Return the least, the largest and the mean of scores [n] f32."""
     if not len(scores):
         return {}
-    mean = np.average(scores.astype(np.float64), weights=counts)
-    return {"min": float(scores.min()), "max": float(scores.max()), "mean": float(mean)}
+    return {"min": float(scores.min()), "max": float(scores.max()), "mean": float(scores.astype(np.float64).mean())}

@@ -12,8 +12,8 @@ import numpy as np
 
 from liftcore.errors import InvalidQuery, NotFound
 from liftcore.query.areas import area_feature
-from liftcore.query.presence import references_of, table_of
-from liftcore.query.question import Query, SuggestedWord, SuggestedWords
+from liftcore.query.presence import table_of
+from liftcore.query.question import Query
 from liftcore.query.scene import Scene, as_numpy
 from liftcore.query.terms import Area, Example, SplatSet, SplatTerm, Term, Vector, parse_example
 from liftcore.text import TextEncoder, check_texts
@@ -88,18 +88,6 @@ def part_phrase(text: str, encoder: TextEncoder) -> PartPhrase | None:
         return source.vocabulary.find_part(text)
     part = shipped_words().find_part(text)
     return part or next((phrase for phrase in part_phrases(text) if phrase.sure), None)
-
-
-def askable_words(scene: Scene, encoder: TextEncoder, text: str, count: int) -> SuggestedWords:
-    """Suggest words to query a lift by (`Scene.askable`)."""
-    source = table_of(encoder)
-    if source is not None:
-        scene_words = object_words(scene, source.words, source.embeddings)
-        words = tuple(SuggestedWord(**suggestion._asdict()) for suggestion in source.vocabulary.complete(text, count))
-        return SuggestedWords(open_vocabulary=False, words=words, scene_words=scene_words)
-    references = references_of(encoder, scene.metadata.text_space)
-    scene_words = () if isinstance(references, str) else object_words(scene, references.words, references.vectors)
-    return SuggestedWords(open_vocabulary=True, words=(), scene_words=scene_words)
 
 
 def object_words(scene: Scene, words: Sequence[str], vectors: np.ndarray) -> tuple[str, ...]:

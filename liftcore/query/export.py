@@ -18,11 +18,11 @@ from liftcore.io.labels import document_bytes
 from liftcore.io.splats import blocks_as, labelled, recoloured, some_rows
 from liftcore.query.catalogue import table_csv
 from liftcore.query.coco import masks_json
-from liftcore.query.colours import NOT_SEEN_COLOUR, cluster_colours, heat_colours
+from liftcore.query.colours import NOT_SEEN_COLOUR, heat_colours
 from liftcore.query.labels import labels
 from liftcore.query.objects import MOST_SPLATS, objects
 from liftcore.query.question import Answer
-from liftcore.query.scene import Scene, Source
+from liftcore.query.scene import Scene
 from liftcore.query.segment import map_png, picture_png, value_map
 
 if TYPE_CHECKING:  # these load torch
@@ -51,30 +51,22 @@ class Export:
         return self.view
 
 
-def blocks_of(
-    scene: Scene,
-    source: Source,
-    content: str = "",
-    *,
-    view: str | Camera | None = None,
-    suffix: str = "",
-    view_mask: ViewMask | None = None,
-    photo: Image | None = None,
-) -> Iterable[bytes]:
+def blocks_of(export: Export) -> Iterable[bytes]:
     """Make a file, in blocks: of an answer, a segmentation, an object of the lift by its id, or the scene.
 
-    Arguments and errors are those of `Scene.blocks_of`; ``content`` is one of FILES.
+    Errors are those of `Scene.blocks_of`. Empty ``content``: what the suffix or the kind of the source has first.
     """
+    source, content = export.source, export.content
     kinds = {Mapping: "answers", np.ndarray: "array", int: "object", type(None): "scene"}
     kind = next((kinds[base] for base in kinds if isinstance(source, base)), type(source).__name__.lower())
     files = FILES[kind]
     if kind in ("segmentation", "scenetree", "answers"):
         by_suffix = BY_SUFFIX | ({".ply": "labelled"} if kind == "scenetree" else {})
-        content = content or by_suffix.get(suffix, "")
+        content = content or by_suffix.get(export.suffix, "")
     content = content or next(iter(files))
     if content not in files:
         raise InvalidQuery("what", expected=f"one of {', '.join(files)}", got=repr(content))
-    return files[content](Export(scene, source, content, view, suffix, view_mask, photo))
+    return files[content](replace(export, content=content))
 
 
 def _of_scene(export: Export) -> Iterable[bytes]:
@@ -158,32 +150,6 @@ def npy(values: np.ndarray) -> bytes:
     content = io.BytesIO()
     np.save(content, values)
     return content.getvalue()
-
-
-def layer_colours(scene: Scene, layer: str) -> np.ndarray:
-    """Colour all splats by a layer, [P, 3] u8 sRGB.
-
-    ``pca`` are three principal components of the features, ``cluster`` a colour a cluster; ``total_weight`` (by its
-    logarithm) and ``confidence`` go through the colour map of scores. Splats without a feature
-    are grey.
-
-    Raises:
-        InvalidQuery: the lift has no clusters, or no confidence.
-    """
-    if layer == "pca":
-        colours = np.round(255 * scene.principal.numpy()).astype(np.uint8)
-    elif layer == "cluster":
-        clusters = scene.layer("cluster")
-        colours = cluster_colours(int(clusters.max()) + 1)[clusters]
-    else:
-        values = scene.layer("confidence" if layer == "confidence" else "total_weight").astype(np.float32)
-        valid = scene.has_feature & np.isfinite(values)
-        if layer == "total_weight":
-            valid &= values > 0
-            values = np.log(np.where(valid, values, 1.0))
-        colours = heat_colours(values, valid)
-    colours[~scene.has_feature] = NOT_SEEN_COLOUR
-    return colours
 
 
 Files = dict[str, Callable[[Export], Iterable[bytes]]]

@@ -36,7 +36,7 @@ import numpy as np
 from liftcore.errors import InvalidQuery, InvalidTable, Unavailable
 from liftcore.query.question import Presence
 from liftcore.query.scene import Scene
-from liftcore.query.scores import spaced
+from liftcore.query.scores import rank_rows, spaced
 from liftcore.query.threshold import LEAST_SHARE
 from liftcore.runtime.folders import cache_folder
 from liftcore.text import LVIS_TABLE, CachingEncoder, TextEncoder
@@ -50,7 +50,6 @@ _ITSELF = 0.9  # similarity about the mean from which a word is one of the refer
 LEAST_OF_SCENE = 0.9  # share of a scene, at which a word is among the nearest, from which all of it is of one thing
 RELATED = 0.55  # of the similarity of a word's nearest reference, from which references are left out
 MOST_SPLATS = 256  # of the best ones that are compared, those with the largest total weight
-_FIRST = 1_024  # splats among which the best ones are searched first
 _SAME_TEXT = 0.99  # least cosine of two vectors of one text that come from one encoder
 _IN_CONE = 0.5  # cosine to the shipped words' mean direction: they have .75 to .93, other spaces' vectors about 0
 
@@ -136,9 +135,8 @@ def estimate_presence(
 def _near_share(scene: Scene, direction: np.ndarray, references: np.ndarray, limit: int) -> float:
     """Return the share of a scene, by a sample of its splats, at which at most ``limit`` references are nearer."""
     rows = spaced(np.flatnonzero(scene.has_feature), MOST_SPLATS)
-    own_cosines, reference_cosines = products(scene.features[rows], scene.norms[rows], direction[None], references)
-    near = (reference_cosines >= own_cosines).sum(axis=1) <= limit
-    return float(np.average(near, weights=scene.total_weight[rows] + np.float32(1e-30)))
+    counts = nearer_counts(scene.features[rows], scene.norms[rows], scene.rough_mean, direction[None], references)
+    return float(np.average(counts[0] <= limit, weights=scene.total_weight[rows] + np.float32(1e-30)))
 
 
 def nearer_counts(
@@ -196,16 +194,9 @@ def best_splats(scene: Scene, scores: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """
     total_weight = np.where(scene.has_feature, scene.total_weight, np.float32(0.0))
     total_weight = total_weight if total_weight.any() else scene.has_feature.astype(np.float32)
-    least, count = LEAST_SHARE * float(total_weight.sum(dtype=np.float64)), min(_FIRST, len(scores))
-    ranked = -scores if scene.all_have_features else np.where(scene.has_feature, -scores, np.float32(np.inf))
-    while True:
-        rows = np.argpartition(ranked, count - 1)[:count] if count < len(ranked) else np.arange(count)
-        if count == len(ranked) or total_weight[rows].sum(dtype=np.float64) >= least:
-            break
-        count = min(4 * count, len(ranked))
-    rows = rows[np.lexsort((rows, ranked[rows]))]
-    rows = rows[: int(np.searchsorted(np.cumsum(total_weight[rows], dtype=np.float64), least)) + 1]
-    rows = rows[total_weight[rows] > 0]
+    rows = rank_rows(scores, np.flatnonzero(total_weight))
+    sums = np.cumsum(total_weight[rows], dtype=np.float64)
+    rows = rows[: int(np.searchsorted(sums, LEAST_SHARE * float(total_weight.sum(dtype=np.float64)))) + 1]
     heaviest = np.sort(np.argsort(-total_weight[rows], kind="stable")[:MOST_SPLATS])
     return rows[heaviest], total_weight[rows[heaviest]].astype(np.float64)
 

@@ -129,20 +129,16 @@ def render(scene: Scene, view: str | Camera, channel: str = "rgb") -> np.ndarray
 
 
 def _render_clusters(scene: Scene, view: str | Camera) -> np.ndarray:
-    clusters = torch.from_numpy(scene.layer("cluster"))
-    labels = scene.image(view, lambda camera: scene.raster.strongest_labels(camera, clusters, scene.compositing))
-    picture = cluster_colours(int(clusters.max()) + 1)[labels.numpy()]  # the last colour is that of label -1
-    sums = scene.image(view, lambda camera: scene.raster.row_sums(camera, scene.compositing))
-    picture[sums.numpy() <= 0] = 0
+    clusters = scene.layer("cluster")
+    labels, sums = scene.strongest_labels(clusters, view)
+    picture = cluster_colours(int(clusters.max()) + 1)[labels]  # the last colour is that of label -1
+    picture[sums <= 0] = 0
     return picture
 
 
 def _render_confidence(scene: Scene, view: str | Camera) -> np.ndarray:
-    confidence = scene.layer("confidence")
-    values = torch.from_numpy(np.stack([confidence, np.ones_like(confidence)], axis=1))
-    image = scene.image(view, lambda camera: scene.raster.render(camera, values, scene.compositing)).numpy()
-    sums = image[..., 1]
-    means = image[..., 0] / np.where(sums > 0, sums, 1.0)
+    confidence = torch.from_numpy(scene.layer("confidence"))
+    means, sums = _means(scene, view, confidence, scene.compositing)
     return map_colours(means, sums >= MINIMUM_ROW_SUM)
 
 
@@ -156,10 +152,18 @@ def expected_depth(scene: Scene, view: str | Camera) -> tuple[np.ndarray, np.nda
     """
     pose = torch.from_numpy(scene.camera(view).about(scene.splats.origin).viewmat[2].copy())
     depths = (scene.splats.means.double() @ pose[:3] + pose[3]).to(torch.float32)
-    values = torch.stack([depths, torch.ones_like(depths)], dim=1)
-    image = scene.image(view, lambda camera: scene.raster.render(camera, values, _as_trained(scene)))
-    hit = image[..., 1] > 0
-    return torch.where(hit, image[..., 0] / image[..., 1], 0.0).numpy(), hit.numpy()
+    means, sums = _means(scene, view, depths, _as_trained(scene))
+    return means, sums > 0
+
+
+def _means(
+    scene: Scene, view: str | Camera, values: torch.Tensor, params: CompositingParams
+) -> tuple[np.ndarray, np.ndarray]:
+    """Render the mean of the splats' values [P] on each ray, [H, W] f32, 0 where no splat is; and the row sums."""
+    columns = torch.stack([values, torch.ones_like(values)], dim=1)
+    image = scene.image(view, lambda camera: scene.raster.render(camera, columns, params))
+    totals, sums = image.unbind(dim=2)
+    return torch.where(sums > 0, totals / sums, 0.0).numpy(), sums.numpy()
 
 
 def shown_depth(scene: Scene, view: str | Camera) -> tuple[np.ndarray, tuple[float, float] | None]:

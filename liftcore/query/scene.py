@@ -17,7 +17,8 @@ import numpy as np
 
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound
 from liftcore.io.splats import quick_count
-from liftcore.query.scores import Features, cosines, norms_of, spaced
+from liftcore.query.colours import NOT_SEEN_COLOUR, cluster_colours, heat_colours
+from liftcore.query.scores import Features, cosines, norms_of, rank_rows, spaced
 from liftcore.runtime.progress import Progress, shown_progress
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.world import UNKNOWN, WorldFrame
@@ -47,7 +48,7 @@ Source: TypeAlias = (  # of a file
 AnyEncoder: TypeAlias = "TextEncoder | str | Path | None"  # or the specification of one; None: that of the lift
 
 OF_SPLATS = (  # values that are computed once, of splats with a feature and their total weight
-    "has_feature", "all_have_features", "weights", "norms", "effective_count", "mean", "rough_mean", "distinct",
+    "has_feature", "weights", "norms", "effective_count", "mean", "rough_mean", "distinct",
     "object_numbers", "object_means", "principal",
 )  # fmt: skip
 MOST_SAMPLED = 1 << 14  # splats of which a rough mean is computed
@@ -79,8 +80,6 @@ class Scene:
 
     features: Features
     """[P, F], exact or as codes; zero rows without a feature"""
-    row_counts: np.ndarray | None = None
-    """[P] f64, the number of splats that each row is of, of `distinct` rows; None: one"""
     selections: dict[str, Selection]
     """selections by their names (`select`)"""
     # The tensors of `liftcore.values.lift.Lift`, as arrays.
@@ -157,7 +156,7 @@ class Scene:
             InvalidLift: an example or ``places`` need the scene's files, and they moved or changed.
             Unavailable: the encoder's weights are not on this machine.
         """
-        from liftcore.query.ask import ask, locate
+        from liftcore.query.ask import ask
         from liftcore.query.question import Query
         from liftcore.text import check_texts
 
@@ -168,20 +167,39 @@ class Scene:
         if places is False:
             return answer
         with nullcontext() if places else suppress(InvalidLift):
-            return locate(self, answer)
+            return self.locate(answer)
         return answer
 
     def locate(self, answer: Answer, count: int | None = None) -> Answer:
-        """Add to an answer its best splats and the box of its selection (`liftcore.query.ask.locate`)."""
-        from liftcore.query.ask import locate
+        """Add to an answer its best splats, and the box around all selected ones.
 
-        return locate(self, answer, count)
+        A single outlier stretches the box; boxes of ``objects`` are without outliers.
+
+        Args:
+            count: of the best splats; None = the query's. Equal scores are ordered by their rows.
+
+        Raises:
+            InvalidLift: the splats moved or changed since the lift.
+        """
+        from liftcore.query.objects import point_of
+        from liftcore.query.question import Box, TopSplat
+
+        places, count = self.axes, answer.query.top if count is None else count
+        top = tuple(
+            TopSplat(splat=int(row), score=float(answer.scores[row]), position=point_of(places[:, row]))
+            for row in rank_rows(answer.scores, np.flatnonzero(answer.has_feature))[:count]
+        )
+        selected = places.take(np.flatnonzero(answer.selected), axis=1)
+        box = Box(point_of(selected.min(axis=1)), point_of(selected.max(axis=1))) if answer.count else None
+        return answer.replace(top=top, box=box)
 
     def best_view(self, answer: Answer) -> str | None:
         """Return the view that shows most of the object with the most selected splats, or else the first view."""
-        from liftcore.query.ask import best_view
-
-        return best_view(self, answer)
+        views, objects = self.metadata.views, self.object
+        if objects is not None and self.object_views is not None and (answer.selected & (objects >= 0)).any():
+            largest = np.bincount(objects[answer.selected & (objects >= 0)]).argmax()
+            return views[max(int(self.object_views[largest, 0]), 0)]
+        return views[0] if views else None
 
     def view_mask(
         self, query: Query | str | Answer, view: str | Camera | None = None, *, encoder: AnyEncoder = None
@@ -328,19 +346,43 @@ class Scene:
             InvalidQuery: the lift's text space names no encoder.
             Unavailable: the encoder's weights are not on this machine.
         """
-        from liftcore.query.directions import askable_words
+        from liftcore.query.directions import object_words
+        from liftcore.query.presence import references_of, table_of
+        from liftcore.query.question import SuggestedWord, SuggestedWords
 
-        return askable_words(self, self.encoder(encoder), text, count)
+        reader = self.encoder(encoder)
+        table = table_of(reader)
+        if table is not None:
+            scene_words = object_words(self, table.words, table.embeddings)
+            words = tuple(SuggestedWord(**word._asdict()) for word in table.vocabulary.complete(text, count))
+            return SuggestedWords(open_vocabulary=False, words=words, scene_words=scene_words)
+        references = references_of(reader, self.metadata.text_space)
+        scene_words = () if isinstance(references, str) else object_words(self, references.words, references.vectors)
+        return SuggestedWords(open_vocabulary=True, words=(), scene_words=scene_words)
 
     def colours(self, what: str) -> np.ndarray:
-        """Return [P, 3] u8 sRGB of splats by a layer: pca, cluster, total_weight or confidence.
+        """Colour all splats by a layer, [P, 3] u8 sRGB.
+
+        ``pca`` are three principal components of the features, ``cluster`` a colour a cluster; ``total_weight`` (by
+        its logarithm) and ``confidence`` go through the colour map of scores. Splats without a feature are grey.
 
         Raises:
-            InvalidQuery: the lift has no such layer.
+            InvalidQuery: the lift has no clusters, or no confidence.
         """
-        from liftcore.query.export import layer_colours
-
-        return layer_colours(self, what)
+        if what == "pca":
+            colours = np.round(255 * self.principal.numpy()).astype(np.uint8)
+        elif what == "cluster":
+            clusters = self.layer("cluster")
+            colours = cluster_colours(int(clusters.max()) + 1)[clusters]
+        else:
+            values = self.layer("confidence" if what == "confidence" else "total_weight").astype(np.float32)
+            valid = self.has_feature & np.isfinite(values)
+            if what == "total_weight":
+                valid &= values > 0
+                values = np.log(np.where(valid, values, 1.0))
+            colours = heat_colours(values, valid)
+        colours[~self.has_feature] = NOT_SEEN_COLOUR
+        return colours
 
     def labels(self, source: Answer | Mapping[str, Answer] | Segmentation | SceneTree) -> Labels:
         """Return class and instance labels of all splats, as written to files (`liftcore.query.labels.labels`)."""
@@ -397,11 +439,11 @@ class Scene:
             InvalidQuery: there is no such file of the source, or the file would be empty.
             NotFound, InvalidLift, Unavailable: as the query, or as `render`.
         """
-        from liftcore.query.export import blocks_of
+        from liftcore.query.export import Export, blocks_of
         from liftcore.query.question import Query
 
         source = self._answer(source, encoder) if isinstance(source, str | Query) else source
-        return blocks_of(self, source, what, view=view, suffix=suffix, view_mask=view_mask, photo=photo)
+        return blocks_of(Export(self, source, what, view, suffix, view_mask, photo))
 
     def _answer(self, query: Query | str | Answer, encoder: AnyEncoder) -> Answer:
         from liftcore.query.question import Answer
@@ -502,14 +544,9 @@ class Scene:
         return self._has_feature & (self.norms > 0)
 
     @cached_property
-    def all_have_features(self) -> bool:
-        """True if every splat has a feature."""
-        return bool(self.has_feature.all())
-
-    @cached_property
     def weights(self) -> np.ndarray | None:
         """[n] f32, total weights of the splats with a feature; None, which means equal ones, if all are zero."""
-        weights = self.total_weight if self.all_have_features else self.total_weight[self.has_feature]
+        weights = self.total_weight[self.has_feature]
         return weights if weights.max(initial=0.0) > 0 else None
 
     def weights_of(self, rows: np.ndarray) -> np.ndarray:
@@ -550,10 +587,10 @@ class Scene:
         rows = self._copy(mean=self.mean, rough_mean=self.rough_mean, effective_count=self.effective_count)
         rows.features = Features(self.features.rows)
         rows.features.__dict__["norms"] = self.features.norms
-        rows.row_counts = self.features.of_rows(self.has_feature)
-        rows._has_feature = rows.row_counts > 0
+        counts = self.features.of_rows(self.has_feature)
+        rows._has_feature = counts > 0
         weights = self.features.of_rows(np.where(self.has_feature, self.total_weight, np.float32(0.0)))
-        rows.total_weight = weights if weights.any() else rows.row_counts
+        rows.total_weight = weights if weights.any() else counts
         rows.object = rows.node = None  # of splats
         return rows
 
@@ -779,6 +816,17 @@ class Scene:
         from liftcore.scene.drawing import in_photo
 
         return in_photo(self.camera(view), draw)
+
+    def strongest_labels(self, labels: np.ndarray, view: str | Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Render the splats' label [P] i32 with the most weight on each ray, [H, W] i32, and its row sum, [H, W] f32.
+
+        Arguments and errors are those of `image`.
+        """
+        import torch
+
+        values, params = torch.from_numpy(labels), self.compositing
+        strongest = self.image(view, lambda camera: self.raster.strongest_labels(camera, values, params))
+        return strongest.numpy(), self.image(view, lambda camera: self.raster.row_sums(camera, params)).numpy()
 
     def _verified_input(self, role: Literal["splats", "cameras"]) -> Path:
         """Return the path of an input whose bytes are those that were lifted; InvalidLift if there is none."""

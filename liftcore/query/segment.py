@@ -238,11 +238,7 @@ def _scores(scene: Scene, vectors: np.ndarray, rows: Sequence[int]) -> Iterator[
 
 def value_map(scene: Scene, values: np.ndarray, view: str | Camera) -> np.ndarray:
     """Render the splats' value [P] i32 with the most weight on each ray, [H, W] i32; 0 where it misses the scene."""
-    import torch
-
-    labels, params = torch.from_numpy(values), scene.compositing
-    strongest = scene.image(view, lambda camera: scene.raster.strongest_labels(camera, labels, params)).numpy()
-    sums = scene.image(view, lambda camera: scene.raster.row_sums(camera, params)).numpy()
+    strongest, sums = scene.strongest_labels(values, view)
     return np.where(sums >= MINIMUM_ROW_SUM, np.maximum(strongest, 0), 0)
 
 

@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from liftcore.query.presence import References, nearer_counts, products
-from liftcore.query.scores import spaced
+from liftcore.query.scores import rank_rows, spaced
 from liftcore.query.threshold import LEAST_SHARE
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def compare_ranks(scene: Scene, scores: np.ndarray, threshold: float, competitor
     Args:
         scene: an opened lift. scores: [P] f32. threshold: on the scores.
     """
-    rows, widths = _octaves(_from_the_best(scores, np.flatnonzero(scene.has_feature)))
+    rows, widths = _octaves(rank_rows(scores, np.flatnonzero(scene.has_feature)))
     counts = scene.total_weight[rows] * widths
     if not counts.any():
         counts = widths
@@ -295,18 +295,6 @@ def _about(scene: Scene, means: np.ndarray, mean: np.ndarray) -> np.ndarray:
     offsets, offset = means - scene.rough_mean, mean - scene.rough_mean
     lengths = np.linalg.norm(offsets, axis=1) * np.linalg.norm(offset)
     return (offsets @ offset) / np.maximum(lengths, np.float32(1e-12))
-
-
-def _from_the_best(scores: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Sort rows [n] by their scores [P] f32, the highest first and equal ones in order.
-
-    A score and its row are sorted as one integer, which takes a quarter of the time of an index sort.
-    """
-    bits = (-scores[rows] + np.float32(0.0)).view(np.int32)  # + 0 makes -0 and 0 equal
-    keys = (bits ^ ((bits >> 31) & np.int32(0x7FFFFFFF))).astype(np.int64)  # in the order of the floats
-    keys = (keys << 32) | rows
-    keys.sort()
-    return keys & 0xFFFFFFFF
 
 
 def _octaves(order: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.ask import ask
 from liftcore.query.edits import Edit
 from liftcore.query.objects import MOST_SPLATS, object_box, objects
 from liftcore.query.question import Answer, Box, Query
@@ -81,7 +80,7 @@ class Selection:
         """
         edit, answer = _edit_of(self._scene, operation, source, fields)
         if edit.query is not None and answer is None:
-            answer = ask(self._scene, edit.query, self._scene.encoder() if edit.query.texts else None)
+            answer = self._scene.ask(edit.query, places=False)
         splats = apply_edit(self._scene, self.splats, edit, answer)
         self._steps = [*self._steps[: self._place + 1], bits_of(splats)][-MOST_HISTORY - 1 :]
         self._place = len(self._steps) - 1

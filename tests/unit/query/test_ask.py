@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound, SplatliftError
 from liftcore.io.splats import some_rows
-from liftcore.query.ask import ask, locate, resolve_query
+from liftcore.query.ask import ask, resolve_query
 from liftcore.query.directions import directions, read_example
 from liftcore.query.question import Query
 from liftcore.query.result import load_lift
@@ -71,11 +71,11 @@ def test_splats_without_weight_do_not_decide_the_threshold(exact: Scene) -> None
 
 def test_words_of_a_table_are_asked_without_torch(tiny_lift: Path) -> None:
     code = (
-        "import sys; from pathlib import Path; from liftcore.query.ask import ask, locate; "
+        "import sys; from pathlib import Path; from liftcore.query.ask import ask; "
         "from liftcore.query.scene import Scene; from liftcore.query.question import Query; "
         "import liftcore.text.table; "
         "scene = Scene(Path(sys.argv[1])); answer = ask(scene, Query(like=['splat:0'])); "
-        "assert locate(scene, answer, 3).top and 'torch' not in sys.modules"
+        "assert scene.locate(answer, 3).top and 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code, str(tiny_lift)], check=True)
 
@@ -107,7 +107,7 @@ def test_every_kind_of_example_finds_its_cluster(scene: Scene, cluster: int) -> 
         answer = ask(scene, Query.of((example,)))
         assert answer.selected[splats].mean() > 0.7, example
         assert answer.count <= 1.3 * SPLATS_A_CLUSTER, example
-        assert len(locate(scene, answer, 1000).top) == COUNT  # no more than there are
+        assert len(scene.locate(answer, 1000).top) == COUNT  # no more than there are
 
 
 def test_pixel_is_the_feature_rendered_there(scene: Scene) -> None:

@@ -16,7 +16,7 @@ from liftcore.evaluate.inspect import describe_cameras
 from liftcore.io.splats import read_places, read_splats
 from liftcore.io.spz import spz_blocks
 from liftcore.lifting.planning.views import visibility
-from liftcore.query.ask import ask, locate
+from liftcore.query.ask import ask
 from liftcore.query.catalogue import table_csv, tree
 from liftcore.query.labels import labels
 from liftcore.query.objects import objects
@@ -170,7 +170,7 @@ def positions_of_answers(splats: Splats, cameras: Cameras, views: dict[str, Any]
     scene = Scene(lift, splats, cameras)
     vectors = np.eye(6, dtype=np.float32)[:2]
     answer = ask(scene, Query.of((Vector(tuple(vectors[0].tolist())),), threshold=0.2, absent="keep"))
-    best, parts = locate(scene, answer, 5), objects(scene, answer)
+    best, parts = scene.locate(answer, 5), objects(scene, answer)
     words = segment(scene, ["one", "two"], vectors)
     document = labels(scene, words).document
     numbers, views_of = torch.arange(len(lift.features)).int() % 2, torch.zeros(2, 5).int()
