@@ -71,26 +71,22 @@ class CameraSource:
 
     def read(self) -> Cameras:
         """Read the cameras, in the frame of the splats where ``frame`` has the transform."""
-        cameras = self._read_in_splat_frame()
-        cameras.warnings += self.warnings
-        return cameras
-
-    def _read_in_splat_frame(self) -> Cameras:
         if self.model is not None:
             source, document, cameras = str(self.model), {}, read_colmap(self.model)
         else:
             assert self.file is not None
             source, document = str(self.file), read_json(self.file)
             cameras = self._parse(document, source)
-        if self.frame is None or is_export(document):  # an export is in the frame of the splats
-            return cameras
-        if isinstance(document, list):
-            expected, got = "cameras in another frame", "Inria's, which are in the frame of their splats"
-            hint = f"remove {source} or {FRAME_FILE}, whichever is of another run"
-            raise InvalidCameras(str(self.frame), expected=expected, got=got, hint=hint)
-        matrix = read_frame(self.frame, document, source)
-        with naming(self.frame):
-            return cameras_in_frame(cameras, matrix)
+        if self.frame is not None and not is_export(document):  # an export is in the frame of the splats
+            if isinstance(document, list):
+                expected, got = "cameras in another frame", "Inria's, which are in the frame of their splats"
+                hint = f"remove {source} or {FRAME_FILE}, whichever is of another run"
+                raise InvalidCameras(str(self.frame), expected=expected, got=got, hint=hint)
+            matrix = read_frame(self.frame, document, source)
+            with naming(self.frame):
+                cameras = cameras_in_frame(cameras, matrix)
+        cameras.warnings += self.warnings
+        return cameras
 
     def _parse(self, document: object, source: str) -> Cameras:
         assert self.file is not None

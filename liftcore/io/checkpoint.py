@@ -31,8 +31,8 @@ def _require_whole(path: Path) -> None:
     match = _RANK.fullmatch(path.name)
     if match is None:
         return
-    matches = (_RANK.fullmatch(file.name) for file in path.parent.iterdir() if file.name != path.name)
-    if int(match["rank"]) or any(other and other["step"] == match["step"] for other in matches):
+    other_ranks = (_RANK.fullmatch(file.name) for file in path.parent.iterdir() if file.name != path.name)
+    if int(match["rank"]) or any(other and other["step"] == match["step"] for other in other_ranks):
         got = f"{path.name}, the splats of one of several GPUs"
         hint = "join the tensors of all ranks in one checkpoint, or export the scene as .ply"
         raise ValueError(f"a checkpoint of the complete scene, got {got}; {hint}")

@@ -115,6 +115,15 @@ _TILES = FileKind(
     "a tileset of 3D Tiles, which lists the tiles of a scene for a map",
     "give the splats, a .glb of its tiles, and the cameras that they were trained with",
 )
+_REPLACEMENTS = {  # by the kind that was expected and the one that came, what to do
+    ("features", "photos"): "'splatlift encode IMAGES -o PACK' makes a feature pack of photos",
+    ("features", "masks"): "masks to judge by have no vectors; 'splatlift pack' makes feature packs",
+    ("features", "table"): "a table of text embeddings belongs to a query, as --table",
+    ("features", "lift"): "a lift belongs to 'splatlift query'; give the feature packs that it was made of",
+    ("cameras", "photos"): "give the COLMAP model, transforms.json or cameras.json of these photos",
+    ("lift", "features"): "'splatlift lift SPLATS CAMERAS FEATURES -o LIFT' makes a lift of them",
+    ("lift", "splats"): "'splatlift lift SPLATS CAMERAS FEATURES -o LIFT' makes a lift of them",
+}
 # By the bytes at a place of a file. Of two that fit the first counts.
 _MAGIC: tuple[tuple[int, bytes, FileKind], ...] = (
     (0, LFS_POINTER, FileKind(None, "a Git LFS pointer, which stands for the file", LFS_HINT)),
@@ -181,28 +190,12 @@ def wrong_kind(
     hint = identified.hint
     if identified in (_ARRAY, _ARRAYS) or identified.format is SplatFormat.CHECKPOINT:
         hint = _OF_ARRAYS.get(kind, hint)
-    elif identified.kind is not None or (kind == "splats" and identified.splats):
-        hint = _replacement_hint(Path(path), identified, kind) or hint
-    return fault(argument or str(path), expected=expected or kind, got=identified.name, hint=hint)
-
-
-def _replacement_hint(path: Path, identified: FileKind, kind: str) -> str:
-    """Return advice what to give in place of a file or folder of a known kind."""
-    if kind == "splats" and identified.splats:
+    elif kind == "splats" and identified.splats:
         first = identified.splats[0]
-        if path.is_dir():
-            return f"give {path / first}"
-        return f"unzip it and give {first}"
-    hints = {
-        ("features", "photos"): "'splatlift encode IMAGES -o PACK' makes a feature pack of photos",
-        ("features", "masks"): "masks to judge by have no vectors; 'splatlift pack' makes feature packs",
-        ("features", "table"): "a table of text embeddings belongs to a query, as --table",
-        ("features", "lift"): "a lift belongs to 'splatlift query'; give the feature packs that it was made of",
-        ("cameras", "photos"): "give the COLMAP model, transforms.json or cameras.json of these photos",
-        ("lift", "features"): "'splatlift lift SPLATS CAMERAS FEATURES -o LIFT' makes a lift of them",
-        ("lift", "splats"): "'splatlift lift SPLATS CAMERAS FEATURES -o LIFT' makes a lift of them",
-    }
-    return hints.get((kind, identified.kind or ""), "")
+        hint = f"give {Path(path) / first}" if Path(path).is_dir() else f"unzip it and give {first}"
+    elif identified.kind is not None:
+        hint = _REPLACEMENTS.get((kind, identified.kind), hint)
+    return fault(argument or str(path), expected=expected or kind, got=identified.name, hint=hint)
 
 
 def identify(path: Path | str) -> FileKind:

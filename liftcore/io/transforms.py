@@ -275,12 +275,19 @@ def read_frame(path: Path, applied: Mapping[str, Any], source: str) -> np.ndarra
         before = np.eye(4)
         if applied.get("applied_transform") is not None:
             before = _affine(applied["applied_transform"], "applied_transform")
-            similarity_of(before)
+            _require_similarity(before, "applied_transform")
         combined = transform @ np.linalg.inv(before)
         combined[:3] *= scale / _scale(applied.get("applied_scale", 1.0), "applied_scale")
     with reading(path, InvalidCameras, "the frame of a run"):
-        similarity_of(combined)
+        _require_similarity(combined, "transform")
     return combined
+
+
+def _require_similarity(matrix: np.ndarray, name: str) -> None:
+    try:
+        similarity_of(matrix)
+    except ValueError as error:
+        raise ValueError(f"{name} of {error}") from None
 
 
 def _affine(value: Any, name: str) -> np.ndarray:

@@ -66,12 +66,12 @@ def shown_progress(progress: Progress | bool | None) -> Iterator[Progress]:
         progress: a function that is called as work advances; True for bars on a terminal and lines elsewhere; False
             for nothing; None for bars on a terminal and nothing elsewhere.
     """
-    is_terminal = sys.stderr is not None and sys.stderr.isatty()
+    on_terminal = sys.stderr is not None and sys.stderr.isatty()
     if progress is None:
-        progress = is_terminal
+        progress = on_terminal
     if callable(progress):
         yield progress
-    elif progress is True and is_terminal:
+    elif progress is True and on_terminal:
         bars = _Bars()
         try:
             yield bars

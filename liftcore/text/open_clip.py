@@ -53,7 +53,7 @@ def open_model(kind: str, spec: str) -> OpenedModel:
         raise InvalidQuery(label, expected="a model of open_clip", got=repr(model_name), hint=hint)
     if at:
         return OpenedModel(f"open_clip:{model_name}", model_name, _from_file(label, model_name, Path(file)))
-    return OpenedModel(f"open_clip:{model_name}/{tag}", model_name, _from_tag(kind, model_name, tag))
+    return OpenedModel(f"open_clip:{model_name}/{tag}", model_name, _from_tag(label, kind, model_name, tag))
 
 
 def create_model(model_name: str, pretrained: str) -> Any:
@@ -87,8 +87,7 @@ def library() -> Any:
     return open_clip
 
 
-def _from_tag(kind: str, model_name: str, tag: str) -> Any:
-    label = f"encoder {kind}:{model_name}/{tag}" if tag else f"encoder {kind}:{model_name}"
+def _from_tag(label: str, kind: str, model_name: str, tag: str) -> Any:
     tags = library().list_pretrained_tags_by_model(model_name)
     if not tag:
         tag_names = ", ".join(tags) or "none"
