@@ -36,7 +36,7 @@ import numpy as np
 from liftcore.errors import InvalidQuery, InvalidTable, Unavailable
 from liftcore.query.question import Presence
 from liftcore.query.scene import Scene
-from liftcore.query.scores import rank_rows, spaced
+from liftcore.query.scores import spaced
 from liftcore.query.threshold import LEAST_SHARE
 from liftcore.runtime.folders import cache_folder
 from liftcore.text import LVIS_TABLE, CachingEncoder, TextEncoder
@@ -49,6 +49,7 @@ MOST_NEARER = 0.0033  # share of the references that may be nearer to a splat th
 _ITSELF = 0.9  # similarity about the mean from which a word is one of the references
 LEAST_OF_SCENE = 0.9  # share of a scene, at which a word is among the nearest, from which all of it is of one thing
 RELATED = 0.55  # of the similarity of a word's nearest reference, from which references are left out
+_FIRST = 1_024  # splats among which the best ones are searched first
 MOST_SPLATS = 256  # of the best ones that are compared, those with the largest total weight
 _SAME_TEXT = 0.99  # least cosine of two vectors of one text that come from one encoder
 _IN_CONE = 0.5  # cosine to the shipped words' mean direction: they have .75 to .93, other spaces' vectors about 0
@@ -194,9 +195,16 @@ def best_splats(scene: Scene, scores: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """
     total_weight = np.where(scene.has_feature, scene.total_weight, np.float32(0.0))
     total_weight = total_weight if total_weight.any() else scene.has_feature.astype(np.float32)
-    rows = rank_rows(scores, np.flatnonzero(total_weight))
-    sums = np.cumsum(total_weight[rows], dtype=np.float64)
-    rows = rows[: int(np.searchsorted(sums, LEAST_SHARE * float(total_weight.sum(dtype=np.float64)))) + 1]
+    least, count = LEAST_SHARE * float(total_weight.sum(dtype=np.float64)), min(_FIRST, len(scores))
+    ranked = np.where(scene.has_feature, -scores, np.float32(np.inf))
+    while True:  # a quarter of the time of a complete order
+        rows = np.argpartition(ranked, count - 1)[:count] if count < len(ranked) else np.arange(count)
+        if count == len(ranked) or total_weight[rows].sum(dtype=np.float64) >= least:
+            break
+        count = min(4 * count, len(ranked))
+    rows = rows[np.lexsort((rows, ranked[rows]))]
+    rows = rows[: int(np.searchsorted(np.cumsum(total_weight[rows], dtype=np.float64), least)) + 1]
+    rows = rows[total_weight[rows] > 0]
     heaviest = np.sort(np.argsort(-total_weight[rows], kind="stable")[:MOST_SPLATS])
     return rows[heaviest], total_weight[rows[heaviest]].astype(np.float64)
 

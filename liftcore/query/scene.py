@@ -18,7 +18,7 @@ import numpy as np
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound
 from liftcore.io.splats import quick_count
 from liftcore.query.colours import NOT_SEEN_COLOUR, cluster_colours, heat_colours
-from liftcore.query.scores import Features, cosines, norms_of, rank_rows, spaced
+from liftcore.query.scores import Features, cosines, norms_of, spaced
 from liftcore.runtime.progress import Progress, shown_progress
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.world import UNKNOWN, WorldFrame
@@ -185,9 +185,15 @@ class Scene:
         from liftcore.query.question import Box, TopSplat
 
         places, count = self.axes, answer.query.top if count is None else count
+        rows = np.flatnonzero(answer.has_feature)
+        scores = answer.scores[rows]
+        if 0 < count < len(scores):
+            last = np.partition(scores, len(scores) - count)[len(scores) - count]
+            rows = np.concatenate([rows[scores > last], rows[scores == last]])[:count]
+        best = rows[np.argsort(-answer.scores[rows], kind="stable")][:count]
         top = tuple(
             TopSplat(splat=int(row), score=float(answer.scores[row]), position=point_of(places[:, row]))
-            for row in rank_rows(answer.scores, np.flatnonzero(answer.has_feature))[:count]
+            for row in best
         )
         selected = places.take(np.flatnonzero(answer.selected), axis=1)
         box = Box(point_of(selected.min(axis=1)), point_of(selected.max(axis=1))) if answer.count else None
