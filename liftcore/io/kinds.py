@@ -13,7 +13,7 @@ import re
 import stat
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import IO, Any, TypeVar
@@ -377,9 +377,9 @@ def _of_names_in_zip(names: list[str], splats: tuple[str, ...]) -> FileKind:  # 
         return FileKind("cameras", "a zip of cameras", splats=splats)
     if not splats and suffixes & IMAGE_SUFFIXES:
         return FileKind("photos", "photos")
-    if splats:
-        return _zip_with(splats)
-    return _zip_with(names)
+    if interesting := splats or tuple(name for name in names if name.endswith(".safetensors")):
+        return _zip_with(interesting)
+    return replace(_zip_with(names), hint="unzip it and give the file itself")
 
 
 def _zip_with(names: Sequence[str]) -> FileKind:

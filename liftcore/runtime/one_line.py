@@ -27,6 +27,7 @@ def value_text(value: Any) -> str:
     """Return a field as text: a number to three digits, a short value, or the length of a long list."""
     if isinstance(value, float):
         return f"{value:.3g}"
+    if isinstance(value, str):  # of an enumeration, its text
+        return repr(value[:MAX_TEXT])
     text = repr(value)
-    is_list = isinstance(value, Sized) and not isinstance(value, str)
-    return f"[{len(value)}]" if is_list and len(text) > MAX_TEXT else text[:MAX_TEXT]
+    return f"[{len(value)}]" if isinstance(value, Sized) and len(text) > MAX_TEXT else text[:MAX_TEXT]

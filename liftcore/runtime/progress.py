@@ -66,7 +66,7 @@ def shown_progress(progress: Progress | bool | None) -> Iterator[Progress]:
         progress: a function that is called as work advances; True for bars on a terminal and lines elsewhere; False
             for nothing; None for bars on a terminal and nothing elsewhere.
     """
-    on_terminal = sys.stderr is not None and sys.stderr.isatty()
+    on_terminal = not callable(progress) and sys.stderr is not None and sys.stderr.isatty()
     if progress is None:
         progress = on_terminal
     if callable(progress):

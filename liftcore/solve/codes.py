@@ -20,8 +20,10 @@ import torch
 from scipy.sparse import csr_array
 
 from liftcore.runtime.cores import cores
+from liftcore.runtime.memory import zeros
 from liftcore.runtime.one_thread import one_thread
 from liftcore.solve.clusters import principal_axes
+from liftcore.values.region_weights import MEMORY_LIMIT
 
 MOST_CODES = 8_192
 LEAST_CODES = 512  # where as many features differ: mixtures at borders are few, and would go first
@@ -137,7 +139,9 @@ def _sums(groups: np.ndarray, weights: np.ndarray, values: np.ndarray, count: in
 
 def _points(features: np.ndarray, rows: np.ndarray, centre: np.ndarray, axes: np.ndarray) -> np.ndarray:
     """Return the unit features of rows [n] about the centre along the axes, [n, D] f32."""
-    points = np.empty((len(rows), axes.shape[1]), np.float32)
+    shape = len(rows), axes.shape[1]
+    in_file = 4 * len(rows) * axes.shape[1] > MEMORY_LIMIT
+    points = zeros(shape, torch.float32, name="codes", in_file=in_file).numpy()
 
     def project(first: int) -> None:
         block = slice(first, first + BLOCK)

@@ -62,7 +62,7 @@ from liftcore.solve.closed_form import morton_codes
 from liftcore.solve.directions import RegionDirections
 from liftcore.solve.shared_rows import compare_rows, flat_table
 from liftcore.solve.sums import PieceSums, piece_sums
-from liftcore.values.region_weights import MEMORY_LIMIT, RegionWeights, from_zero, row_blocks, run_each
+from liftcore.values.region_weights import MEMORY_LIMIT, RegionWeights, row_blocks, run_each
 
 BLOCK_ROWS, BLOCK_ENTRIES = 1 << 11, 1 << 15  # a splat has a sum per view
 POWERS = 1 << 12  # table size of powers of consensus; linear interpolation has a relative error of 3e-5 at most
@@ -191,7 +191,7 @@ class BlockReweighter:
             consensus: [nnz] f32 of each entry of W (`liftcore.solve.consensus`); None: no consensus.
             scores: [2, n] f64, to which ``sum W' c_jm`` and ``sum W`` of each splat are added.
         """
-        by_level = cosines.clone() if self.levels > 1 else cosines
+        by_level = _zeros(self.W).copy_(cosines) if self.levels > 1 else cosines
         levels = zip(self._by_level(), scene.mean_cosines, scene.powers, strict=True)
         for (W, entries, places), mean_cosine, power in levels:
             factors = by_level[entries]
@@ -211,10 +211,11 @@ class BlockReweighter:
             return
         level_of_entry, end = self.level[self.W.region.numpy()], 0
         for number in range(self.levels):
-            of_level = torch.from_numpy(level_of_entry == number)
-            part = {"region": self.W.region[of_level], "weight": self.W.weight[of_level]}
-            begin, end = end, end + part["region"].shape[0]
-            yield replace(self.W, indptr=from_zero(of_level)[self.W.indptr], **part), slice(begin, end), of_level
+            places = torch.from_numpy(np.flatnonzero(level_of_entry == number))
+            starts = torch.searchsorted(places, self.W.indptr)
+            begin, end = end, end + places.shape[0]
+            W = replace(self.W, indptr=starts, region=self.W.region[places], weight=self.W.weight[places])
+            yield W, slice(begin, end), places
 
     def _arrays(self, W: RegionWeights) -> list[np.ndarray]:
         """Return the arrays of W, and the view of each region."""

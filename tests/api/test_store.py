@@ -19,8 +19,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from liftcore.errors import NotFound
-from service.commands.store import back_up, clean
-from service.errors import Conflict, KeyReused, Misconfigured
+from service.commands.store import back_up, clean, verify
+from service.errors import Busy, Conflict, KeyReused, Misconfigured, NoSpace
 from service.models import FINAL_STATES, Job
 from service.store import DATABASE, MAX_ATTEMPTS, SERVICE, Owner, Store, open_keys, revoke_key
 
@@ -106,6 +106,21 @@ def test_twelve_threads_with_one_key_make_one_job(store: Store) -> None:
     assert len(ids) == 1 and store.counts_by_state() == {"queued": 1}
 
 
+def test_order_of_anothers_asset_is_refused(store: Store) -> None:
+    order = order_of(store, ANNA)
+    with pytest.raises(NotFound, match="splats"):
+        store.submit(BERT, order)
+    assert store.counts_by_state() == {}
+
+
+def test_full_line_refuses_new_jobs_and_repeats_known_ones(store: Store) -> None:
+    order = order_of(store, ANNA)
+    job, _ = store.submit(ANNA, order, "key", max_queued=1)
+    with pytest.raises(Busy):
+        store.submit(ANNA, order, max_queued=1)
+    assert store.submit(ANNA, order, "key", max_queued=1) == (job, False)
+
+
 def test_attempts_without_an_answer_end_a_job_after_the_third(store: Store) -> None:
     job, _ = store.submit(ANNA, order_of(store, ANNA))
     for attempt in range(1, MAX_ATTEMPTS + 1):
@@ -115,6 +130,15 @@ def test_attempts_without_an_answer_end_a_job_after_the_third(store: Store) -> N
     record = store.job(ANNA, job.id)
     assert (record.state, record.attempt, store.claim()) == ("failed", MAX_ATTEMPTS, None)
     assert states_of(store, job.id) == ["queued", *["running", "queued"] * (MAX_ATTEMPTS - 1), "running", "failed"]
+
+
+def test_attempts_that_the_server_ended_do_not_count(store: Store) -> None:
+    job, _ = store.submit(ANNA, order_of(store, ANNA))
+    for _ in range(MAX_ATTEMPTS + 2):
+        active = store.claim()
+        assert active is not None and active.attempt == 1
+        store.end(active)
+    assert store.job(ANNA, job.id).state == "queued"
 
 
 def test_job_that_has_its_result_is_not_put_back_in_line(store: Store) -> None:
@@ -140,8 +164,28 @@ def test_jobs_of_a_server_that_died_go_back_in_line(tmp_path: Path) -> None:
         assert store.job(ANNA, running.id).state == "canceled"
 
 
-def test_lift_that_is_none_is_not_found(store: Store) -> None:
-    for lift, message in ((None, "at least one lift"), ("0" * 32, "the id of a lift")):
+def test_job_that_is_being_canceled_gets_no_result(store: Store) -> None:
+    job, _ = store.submit(ANNA, order_of(store, ANNA))
+    active = store.claim()
+    assert active is not None and store.cancel(ANNA, job.id).state == "canceling"
+    finish(store, active)
+    assert store.job(ANNA, job.id).state == "canceled"
+    assert list((store.root / "lifts").iterdir()) == []
+    with pytest.raises(NotFound):
+        store.lift(ANNA, job.id)
+
+
+def test_result_goes_only_with_a_job_that_is_deleted_with_it(store: Store) -> None:
+    store.submit(ANNA, order_of(store, ANNA))
+    job = store.claim()
+    assert job is not None
+    finish(store, job)
+    with pytest.raises(Conflict, match="with_lift"):
+        store.delete_job(ANNA, job.id, with_result=False)
+    assert store.lift(ANNA, job.id).file.is_file()
+    store.delete_job(ANNA, job.id, with_result=True)
+    assert list((store.root / "lifts").iterdir()) == []
+    for lift, message in ((None, "at least one lift"), (job.id, "the id of a lift")):
         with pytest.raises(NotFound, match=message):
             store.lift(ANNA, lift)
 
@@ -212,6 +256,16 @@ def test_another_file_in_the_place_of_the_database_is_noticed(store: Store) -> N
         store.require_usable()
 
 
+def test_disk_below_its_floor_takes_no_work_and_gives_room(tmp_path: Path) -> None:
+    with closing(open_store(tmp_path)) as store:
+        asset = add_asset(store, ANNA, "splats", b"x")
+    with closing(open_store(tmp_path, floor_bytes=1 << 62)) as store:
+        with pytest.raises(NoSpace):
+            store.require_room()
+        store.delete_asset(ANNA, asset)
+        assert list((tmp_path / "blobs").iterdir()) == []
+
+
 def test_lift_whose_row_cannot_be_committed_stays_a_draft(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     store.submit(ANNA, order_of(store, ANNA))
     job = store.claim()
@@ -249,7 +303,7 @@ def test_files_without_a_row_stay_until_they_are_cleaned(tmp_path: Path) -> None
     assert len(list((tmp_path / "blobs").iterdir())) == 1 and clean(tmp_path) == []
 
 
-def test_directory_with_the_database_of_another_is_refused(tmp_path: Path) -> None:
+def test_directory_without_its_database_or_with_anothers_is_refused(tmp_path: Path) -> None:
     with closing(open_store(tmp_path)) as store:
         add_asset(store, ANNA, "splats", b"x")
     with closing(sqlite3.connect(tmp_path / DATABASE)) as connection:
@@ -260,11 +314,39 @@ def test_directory_with_the_database_of_another_is_refused(tmp_path: Path) -> No
         path.write_bytes(b"no database at all, but many letters" * 100)
     with pytest.raises(Misconfigured, match="database"):
         Store(tmp_path)
+    for path in tmp_path.glob(f"{DATABASE}*"):
+        path.unlink()
+    with pytest.raises(Misconfigured, match=DATABASE):
+        Store(tmp_path)
+    assert len(list((tmp_path / "blobs").iterdir())) == 1
 
 
-def test_backup_without_a_file_is_none(tmp_path: Path) -> None:
+def test_bytes_of_two_owners_go_with_the_last(store: Store) -> None:
+    asset = add_asset(store, ANNA, "splats", b"x")
+    assert add_asset(store, BERT, "splats", b"x") == asset
+    store.delete_asset(ANNA, asset)
+    assert store.asset(BERT, asset).file.read_bytes() == b"x"
+    store.delete_asset(BERT, asset)
+    assert list((store.root / "blobs").iterdir()) == []
+
+
+def test_backup_is_a_directory_that_starts_and_damage_is_found(tmp_path: Path) -> None:
     with closing(open_store(tmp_path / "data")) as store:
-        store.asset(ANNA, add_asset(store, ANNA, "splats", b"x")).file.unlink()
+        store.submit(ANNA, order_of(store, ANNA))
+        job = store.claim()
+        assert job is not None
+        finish(store, job)
+        assert back_up(tmp_path / "data", tmp_path / "backup") == 4
+    with pytest.raises(Misconfigured, match="not there yet"):
+        back_up(tmp_path / "data", tmp_path / "backup")
+    assert verify(tmp_path / "backup") == []
+    with closing(open_store(tmp_path / "backup")) as copy:
+        assert copy.lift(ANNA, job.id).file.read_bytes() == job.id.encode()
+        file = copy.lift(ANNA, job.id).file
+    file.unlink()
+    file.write_bytes(b"y" * 32)
+    assert len(verify(tmp_path / "backup")) == 1 and verify(tmp_path / "data") == []
+    (tmp_path / "data" / "lifts" / file.name).unlink()
     with pytest.raises(Misconfigured, match="1 lost"):
         back_up(tmp_path / "data", tmp_path / "other")
     assert not (tmp_path / "other").exists()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -52,6 +54,14 @@ def test_auto_takes_no_score_below_least() -> None:
 def test_auto_says_when_nothing_stands_apart() -> None:
     assert "with care" in find_threshold(hills((0.2, 0.05, 50_000)), "auto").explanation
     assert "with care" not in find_threshold(hills((0.2, 0.02, 50_000), (0.4, 0.01, 500)), "auto").explanation
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_scores_that_are_equal_or_none_say_so(method: str) -> None:
+    for count in (1, 1000):
+        threshold = find_threshold(torch.full((count,), 0.25), method)
+        assert threshold.value == 0.25 and "no valley" in threshold.explanation
+    assert find_threshold(torch.empty(0), method).value == math.inf
 
 
 def test_weights_count_like_repeated_scores() -> None:
