@@ -102,10 +102,9 @@ def ask(scene: Scene, query: Query | str, encoder: TextEncoder | None = None) ->
     """Score every splat for a query and select those that answer it.
 
     The threshold `auto` comes from a histogram of scores, in which each splat counts by its total weight, as splats
-    hit by few rays have noisy scores. The threshold is compared with other words,
-    and objects of the region graph may be selected as a whole (`liftcore.query.selection`). Any other threshold
-    selects by the score alone. Scores that are all equal or zero select nothing, unless all
-    of the scene is of one thing. Absent words
+    hit by few rays have noisy scores. The threshold is compared with other words, and objects of the region graph may
+    be selected as a whole (`liftcore.query.selection`). Any other threshold selects by the score alone. Scores that
+    are all equal or zero select nothing, unless all of the scene is of one thing. Absent words
     (`liftcore.query.presence`) are left out of the scores, and without another positive nothing is selected, unless
     the query keeps absent words. The presence of negatives and examples is not estimated.
 

@@ -78,10 +78,13 @@ def test_codes_are_labelled_clicked_and_named_as_their_rows_are(coded: lc.LiftRe
     )
 
 
-def test_codes_have_the_same_bits_for_any_threads(exact: lc.LiftResult, coded: lc.LiftResult) -> None:
+def test_codes_have_the_same_bits_for_any_threads(
+    exact: lc.LiftResult, coded: lc.LiftResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
     threads = torch.get_num_threads()
     for count in (1, 3):
         torch.set_num_threads(count)
+        monkeypatch.setattr("liftcore.solve.codes.cores", lambda count=count: count)
         coded_again = exact.as_codes()
         torch.set_num_threads(threads)
         for name in ("code", "features"):

@@ -17,7 +17,7 @@ from liftcore.io.transforms import transforms_of
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
-from liftcore.scene.views import view_names
+from liftcore.scene.views import MAX_VIEWS, view_names
 from tests.camera_files import IMAGES, binary_files, text_files, with_json, write_files
 from tests.inria_file import write_inria_cameras
 
@@ -101,6 +101,12 @@ def test_views_are_named_by_stem_and_all_by_path_where_any_stems_collide() -> No
     images = ["a/001.jpg", "b\\002.png", "003.JPG", "./train/r_0", "frame.0001"]
     assert view_names(images) == ["001", "002", "003", "r_0", "frame.0001"]
     assert view_names([*images, "b/001.jpg"]) == ["a/001", "b/002", "003", "train/r_0", "frame.0001", "b/001"]
+
+
+def test_more_views_than_a_scene_may_have_are_refused_by_their_names() -> None:
+    names = [f"{k}.jpg" for k in range(MAX_VIEWS + 1)]
+    with pytest.raises(InvalidCameras, match="at most 100000 views, got 100001; lift fewer photos"):
+        view_names(names)
 
 
 RIG = [f"camA/{k:03}.jpg" for k in range(4)] + [f"camB/{k:03}.jpg" for k in range(3)]
