@@ -140,10 +140,10 @@ def check_lift(path: Path, cameras: str | None) -> dict[str, Any]:
     require_texts("word", metadata["words"], WORD_CHARACTERS, InvalidLift)
     if None in metadata["timings"].values():  # JSON has no infinite numbers
         raise InvalidLift("lift", expected="finite timings", got="others", hint="a list of lifts tells them")
-    return lift_content(path, (len(lift), lift.features.shape[1]), metadata)
+    return lift_content(path, lift, metadata)
 
 
-def lift_content(path: Path, shape: Sequence[int], metadata: dict[str, Any]) -> dict[str, Any]:
+def lift_content(path: Path, lift: LiftResult, metadata: dict[str, Any]) -> dict[str, Any]:
     """Return the columns of a lift's row; of long metadata the names of views and the words are left out."""
     views = metadata["views"]
     if len(json.dumps(metadata)) > SHOWN_BYTES:
@@ -157,7 +157,7 @@ def lift_content(path: Path, shape: Sequence[int], metadata: dict[str, Any]) -> 
     metadata["view_count"] = len(views)
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return {"sha256": digest, "count": shape[0], "channels": shape[1], "metadata": metadata}
+    return {"sha256": digest, "count": len(lift), "channels": lift.features.shape[1], "metadata": metadata}
 
 
 def _of_another_kind(kind: str, path: Path) -> InvalidInput | None:
@@ -211,8 +211,9 @@ def lift(order: Order, report: Reporter) -> dict[str, Any]:
     )
     lift, output = _as_clients_know(lift, order["file_names"]), Path(order["output"])
     lift.save(output, progress=report)
+    saved_lift = load_lift(output)  # its metadata say how features are kept
     # Through JSON, not model_dump: infinite numbers must become null.
-    return lift_content(output, lift.features.shape, json.loads(lift.metadata.model_dump_json()))
+    return lift_content(output, saved_lift, json.loads(saved_lift.metadata.model_dump_json()))
 
 
 def _as_clients_know(lift: LiftResult, names: Mapping[str, str]) -> LiftResult:

@@ -147,7 +147,7 @@ def plan_lines(plan: Plan) -> Iterable[str]:
 def _summary(result: LiftResult) -> dict[str, Any]:
     metadata = result.metadata
     return {
-        "splats": result.features.shape[0],
+        "splats": len(result),
         "feature_share": float(result.has_feature.float().mean()),
         "channels": result.features.shape[1],
         "views": len(metadata.views),

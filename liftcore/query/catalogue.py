@@ -73,7 +73,7 @@ def tree(scene: Scene, words: Sequence[str] = (), vectors: Any = None) -> SceneT
                 views=tuple(view_names[view] for view in scene.node_views[node] if 0 <= view < len(view_names)),
                 kind=scene.node_kind(node),
                 parent=int(parents[node]) if parents[node] >= 0 else None,
-                path=scene.node_path(node),
+                path=scene.node_paths[node],
                 parts=tuple(part for part in np.flatnonzero(parents == node).tolist() if rows_of[part].size),
                 confidence=scene.confidence_of(node),
             )

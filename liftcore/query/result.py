@@ -137,10 +137,10 @@ class LiftResult(Lift):
         if not isinstance(codes, str):
             facts = {"rows": len(codes.codebook), "loss": codes.loss}
             changes = {"features": torch.from_numpy(codes.codebook), "code": torch.from_numpy(codes.code)}
-            for name in ("total_weight", "confidence"):  # so that the file takes two bytes for each
-                column = getattr(lift, name)
-                if column is not None and (rounded := column.half().float()).isfinite().all():
-                    changes[name] = rounded
+            if (rounded := lift.total_weight.half().float()).isfinite().all():  # so that the file takes two bytes
+                changes["total_weight"] = rounded
+            if lift.confidence is not None:  # and one
+                changes["confidence"] = (255 * lift.confidence).round() / 255
         metadata = self.metadata.model_copy(update={"diagnostics": self.diagnostics | {"codes": facts}})
         return replace(lift, **changes, metadata=metadata)
 
@@ -155,7 +155,8 @@ class LiftResult(Lift):
 
         Args:
             path: a file.
-            features: ``codes``: two bytes a splat, where that loses little (`as_codes`); None: as the lift has them.
+            features: ``codes``: two bytes a splat, where that loses little (`as_codes`); ``exact``: a row of features
+                a splat; None: as the lift's setting ``codes`` has it.
             progress: as `liftcore.lift` has it; there is one step.
 
         Raises:
@@ -166,8 +167,8 @@ class LiftResult(Lift):
         if features not in (None, "exact", "codes"):
             raise InvalidInput("features", expected="exact, codes or None", got=repr(features))
         with shown_progress(progress) as reporter, one_step(reporter, "save"):
-            lift = self.as_codes() if features == "codes" else self
-            save_lift(lift.with_exact_features() if features == "exact" else lift, path)
+            as_codes = self.settings.codes if features is None else features == "codes"
+            save_lift(self.as_codes() if as_codes else self.with_exact_features(), path)
 
     def save_scene(
         self, folder: Path, splats: Splats | None = None, cameras: Mapping[str, Camera] | None = None

@@ -618,20 +618,24 @@ class Scene:
         in_object = numbers >= 0
         return numbers, np.bincount(numbers[in_object], self.total_weight[in_object], len(self.object_views))
 
-    def node_path(self, node: int) -> tuple[int, ...]:
-        """Return the nodes of the tree that contain a node, the largest first, and the node itself."""
+    @cached_property
+    def node_paths(self) -> list[tuple[int, ...]]:
+        """Of each node of the tree the nodes that contain it, the largest first, and itself."""
         assert self.node_parents is not None
-        path = [node]
-        while (above := int(self.node_parents[path[-1]])) >= 0:
-            path.append(above)
-        return tuple(reversed(path))
+        parents, paths = self.node_parents.tolist(), list[tuple[int, ...]]()
+        for node in range(len(parents)):
+            path = [node]
+            while (above := parents[path[-1]]) >= 0:
+                path.append(above)
+            paths.append(tuple(reversed(path)))
+        return paths
 
     def node_kind(self, node: int) -> Literal["object", "part", "group"]:
         """Return the kind of a node of the tree: the first nodes are the objects."""
         objects = 0 if self.object_views is None else len(self.object_views)
         if node < objects:
             return "object"
-        return "part" if min(self.node_path(node)) < objects else "group"
+        return "part" if min(self.node_paths[node]) < objects else "group"
 
     def confidence_of(self, node: int) -> float | None:
         """Return the share of the views that see a node which have a mask of it; None in a lift without a tree."""
@@ -655,7 +659,7 @@ class Scene:
             expected = f"a number from 0 to {nodes - 1}" if nodes else "a lift with objects"
             hint = "the list of the lift's objects has them" if nodes else self.lack_of_objects()
             raise NotFound("object", expected=expected, got=str(number), hint=hint)
-        below = [number in self.node_path(node) for node in range(nodes)]
+        below = [number in path for path in self.node_paths]
         return np.array([*below, False])[self.node]  # the last entry is of splats without a node
 
     def set_members(self, splat_set: SplatSet) -> np.ndarray:

@@ -199,7 +199,7 @@ def _by_nodes(scene: Scene, labels: np.ndarray, weights: np.ndarray, parts: np.n
     if scene.node is None or scene.node_parents is None or not len(scene.node_parents):  # no ray met a region
         return labels
     output = labels.copy()
-    for node in sorted(np.flatnonzero(parts.any(axis=0)).tolist(), key=lambda n: len(scene.node_path(n))):
+    for node in sorted(np.flatnonzero(parts.any(axis=0)).tolist(), key=lambda n: len(scene.node_paths[n])):
         output[scene.has_feature & scene.members(node)] = int(parts[:, node].argmax())
     nodes, word_count = np.where(scene.has_feature, scene.node, -1), len(parts)
     within = nodes >= 0

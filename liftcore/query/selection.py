@@ -212,14 +212,14 @@ def part_nodes(scene: Scene, queries: Iterable[CompetingWords]) -> Iterator[list
     if parents is None or features is None or not levels_disagree(scene):
         yield from ([] for _ in queries)
         return
-    vectors, paths = features.astype(np.float32), [scene.node_path(node) for node in range(len(parents))]
+    vectors, paths = features.astype(np.float32), scene.node_paths
     has_vector = np.linalg.norm(vectors, axis=1) > 0
+    is_alike = (parents >= 0) & (_about(scene, vectors[parents], vectors) >= LEVELS_AGREE)
     from_the_largest = sorted(range(len(parents)), key=lambda node: len(paths[node]))
     widest = np.arange(len(parents))  # the largest node of the same meaning above each, or itself
     for node in from_the_largest:
-        parent = int(parents[node])
-        if parent >= 0 and _about(scene, vectors[parent][None], vectors[node])[0] >= LEVELS_AGREE:
-            widest[node] = widest[parent]
+        if is_alike[node]:
+            widest[node] = widest[parents[node]]
     for competitors in queries:
         scores = np.where(has_vector, (vectors @ competitors.directions.T).max(axis=1), -1.0)
         sure = has_vector & (competitors.count_nearer_means(scene, vectors) <= competitors.nearer_limit)
@@ -290,11 +290,11 @@ def _nearest_to(scene: Scene, rows: np.ndarray, means: np.ndarray, target: int) 
     return rows[is_nearest[inverse]]
 
 
-def _about(scene: Scene, means: np.ndarray, mean: np.ndarray) -> np.ndarray:
-    """Compute the cosines [n] f32 of unit features [n, F] and [F] about the scene's mean."""
-    offsets, offset = means - scene.rough_mean, mean - scene.rough_mean
-    lengths = np.linalg.norm(offsets, axis=1) * np.linalg.norm(offset)
-    return (offsets @ offset) / np.maximum(lengths, np.float32(1e-12))
+def _about(scene: Scene, means: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Compute the cosines [n] f32 of unit features [n, F] and others [n, F] or [F] about the scene's mean."""
+    means, others = means - scene.rough_mean, others - scene.rough_mean
+    lengths = np.linalg.norm(means, axis=-1) * np.linalg.norm(others, axis=-1)
+    return (means * others).sum(axis=-1) / np.maximum(lengths, np.float32(1e-12))
 
 
 def _octaves(order: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

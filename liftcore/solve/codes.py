@@ -23,6 +23,7 @@ from liftcore.runtime.cores import cores
 from liftcore.runtime.memory import zeros
 from liftcore.runtime.one_thread import one_thread
 from liftcore.solve.clusters import principal_axes
+from liftcore.values.lift_file import byte_steps
 from liftcore.values.region_weights import MEMORY_LIMIT
 
 MOST_CODES = 8_192
@@ -43,7 +44,7 @@ class Codes:
     """Features as codes over a codebook."""
 
     code: np.ndarray  # [P] u16, 0 without a feature
-    codebook: np.ndarray  # [K, F] of the features' type, the first row zero
+    codebook: np.ndarray  # [K, F] of the features' type, the first row zero; f16 are multiples of `byte_steps`
     loss: float  # of held-out splats
 
 
@@ -76,13 +77,17 @@ def code_features(features: np.ndarray, has_feature: np.ndarray, total_weight: n
             break
     if loss > MOST_LOSS:
         return f"Features are exact: as codes their mean cosine about the scene's mean would be {1 - loss:.3f}."
-    code = np.zeros(len(features), np.uint16)
-    code[rows] = groups + 1
+    present = np.bincount(groups) > 0  # a cut may leave nothing on one side
+    code, number = np.zeros(len(features), np.uint16), np.count_nonzero(present)
+    code[rows] = np.cumsum(present)[groups]
     sums = np.zeros((number + 1, features.shape[1]))  # of all splats: a sample has ten a group
     for first in range(0, len(code), BLOCK):
         block = slice(first, first + BLOCK)
         sums += _sums(code[block], root_weights[block], _wide(features[block]), number + 1)
     codebook = sums / np.maximum(np.bincount(code, root_weights, number + 1), 1e-30)[:, None]
+    if features.dtype == np.float16:  # the file has bytes of these: 1 - cosine about the mean grows by .0001 to .0004
+        steps = byte_steps(codebook)
+        codebook = np.clip(np.round(codebook / steps), -127, 127) * steps
     return Codes(code, codebook.astype(features.dtype), float(loss))
 
 

@@ -6,9 +6,11 @@ i32, -1 for splats in none, and ``cluster_features`` [K, F]; where objects were 
 none, and ``object_views`` [N, 5] i32, and of the tree of objects, parts and groups ``node`` [P] i32, ``node_parents``
 [T] i32, ``node_views`` [T, 5] i32, ``node_confidence`` [T] f32 and ``node_features`` [T, F] f16 (`Lift`); of packs
 with words their vectors, ``embeddings`` [n, F] f32. A lift as codes (`liftcore.solve.codes`) has ``code`` [P] u16,
-the row of ``features`` [K, F] of each splat, whose first row is zero. Columns of i32, total
-weight and confidence are written as i16 and f16 where that loses nothing. Its metadata hold settings, inputs with
-digests, the encoder, words, the diagnostics, timings and the version, as JSON.
+the row of ``features`` [K, F] of each splat, whose first row is zero; these are i8, multiples of ``feature_steps``
+[F] f32 of their channels. Where nothing is lost by it, columns of i32, total weight and confidence take two bytes or
+one (a confidence of u8 is in 255ths), and columns that follow from others are left out: ``has_feature`` from a code
+above zero, ``object`` from ``node``. Its metadata hold settings, inputs with digests, the encoder, words, the
+diagnostics, timings and the version, as JSON.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ if TYPE_CHECKING:
 
 FORMAT = "splatlift-lift/2"
 EXPECTED, AGAIN = "a lift file (.safetensors)", "copy the file again, or lift again"
-TENSORS = ("features", "total_weight", "has_feature")
+TENSORS = ("features", "total_weight", "has_feature")  # the last or a code
 CONFIDENCE = "confidence"  # in lifts that were reweighted
 MOST_BESIDE = 16  # files of one kind beside a lift, that are read to know one of them
 DIGEST = re.compile("[0-9a-f]{64}")  # SHA-256, as `sha256_of` has it
@@ -48,14 +50,16 @@ NEAR = 3  # folders of an input's path, and above a lift, among which it is look
 CLUSTER_TENSORS = ("cluster", "cluster_features")  # in lifts with aggregation only
 OBJECT_TENSORS = ("object", "object_views")  # in lifts that looked for objects
 NODE_TENSORS = ("node", "node_parents", "node_views", "node_confidence", "node_features")  # beside objects
+STEPS = 2.0**-24, 512.0  # of float16: below there is none, and above bytes reach beyond its range
 MOST_DEPTH = 63  # of a tree of nodes
 EMBEDDINGS = "embeddings"  # in lifts of packs with words
 NARROWED = {  # columns that take two bytes in the file, where that loses nothing
     "total_weight": np.float32, CONFIDENCE: np.float32, "cluster": np.int32, "object": np.int32, "node": np.int32,
 }  # fmt: skip
 SCHEMA = {  # types, and axes: P splats, K rows, F channels, C clusters, O objects, V views, N nodes, W words
-    "features": ("f2 f4", "K F"), "code": ("u2", "P"), "total_weight": ("f2 f4", "P"), "has_feature": ("b1", "P"),
-    CONFIDENCE: ("f2 f4", "P"), "cluster": ("i2 i4", "P"), "cluster_features": ("f2 f4", "C F"),
+    "features": ("i1 f2 f4", "K F"), "feature_steps": ("f4", "F"), "code": ("u2", "P"),
+    "total_weight": ("f2 f4", "P"), "has_feature": ("b1", "P"), CONFIDENCE: ("u1 f2 f4", "P"),
+    "cluster": ("i2 i4", "P"), "cluster_features": ("f2 f4", "C F"),
     "object": ("i2 i4", "P"), "object_views": ("i4", "O V"),
     "node": ("i2 i4", "P"), "node_parents": ("i4", "N"), "node_views": ("i4", "N V"), "node_confidence": ("f4", "N"),
     "node_features": ("f2", "N F"), EMBEDDINGS: ("f4", "W F"),
@@ -73,21 +77,62 @@ def save_lift(lift: Lift, path: Path | str) -> None:
             "node_features", expected=expected, got=got, hint=f"replace {', '.join(NODE_TENSORS)} by None"
         )
 
-    tensors = {name: _narrowed(tensor) if name in NARROWED else tensor for name, tensor in tensors_of(lift).items()}
+    tensors = tensors_of(lift)
+    for name in NARROWED.keys() & tensors.keys():
+        tensors[name] = _narrowed(tensors[name], is_share=name == CONFIDENCE)
+    if lift.code is not None:
+        tensors |= _as_bytes(lift.features)
+        if ((lift.code.int() > 0) == lift.has_feature).all():
+            del tensors["has_feature"]
+    if lift.object is not None and lift.object_views is not None and lift.node is not None:
+        node, parents = lift.node.cpu().numpy(), lift.node_parents.cpu().numpy()
+        if np.array_equal(_objects_of(node, parents, len(lift.object_views)), lift.object.cpu().numpy()):
+            del tensors["object"]
     write_tensors(as_path(path), tensors, {"splatlift": lift.metadata.model_dump_json()})
 
 
-def _narrowed(column: Tensor) -> Tensor:
-    """Return a column [P] i32 or f32 in half of the bytes, where that loses nothing."""
+def _narrowed(column: Tensor, is_share: bool) -> Tensor:
+    """Return a column [P] i32 or f32 in two bytes, a share in one, where that loses nothing."""
     import torch
 
+    if is_share:
+        levels = (255 * column).round().clamp(0, 255).byte()
+        if torch.equal(levels.float() / 255, column):
+            return levels
     narrow = column.to(torch.float16 if column.is_floating_point() else torch.int16)
     return narrow if torch.equal(narrow.to(column.dtype), column) else column
 
 
+def byte_steps(rows: np.ndarray) -> np.ndarray:
+    """Return the powers of two [F] f32 of which multiples in -127..127 reach to all values of rows [K, F]."""
+    largest = np.abs(rows).max(axis=0).astype(np.float32) / 127
+    return np.exp2(np.ceil(np.log2(np.clip(largest, *STEPS))))
+
+
+def _as_bytes(features: Tensor) -> dict[str, Tensor]:
+    """Return rows [K, F] f16 as i8 with their steps, if they are multiples of these; others as they are."""
+    import torch
+
+    rows = features.cpu().numpy()
+    steps = byte_steps(rows)
+    multiples = np.round(rows / steps)
+    if rows.dtype != np.float16 or not np.array_equal(multiples * steps, rows):
+        return {"features": features}
+    return {"features": torch.from_numpy(multiples.astype(np.int8)), "feature_steps": torch.from_numpy(steps)}
+
+
+def _objects_of(node: np.ndarray, parents: np.ndarray, objects: int) -> np.ndarray:
+    """Return the object [P] i32 that each splat's node is or is a part of, one of the first nodes; -1: none."""
+    above, numbers = np.append(parents, np.int32(-1)), np.arange(len(parents) + 1, dtype=np.int32)
+    numbers[-1] = -1
+    while (others := numbers >= objects).any():
+        numbers[others] = above[numbers[others]]
+    return numbers[node]
+
+
 def tensors_of(lift: Lift) -> dict[str, Tensor]:
     """Return the tensors of a lift by their names, in the order of its file."""
-    return {name: getattr(lift, name) for name in SCHEMA if getattr(lift, name) is not None}
+    return {name: tensor for name in SCHEMA if (tensor := getattr(lift, name, None)) is not None}
 
 
 def open_lift(path: Path | str) -> Lift:
@@ -109,15 +154,19 @@ def read_lift(path: Path | str) -> tuple[dict[str, np.ndarray], str]:
             tensors, header = map_tensors(source)
             if "splatlift" not in header:
                 raise ValueError(f"{EXPECTED}, got safetensors without lift metadata")
+            if "code" in tensors:
+                tensors.setdefault("has_feature", tensors["code"] > 0)
             if missing := [name for name in TENSORS if name not in tensors]:
                 _check_format(header["splatlift"])
                 raise ValueError(f"{EXPECTED}, got one without {missing[0]}")
             arrays = {name: tensors[name] for name in SCHEMA if name in tensors}
-            _check_tensors(arrays)
+            lengths = check_arrays(arrays, SCHEMA)
+            _widen(arrays)
+            _check_tensors(arrays, lengths)
+            if "object_views" in arrays and "object" not in arrays:
+                arrays["object"] = _objects_of(arrays["node"], arrays["node_parents"], lengths["O"])
     except InvalidLift as error:
         raise wrong_kind(source, "lift", InvalidLift, argument=str(path)) or error from None
-    for name in NARROWED.keys() & arrays.keys():
-        arrays[name] = arrays[name].astype(NARROWED[name], copy=False)
     return arrays, header["splatlift"]
 
 
@@ -139,9 +188,23 @@ def _check_format(text: str) -> None:
         raise ValueError(f"a lift of {FORMAT}, got {name!r}; {hint}")
 
 
-def _check_tensors(arrays: dict[str, np.ndarray]) -> None:
+def _widen(arrays: dict[str, np.ndarray]) -> None:
+    """Replace columns that take fewer bytes in a file than in a lift; a ValueError names invalid steps."""
+    features, steps = arrays["features"], arrays.pop("feature_steps", None)
+    if (steps is None) != (features.dtype != np.int8):
+        raise ValueError(f"feature_steps beside features of int8 alone, got features of {features.dtype}")
+    if steps is not None:
+        if not ((steps >= STEPS[0]) & (steps <= STEPS[1])).all():
+            raise ValueError(f"feature_steps of {STEPS[0]:g}..{STEPS[1]:g}, got {steps.min()}..{steps.max()}")
+        arrays["features"] = (features * steps).astype(np.float16)
+    if CONFIDENCE in arrays and arrays[CONFIDENCE].dtype == np.uint8:
+        arrays[CONFIDENCE] = arrays[CONFIDENCE] / np.float32(255)
+    for name in NARROWED.keys() & arrays.keys():
+        arrays[name] = arrays[name].astype(NARROWED[name], copy=False)
+
+
+def _check_tensors(arrays: dict[str, np.ndarray], lengths: dict[str, int]) -> None:
     """Refuse tensors that do not fit together; a ValueError names what is wrong."""
-    lengths = check_arrays(arrays, SCHEMA)
     if not arrays["features"].size:
         raise ValueError("features of at least one splat and channel, got none")
     code = arrays.get("code")
@@ -150,8 +213,8 @@ def _check_tensors(arrays: dict[str, np.ndarray]) -> None:
     if code is not None and int(code.max(initial=0)) >= lengths["K"]:
         raise ValueError(f"code of 0..{lengths['K'] - 1}, got {code.max()}")
     for names in (CLUSTER_TENSORS, OBJECT_TENSORS, NODE_TENSORS):
-        present = [name for name in names if name in arrays]
-        if present and len(present) < len(names):
+        present, missing = ([name for name in names if (name in arrays) is has] for has in (True, False))
+        if present and missing and not (missing == ["object"] and "node" in arrays):
             raise ValueError(f"{', '.join(names)} together, got {', '.join(present)} alone")
     clusters = arrays.get("cluster_features")
     if clusters is not None and clusters.dtype != arrays["features"].dtype:

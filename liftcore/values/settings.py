@@ -96,7 +96,7 @@ GROUPS = {  # of the settings, for people who read all of them
     "wrong masks": ("robust", "robust_directions"),
     "objects and clusters": ("objects", "aggregation", "aggregation_iou", "aggregation_cluster_size"),
     "neighbours": ("smoothness",),
-    "the result, and where it is made": ("dtype", "diagnostic_rays", "reference_channels", "seed", "device"),
+    "the result, and where it is made": ("dtype", "codes", "diagnostic_rays", "reference_channels", "seed", "device"),
 }  # fmt: skip
 
 
@@ -183,6 +183,11 @@ class LiftSettings(Body):
     )
     dtype: Literal["float16", "float32"] = Field(
         "float16", description="how features are stored, or `float32`; what float16 cannot hold is stored as float32"
+    )
+    codes: bool = Field(
+        True,
+        description="the file has two bytes a splat for features, the number of one of at most 8,192 rows, where a "
+        "held-out sample loses little by it; `false` keeps a row a splat",
     )
     aggregation: bool = Field(False, description="one feature a cluster of splats, by HDBSCAN")
     aggregation_iou: float = Field(

@@ -9,6 +9,8 @@ import liftcore as lc
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
 from tests.promises.tiny_files import photo_vectors, row_of_splats, scene_with
 
@@ -116,11 +118,31 @@ def test_codes_are_saved_as_exact_features_where_these_are_wanted(
     coded.save(tmp_path / "exact.safetensors", features="exact")
     read = lc.load_lift(tmp_path / "exact.safetensors")
     assert read.code is None and torch.equal(read.features, expected)
-    coded.save(tmp_path / "coded.safetensors")
+    exact.save(tmp_path / "coded.safetensors")
+    settings = exact.settings.model_copy(update={"codes": False})
+    kept = replace(exact, metadata=exact.metadata.model_copy(update={"settings": settings}))
+    kept.save(tmp_path / "kept.safetensors")
+    assert torch.equal(lc.load_lift(tmp_path / "kept.safetensors").features, exact.features)
     sizes = [(tmp_path / f"{name}.safetensors").stat().st_size for name in ("coded", "exact")]
-    assert sizes[0] < 0.6 * sizes[1]
+    assert sizes[0] < 0.4 * sizes[1]
     with pytest.raises(lc.InvalidInput, match="codes"):
         coded.save(tmp_path / "other.safetensors", features="small")  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("steps", [float("nan"), float("inf"), 1024.0, None])
+def test_bytes_without_steps_that_float16_can_hold_are_refused(
+    coded: lc.LiftResult, tmp_path: Path, steps: float | None
+) -> None:
+    coded.save(tmp_path / "coded.safetensors")
+    with safe_open(tmp_path / "coded.safetensors", "pt") as file:
+        text = file.metadata()
+    tensors = load_file(tmp_path / "coded.safetensors")
+    first = tensors.pop("feature_steps")
+    if steps is not None:
+        tensors["feature_steps"] = torch.where(torch.arange(len(first)) == 3, torch.tensor(steps), first)
+    save_file(tensors, tmp_path / "coded.safetensors", text)
+    with pytest.raises(lc.InvalidLift, match="feature_steps"):
+        lc.load_lift(tmp_path / "coded.safetensors")
 
 
 def test_an_edited_copy_of_the_splats_takes_their_codes(coded: lc.LiftResult) -> None:
