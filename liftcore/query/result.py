@@ -132,7 +132,8 @@ class LiftResult(Lift):
         if self.code is not None:
             return self
         lift = self.cpu()
-        codes = code_features(*(part.numpy() for part in (lift.features, lift.has_feature, lift.total_weight)))
+        columns = (part.numpy() for part in (lift.features, lift.has_feature, lift.total_weight))
+        codes = code_features(*columns, of_masks=lift.object is not None)
         facts, changes = {"reason": codes}, dict[str, Any]()
         if not isinstance(codes, str):
             facts = {"rows": len(codes.codebook), "loss": codes.loss}

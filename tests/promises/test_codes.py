@@ -26,6 +26,7 @@ def lift_with(features: np.ndarray, has_feature: np.ndarray | None = None) -> lc
     rows, weights = torch.from_numpy(features).half(), torch.linspace(1.0, 9.0, len(features))
     columns = {"total_weight": weights * torch.from_numpy(has_feature), "confidence": weights / 10}
     columns |= {"features": rows, "has_feature": torch.from_numpy(has_feature)}
+    columns |= {"object": torch.full((len(features),), -1).int(), "object_views": torch.zeros(0, 5).int()}  # of masks
     metadata = lift.metadata.model_copy(update={"landmarks": ()})
     return lc.LiftResult.of(replace(lift, **columns, metadata=metadata))
 
@@ -161,7 +162,8 @@ def test_labelled_splats_bring_their_codes(coded: lc.LiftResult, tmp_path: Path,
     assert np.array_equal(coded.arrays()["features"][codes], coded.with_exact_features().arrays()["features"])
 
 
-def test_features_that_share_nothing_stay_exact() -> None:
+def test_features_that_share_nothing_or_differ_within_things_stay_exact(exact: lc.LiftResult) -> None:
+    assert replace(exact, object=None, object_views=None).as_codes().code is None  # of maps
     rng = np.random.default_rng(0)
     for features in (rng.normal(size=(COUNT, 64)), rng.normal(size=(40, 64))):
         lift = lift_with(features)

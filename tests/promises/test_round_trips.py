@@ -161,7 +161,7 @@ def test_checkpoints_are_read_as_the_tensors_in_them(trainer: str, tmp_path: Pat
 
 
 def test_lift_comes_back_with_every_array_and_its_settings(tmp_path: Path) -> None:
-    result = lc.lift(*random_scene().arguments(), progress=False)
+    result = lc.lift(*random_scene().arguments(), progress=False).as_codes()
     result.save(tmp_path / "lift.safetensors")
     copy = lc.load_lift(tmp_path / "lift.safetensors")
     arrays, copies = result.arrays(), copy.arrays()
