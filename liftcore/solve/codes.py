@@ -92,7 +92,7 @@ def code_features(
     codebook = sums / np.maximum(np.bincount(code, root_weights, number + 1), 1e-30)[:, None]
     if features.dtype == np.float16:  # the file has bytes of these: 1 - cosine about the mean grows by .0001 to .0004
         steps = byte_steps(codebook)
-        codebook = np.clip(np.round(codebook / steps), -127, 127) * steps
+        codebook = (np.clip(np.round(codebook / steps), -127, 127) + 0.0) * steps  # + 0, as bytes have no -0
     return Codes(code, codebook.astype(features.dtype), float(loss))
 
 
