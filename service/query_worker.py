@@ -55,7 +55,7 @@ VALUES = ("views", "edit", "count_objects")  # for the HTTP process
 WORD_COSINES = 1 << 31  # of splats times words: about a minute and a half on one core
 MASK_PIXELS = 1 << 26  # of all views of an export: a minute, as for the largest picture
 # Files of many words by operation, and of splats by `what`: what `Scene.blocks_of` calls them
-WORD_FILES = {"labels": "splat_labels", "map": "labels", "picture": "picture"}
+WORD_FILES = ("labels", "map", "picture")
 SPLATS_FILES = {"object": "object", "scores": "coloured"}
 VIEW_LINKS = ("render", "mask", "attention")  # links of an answer that end with a view
 Request = dict[str, Any]
@@ -286,7 +286,7 @@ class Answers:
         if operation == "colours":
             return scene.blocks_of(scene.colours(request["what"]))
         if operation in WORD_FILES:
-            return scene.blocks_of(self._segmentation(request), WORD_FILES[operation], view=view)
+            return scene.blocks_of(self._segmentation(request), operation, view=view)
         if "query" in request:
             view_mask = self._view_mask(request) if operation in ("mask", "attention") else None
             kind = SPLATS_FILES[request["what"]] if operation == "splats" else operation

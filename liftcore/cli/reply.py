@@ -33,8 +33,8 @@ def reply(document: Mapping[str, Any], *, as_json: bool, lines: Iterable[str] | 
 
 
 OUTPUTS = {
-    "object": "splats", "coloured": "ply", "labelled": "ply", "names": "json", "scores": "npy", "splat_labels": "npy",
-    "csv": "csv", **dict.fromkeys(("mask", "attention", "overlay", "labels", "picture", "output", "worst"), "png"),
+    "object": "splats", "coloured": "ply", "labelled": "ply", "names": "json", "scores": "npy", "labels": "npy",
+    "csv": "csv", **dict.fromkeys(("mask", "attention", "overlay", "map", "picture", "output", "worst"), "png"),
 }  # kind of file of each option  # fmt: skip
 INPUTS = ("lift", "splats", "cameras", "features", "edited", "table", "words", "vocabulary", "camera", "photo")
 

@@ -26,16 +26,16 @@ def add_arguments(parser: common.Parser) -> None:
     parser.add_argument("--example", action="append", default=[], metavar="EXAMPLE", help=examples)
     parser.add_argument("--top", type=common.count, default=5, metavar="N", help="words for an example; default 5")
     common.add_view(parser)
-    parser.add_argument("--labels", type=Path, metavar="PNG", help="write numbers of the view's words")
+    parser.add_argument("--map", type=Path, metavar="PNG", help="write numbers of the view's words")
     parser.add_argument("--picture", type=Path, metavar="PNG", help="write the view with a legend")
     parser.add_argument("--coloured", type=Path, metavar="PLY", help="write splats in colours of words")
-    parser.add_argument("--splat-labels", type=Path, metavar="NPY", help="write the splats' numbers [P]")
+    parser.add_argument("--labels", type=Path, metavar="NPY", help="write the splats' numbers [P]")
     parser.add_argument("--labelled", type=Path, metavar="PLY", help="write labelled splats, and PLY.json")
 
 
 def run(options: argparse.Namespace) -> int:
     """Label the splats, write the requested files, and list the words; or list only the words of examples."""
-    view = common.view_of(options, "labels", "picture")
+    view = common.view_of(options, "map", "picture")
     files = outputs_of(options)
     if options.labelled is not None:
         files["names"] = options.labelled.with_name(f"{options.labelled.name}.json")

@@ -11,7 +11,7 @@ A folder contains, with sub-folders if names of views have some (``camA/000``), 
   ``.npz``;
 * JSON: data sets of COCO, or Grounded SAM 2's records and tracking (`liftcore.features.mask_json`);
 * label pictures ``VIEW.png`` with the names of their values: in a JSON, or in the picture's text ``legend``, as
-  ``splatlift segment --labels`` writes it.
+  ``splatlift segment --map`` writes it.
 
 Masks of one phrase in a view are merged. A view counts if it has a file or a record, also of an empty mask. These
 pixels have no label: those with the value ``unlabelled``, those within a box without a mask, and those outside of all

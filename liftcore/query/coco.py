@@ -11,7 +11,7 @@ import numpy as np
 
 from liftcore.errors import InvalidQuery
 from liftcore.query.scene import Scene
-from liftcore.query.segment import value_map
+from liftcore.query.segment import label_map
 
 if TYPE_CHECKING:
     from liftcore.io.labels import Labels
@@ -43,7 +43,7 @@ def masks_json(scene: Scene, labels: Labels, views: Sequence[str] | None = None)
         images, numbers = [], itertools.count(1)
         yield json.dumps(head, ensure_ascii=False)[:-1].encode() + b', "annotations": ['
         for place, view in enumerate(view_names, 1):
-            number_map = value_map(scene, labels.columns["instance_id"], view)
+            number_map = label_map(scene, labels.columns["instance_id"], view)
             height, width = number_map.shape
             images.append({"id": place, "file_name": view, "width": width, "height": height})
             for annotation in _annotations(number_map, instances):

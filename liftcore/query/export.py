@@ -23,7 +23,7 @@ from liftcore.query.labels import labels
 from liftcore.query.objects import MOST_SPLATS, objects
 from liftcore.query.question import Answer
 from liftcore.query.scene import Scene
-from liftcore.query.segment import map_png, picture_png, value_map
+from liftcore.query.segment import label_map, map_png, picture_png
 
 if TYPE_CHECKING:  # these load torch
     from PIL.Image import Image
@@ -91,10 +91,10 @@ def _of_words(export: Export) -> Iterable[bytes]:
     """Return the map or the picture of a segmentation in a view."""
     from liftcore.query.render import render
 
-    values = value_map(export.scene, export.source.values, export.require_view())
-    if export.content == "labels":
-        return [map_png(values, export.source)]
-    return [picture_png(render(export.scene, export.require_view()), values, export.source)]
+    labels = label_map(export.scene, export.source.labels, export.require_view())
+    if export.content == "map":
+        return [map_png(labels, export.source)]
+    return [picture_png(render(export.scene, export.require_view()), labels, export.source)]
 
 
 def _of_labels(export: Export) -> Iterable[bytes]:
@@ -165,9 +165,9 @@ FILES: dict[str, Files] = {  # kind of a source -> the files that are made of it
     },
     "answers": OF_LABELS,
     "segmentation": {
-        "coloured": lambda export: recoloured(export.scene.splat_file, export.source.colours[export.source.values]),
-        **dict.fromkeys(("labels", "picture"), _of_words),
-        "splat_labels": lambda export: [npy(export.source.values)],
+        "coloured": lambda export: recoloured(export.scene.splat_file, export.source.colours[export.source.labels]),
+        "labels": lambda export: [npy(export.source.labels)],
+        **dict.fromkeys(("map", "picture"), _of_words),
         **OF_LABELS,
     },
     "object": {

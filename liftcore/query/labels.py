@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 def labels(scene: Scene, source: Segmentation | Answer | Mapping[str, Answer] | SceneTree) -> Labels:
     """Return the labels of a segmentation, of answers, or of a lift's objects with their parts.
 
-    Of a segmentation, ``class_id`` is the value of a splat's word (`Segmentation.values`), and ``instance_id``
+    Of a segmentation, ``class_id`` is the value of a splat's word (`Segmentation.labels`), and ``instance_id``
     numbers the groups of touching splats of one word (`liftcore.scene.touching`), the one with the largest total
     weight first; groups with less than a twentieth of the total weight of their word's largest have only a class. Of
     an answer, every selected splat has class 1, and the instances are its objects. Of several answers by name, each
@@ -66,7 +66,7 @@ def _name(answer: Answer) -> str:
 
 
 def _of_words(scene: Scene, segmentation: Segmentation) -> Labels:
-    names, values = [label.word for label in segmentation.named_words], segmentation.values
+    names, values = [label.word for label in segmentation.named_words], segmentation.labels
     groups = list[tuple[int, np.ndarray]]()
     for value in range(1, len(names) + 1):
         rows = np.flatnonzero(values == value)

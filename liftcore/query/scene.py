@@ -433,7 +433,7 @@ class Scene:
             source: a query or its answer, answers by names, a segmentation, a tree, the id of an object or another
                 node, or an array; None: the scene.
             what: of an answer object, coloured, scores, selection, mask, attention or overlay; of a segmentation
-                coloured, labels, picture or splat_labels; of a tree csv, of its objects; of all these labelled
+                coloured, labels, map or picture; of a tree csv, of its objects; of all these labelled
                 (splats with labels), names (of the labels) or masks (COCO's JSON, in the views); of the scene a
                 channel of `render`, or splats; of an array npy. Empty: the first of
                 these; of a segmentation or a tree as a .glb or .usdz labelled (a tree as a .ply, too), .json masks.

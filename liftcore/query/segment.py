@@ -50,8 +50,8 @@ class Segmentation:
 
     words: tuple[str, ...]
     """as passed"""
-    labels: np.ndarray
-    """[P] i32, rows of words; -1 for none"""
+    rows: np.ndarray
+    """[P] i32, the row of each splat's word in ``words``; -1 for none"""
     score: np.ndarray
     """[P] f32, the cosine of a splat to its word; 0 without a word"""
     margin: np.ndarray
@@ -62,27 +62,27 @@ class Segmentation:
     def __repr__(self) -> str:
         text = ", ".join(f"{label.word!r}: {label.splats}" for label in self.named_words)
         return one_line(
-            self, f"{len(self.labels)} splats", f"{len(self.named_words)} of {len(self.words)} words: {text}"
+            self, f"{len(self.rows)} splats", f"{len(self.named_words)} of {len(self.words)} words: {text}"
         )
 
     @property
-    def values(self) -> np.ndarray:
+    def labels(self) -> np.ndarray:
         """[P] i32, the place of each splat's word in ``named_words``, from 1; 0 for none."""
         places = np.zeros(len(self.words) + 1, np.int32)  # the last is of -1
         places[[label.row for label in self.named_words]] = np.arange(1, len(self.named_words) + 1)
-        return places[self.labels]
+        return places[self.rows]
 
     @property
     def colours(self) -> np.ndarray:
-        """[len(named_words) + 1, 3] u8 sRGB, by ``values``: grey, then a colour a word."""
+        """[len(named_words) + 1, 3] u8 sRGB, by ``labels``: grey, then a colour a word."""
         return np.roll(cluster_colours(len(self.named_words)), 1, axis=0)
 
     @property
     def summary(self) -> LabelSummary:
         """Present words, and the number of splats without a word."""
-        none = int((self.labels < 0).sum())
+        none = int((self.rows < 0).sum())
         return LabelSummary(
-            word_count=len(self.words), splats=len(self.labels), none=none, named_words=self.named_words
+            word_count=len(self.words), splats=len(self.rows), none=none, named_words=self.named_words
         )
 
 
@@ -108,9 +108,9 @@ def segment(
         InvalidLift: the splats moved or changed since the lift.
     """
     check_texts(words, "words")
-    words, rows = tuple(words), np.atleast_2d(np.asarray(as_numpy(vectors), np.float32))
-    if not 1 <= len(words) <= MOST_WORDS or len(rows) != len(words):
-        got = f"{len(words)} words and {len(rows)} vectors"
+    words, vectors = tuple(words), np.atleast_2d(np.asarray(as_numpy(vectors), np.float32))
+    if not 1 <= len(words) <= MOST_WORDS or len(vectors) != len(words):
+        got = f"{len(words)} words and {len(vectors)} vectors"
         raise InvalidQuery("words", expected=f"1 to {MOST_WORDS} words, a vector each", got=got)
     if len(set(words)) < len(words):
         twice = next(word for place, word in enumerate(words) if word in words[:place])
@@ -121,7 +121,7 @@ def segment(
     row_weights = scene.features.of_rows(weights)
     thresholds, answer_weights = np.empty(len(words)), np.empty(len(words))
     nearest = _Nearest(len(row_weights))
-    for row, scores in _scores(table, rows, range(len(words))):
+    for row, scores in _scores(table, vectors, range(len(words))):
         threshold = find_threshold(scores[table.has_feature], "auto", table.weights)
         thresholds[row] = threshold.value if threshold.clear else np.inf
         answer_weights[row] = row_weights[scores >= thresholds[row]].sum()
@@ -131,12 +131,12 @@ def segment(
     sums = np.bincount(nearest.row[is_answer], row_weights[is_answer], len(words))
     shares = sums / np.maximum(answer_weights, 1e-30)
     winners = _Nearest(len(row_weights))
-    unit = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
     if references is None:
         suffices = len(words) >= LEAST_WORDS
         references = References(words, unit) if suffices else references_of_space(unit, scene.metadata.text_space)
     parts = _parts(scene, unit, references)
-    for row, scores in _scores(table, rows, np.flatnonzero((shares >= LEAST_OWN) | parts.any(axis=1)).tolist()):
+    for row, scores in _scores(table, vectors, np.flatnonzero((shares >= LEAST_OWN) | parts.any(axis=1)).tolist()):
         if (
             isinstance(references, References)
             and estimate_presence(table, words[row], unit[row], scores, references).present is False
@@ -146,19 +146,19 @@ def segment(
         if shares[row] >= LEAST_OWN and not parts[row].any():
             winners.take(row, np.where(table.has_feature & (scores >= thresholds[row]), scores, -np.inf))
     of_splats = scene.features.of_splats
-    labels = of_splats(np.where(winners.score > -np.inf, winners.row, NO_WORD).astype(np.int32))
-    labels = np.where(scene.has_feature, labels, np.int32(NO_WORD))
-    labels = _by_nodes(scene, labels, weights, parts)
-    score = np.zeros(len(labels), np.float32)
-    for row, scores in _scores(table, rows, np.unique(labels[labels != NO_WORD]).tolist()):
-        score = np.where(labels == row, of_splats(scores), score)
-    other = np.where(labels == of_splats(nearest.row), of_splats(nearest.second), of_splats(nearest.score))
-    has_margin = (labels != NO_WORD) & (other > -np.inf)
+    rows = of_splats(np.where(winners.score > -np.inf, winners.row, NO_WORD).astype(np.int32))
+    rows = np.where(scene.has_feature, rows, np.int32(NO_WORD))
+    rows = _by_nodes(scene, rows, weights, parts)
+    score = np.zeros(len(rows), np.float32)
+    for row, scores in _scores(table, vectors, np.unique(rows[rows != NO_WORD]).tolist()):
+        score = np.where(rows == row, of_splats(scores), score)
+    other = np.where(rows == of_splats(nearest.row), of_splats(nearest.second), of_splats(nearest.score))
+    has_margin = (rows != NO_WORD) & (other > -np.inf)
     margin = np.subtract(score, other, out=np.zeros_like(score), where=has_margin)
     groups = [
         (float(weights[members].sum() / weights.sum()), row, members)
-        for row in np.unique(labels[labels != NO_WORD]).tolist()
-        if weights[members := np.flatnonzero(labels == row)].any()
+        for row in np.unique(rows[rows != NO_WORD]).tolist()
+        if weights[members := np.flatnonzero(rows == row)].any()
     ]
     groups.sort(key=lambda group: -group[0])
     colours = cluster_colours(len(groups)).tolist()
@@ -177,7 +177,7 @@ def segment(
         )
         for value, (share, row, members) in enumerate(groups, 1)
     )
-    return Segmentation(words, labels, score, margin, summaries)
+    return Segmentation(words, rows, score, margin, summaries)
 
 
 def _parts(scene: Scene, unit: np.ndarray, references: References | str | None) -> np.ndarray:
@@ -190,15 +190,15 @@ def _parts(scene: Scene, unit: np.ndarray, references: References | str | None) 
     return mask
 
 
-def _by_nodes(scene: Scene, labels: np.ndarray, weights: np.ndarray, parts: np.ndarray) -> np.ndarray:
-    """Correct labels by the lift's nodes: parts that a word names, and splats without a word; [P] i32.
+def _by_nodes(scene: Scene, rows: np.ndarray, weights: np.ndarray, parts: np.ndarray) -> np.ndarray:
+    """Correct rows of words by the lift's nodes: parts that a word names, and splats without a word; [P] i32.
 
     Args:
-        labels: [P] i32, NO_WORD for none. weights: [P] f64. parts: [n, N] bool, the nodes that words name.
+        rows: [P] i32, NO_WORD for none. weights: [P] f64. parts: [n, N] bool, the nodes that words name.
     """
     if scene.node is None or scene.node_parents is None or not len(scene.node_parents):  # no ray met a region
-        return labels
-    output = labels.copy()
+        return rows
+    output = rows.copy()
     for node in sorted(np.flatnonzero(parts.any(axis=0)).tolist(), key=lambda n: len(scene.node_paths[n])):
         output[scene.has_feature & scene.members(node)] = int(parts[:, node].argmax())
     nodes, word_count = np.where(scene.has_feature, scene.node, -1), len(parts)
@@ -236,14 +236,14 @@ def _scores(scene: Scene, vectors: np.ndarray, rows: Sequence[int]) -> Iterator[
         yield from zip(block, np.ascontiguousarray(scores.T), strict=True)
 
 
-def value_map(scene: Scene, values: np.ndarray, view: str | Camera) -> np.ndarray:
-    """Render the splats' value [P] i32 with the most weight on each ray, [H, W] i32; 0 where it misses the scene."""
-    strongest, sums = scene.strongest_labels(values, view)
+def label_map(scene: Scene, labels: np.ndarray, view: str | Camera) -> np.ndarray:
+    """Render the splats' label [P] i32 with the most weight on each ray, [H, W] i32; 0 where it misses the scene."""
+    strongest, sums = scene.strongest_labels(labels, view)
     return np.where(sums >= MINIMUM_ROW_SUM, np.maximum(strongest, 0), 0)
 
 
-def map_png(values: np.ndarray, segmentation: Segmentation) -> bytes:
-    """Write values [H, W] as a PNG with a palette, 0 black; its text ``legend`` is JSON from values to words.
+def map_png(labels: np.ndarray, segmentation: Segmentation) -> bytes:
+    """Write labels [H, W] as a PNG with a palette, 0 black; its text ``legend`` is JSON from labels to words.
 
     Above 255 words it is a grey image of 16 bits.
     """
@@ -252,19 +252,19 @@ def map_png(values: np.ndarray, segmentation: Segmentation) -> bytes:
     words = [label.word for label in segmentation.named_words]
     text = {"legend": json.dumps(dict(enumerate(words, 1)))}
     if len(words) > 255:
-        return png(values.astype(np.uint16), text)
+        return png(labels.astype(np.uint16), text)
     colours = segmentation.colours.copy()
     colours[0] = 0
-    return png(values.astype(np.uint8), text, colours)
+    return png(labels.astype(np.uint8), text, colours)
 
 
-def picture_png(image: np.ndarray, values: np.ndarray, segmentation: Segmentation) -> bytes:
+def picture_png(image: np.ndarray, labels: np.ndarray, segmentation: Segmentation) -> bytes:
     """Tint a view [H, W, 3] u8 with the colours of its words, and list them below it, as a PNG."""
     from liftcore.query.render import captioned_png
 
     colours = segmentation.colours
-    tinted = np.where(values[..., None] > 0, (0.4 * image + 0.6 * colours[values]).astype(np.uint8), image // 2)
-    pixels = np.bincount(values.ravel(), minlength=len(colours))
+    tinted = np.where(labels[..., None] > 0, (0.4 * image + 0.6 * colours[labels]).astype(np.uint8), image // 2)
+    pixels = np.bincount(labels.ravel(), minlength=len(colours))
     visible = [place for place in np.argsort(-pixels, kind="stable").tolist() if place and pixels[place]]
     lines = [(segmentation.named_words[place - 1].word, colours[place]) for place in visible[:LEGEND_WORDS]]
     return captioned_png(tinted, lines or [("no word is here", colours[0])])

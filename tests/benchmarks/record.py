@@ -207,9 +207,9 @@ def tree(_: RealScene, __: lc.LiftResult, scene: lc.Scene) -> Figures:
 def segmentation(real: RealScene, _: lc.LiftResult, scene: lc.Scene) -> Figures:
     """Words that are there, of the classes and of absent words, and the accuracy of the labels."""
     result = scene.segment([*real.words, *real.recorded["absent words"]], encoder=real.encoder)
-    accuracy = (result.labels == real.owners)[real.counted_splats].mean()
+    accuracy = (result.rows == real.owners)[real.counted_splats].mean()
     words = sorted(label.word for label in result.named_words)
-    return {"words": words, "accuracy": rounded(accuracy), "bits of labels": digest(result.labels)}
+    return {"words": words, "accuracy": rounded(accuracy), "bits of labels": digest(result.rows)}
 
 
 def questions(real: RealScene, _: lc.LiftResult, scene: lc.Scene) -> Figures:

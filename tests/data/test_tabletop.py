@@ -119,8 +119,8 @@ def test_fourteen_words_are_found_among_many(
     segmentation = segment(scene, words + absent, encoder.encode(words + absent))
     assert {label.word for label in segmentation.named_words} == set(words)
     mask = scene.has_feature & (scene.total_weight > 0.5)
-    assert (segmentation.labels == real)[mask].mean() > 0.9
-    seven = segment(scene, words[:7], encoder.encode(words[:7])).labels
+    assert (segmentation.rows == real)[mask].mean() > 0.9
+    seven = segment(scene, words[:7], encoder.encode(words[:7])).rows
     assert (seven[mask & (real >= 7)] < 0).mean() > 0.5
 
 

@@ -69,7 +69,7 @@ def test_what_follows_a_lift_takes_it_from_the_card(paths: list[Path], tmp_path:
     assert np.flatnonzero(answer.selected).tolist() == list(range(20))
     for views in (vectors[0], vectors[0].to("cuda")):
         assert np.array_equal(result.query(views).selected, answer.selected)
-    assert result.scene(splats).segment(WORDS, vectors).labels.tolist() == [number // 20 for number in range(60)]
+    assert result.scene(splats).segment(WORDS, vectors).rows.tolist() == [number // 20 for number in range(60)]
     assert len(result.scene(splats).tree(WORDS, vectors.to("cuda")).objects) == 3
     image = lc.render(splats, cameras["middle"], result.features)
     assert image.shape == (24, 32, 8)
@@ -107,6 +107,6 @@ def test_tensors_of_a_card_come_in(paths: list[Path]) -> None:
         assert lc.plan(splats, {"middle": corner}, {"middle": few}, device=device).views == ("middle",)
     ones = lc.render(splats, cameras["middle"], torch.ones(60).to("cuda"))
     assert torch.equal(ones, lc.render(splats_on_cpu, camera, torch.ones(60)))
-    assert result.scene(splats).segment(WORDS, torch.eye(3, 8).to("cuda")).labels.max() >= 0
+    assert result.scene(splats).segment(WORDS, torch.eye(3, 8).to("cuda")).rows.max() >= 0
     answer = result.query(torch.eye(8)[0].to("cuda"), splats=splats)
     assert splats.means[answer.selected].shape[1] == 3

@@ -39,7 +39,7 @@ RUNS = {  # commands over the lifted tiny scene -> words, and the files that the
     "inspect": ("{lift}", ""),
     "check": ("{s} {c} {f}", ""),
     "query": ("{lift} book --table {w} --scores {out}/s.npy --coloured {out}/c.ply", "s.npy c.ply"),
-    "segment": ("{lift} --table {w} --splat-labels {out}/l.npy --labelled {out}/n.ply", "l.npy n.ply n.ply.json"),
+    "segment": ("{lift} --table {w} --labels {out}/l.npy --labelled {out}/n.ply", "l.npy n.ply n.ply.json"),
     "objects": ("{lift} --table {w} --into {out}/each --csv {out}/t.csv", "each/object-0.ply t.csv"),
     "render": ("{lift} --view left -o {out}/r.png", "r.png"),
     "export": ("{lift} --table {w} -o {out}/e.ply", "e.ply e.ply.json"),

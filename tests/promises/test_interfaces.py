@@ -327,12 +327,12 @@ def test_labels_of_many_words_are_the_same(interfaces: Interfaces) -> None:
     labelled = interfaces.exported("labelled.ply", segmentation, "labelled")
     assert interfaces.written_file("segment", "--labelled", "labelled.ply", *options) == labelled
     labels = [interfaces.post("/query/segment/labels", **body).content]
-    labels.append(interfaces.written_file("segment", "--splat-labels", "labels.npy", *options))
-    assert all(np.array_equal(np.load(io.BytesIO(content)), segmentation.values) for content in labels)
-    assert len(set(segmentation.values.tolist())) >= len(words)
+    labels.append(interfaces.written_file("segment", "--labels", "labels.npy", *options))
+    assert all(np.array_equal(np.load(io.BytesIO(content)), segmentation.labels) for content in labels)
+    assert len(set(segmentation.labels.tolist())) >= len(words)
     maps = [interfaces.post("/query/segment/map", view="left", **body).content]
-    maps.append(interfaces.written_file("segment", "--labels", "map.png", *options, "--view", "left"))
-    maps.append(interfaces.exported("map.png", segmentation, "labels", view="left"))
+    maps.append(interfaces.written_file("segment", "--map", "map.png", *options, "--view", "left"))
+    maps.append(interfaces.exported("map.png", segmentation, "map", view="left"))
     assert all(np.array_equal(pixels_of(content), pixels_of(maps[0])) for content in maps)
 
 

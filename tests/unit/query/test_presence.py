@@ -115,4 +115,4 @@ def test_many_words_follow_the_same_rule(clip: Scene, table: TableEncoder) -> No
     words = ["cat", "sofa", "lamp"]  # without the presence test, some splats would be a sofa
     segmentation = segment(clip, words, table.encode(words))
     assert [label.word for label in segmentation.named_words] == ["cat"]
-    assert set(segmentation.labels.tolist()) <= {-1, 0}
+    assert set(segmentation.rows.tolist()) <= {-1, 0}

@@ -14,7 +14,7 @@ from liftcore.io.splats import read_splats
 from liftcore.query.colours import NO_CLUSTER_COLOUR
 from liftcore.query.render import render
 from liftcore.query.scene import Scene
-from liftcore.query.segment import map_png, picture_png, segment, value_map
+from liftcore.query.segment import label_map, map_png, picture_png, segment
 from liftcore.query.splat_colours import view_colours
 from tests.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH
 
@@ -39,16 +39,16 @@ def test_words_that_are_not_there_name_nothing(clear: Scene) -> None:
     words, vectors = ["apple", "pear", "book", "lamp", "void"], np.stack([EYE[0], between, *EYE[[1, 2, 7]]])
     segmentation = segment(clear, words, vectors)
     assert {label.word for label in segmentation.named_words} == {"apple", "book", "lamp"}
-    assert np.array_equal(segmentation.labels, np.array([0, 2, 3])[CLUSTER])
+    assert np.array_equal(segmentation.rows, np.array([0, 2, 3])[CLUSTER])
 
 
 def test_splats_of_no_word_and_unseen_ones_are_named_none(clear: Scene) -> None:
     segmentation, rest = segment(clear, ["apple", "book"], EYE[:2]), slice(2 * SPLATS_A_CLUSTER, None)
-    assert np.array_equal(segmentation.labels == -1, CLUSTER == 2)
-    assert np.array_equal(segmentation.values == 0, CLUSTER == 2)
+    assert np.array_equal(segmentation.rows == -1, CLUSTER == 2)
+    assert np.array_equal(segmentation.labels == 0, CLUSTER == 2)
     assert not segmentation.margin[rest].any()
     without_feature = Scene(replace(clear.lift, has_feature=torch.arange(COUNT) != 3), clear.splats)
-    assert segment(without_feature, ["apple", "book", "lamp"], EYE[:3]).labels[3] == -1
+    assert segment(without_feature, ["apple", "book", "lamp"], EYE[:3]).rows[3] == -1
     flat = Scene(replace(clear.lift, features=torch.ones(COUNT, CHANNELS)), clear.splats)  # of equal scores
     assert segment(flat, ["apple", "book"], EYE[:2]).named_words == ()
 
@@ -69,16 +69,16 @@ def test_splat_of_no_word_gets_the_one_of_most_of_its_node(clear: Scene) -> None
     lift = replace(clear.lift, features=rows, has_feature=torch.arange(COUNT) != 1)
     without_tree, with_tree = (Scene(replace(lift, **fields), clear.splats) for fields in (dict.fromkeys(tree), tree))
     words = ["apple", "book", "lamp"]
-    assert segment(without_tree, words, EYE[:3]).labels[odd].tolist() == [-1, -1, -1]
+    assert segment(without_tree, words, EYE[:3]).rows[odd].tolist() == [-1, -1, -1]
     segmentation = segment(with_tree, words, EYE[:3])
-    assert segmentation.labels[odd].tolist() == [0, -1, -1]
+    assert segmentation.rows[odd].tolist() == [0, -1, -1]
     assert segmentation.score[0] < 0.2 and segmentation.margin[0] <= 0
-    assert np.array_equal(segmentation.labels[3:], CLUSTER[3:])
+    assert np.array_equal(segmentation.rows[3:], CLUSTER[3:])
 
 
 def test_pictures_show_the_words_of_the_pixels(clear: Scene) -> None:
     segmentation = segment(clear, ["apple", "book"], EYE[:2])
-    values = value_map(clear, segmentation.values, "middle")
+    values = label_map(clear, segmentation.labels, "middle")
     with Image.open(io.BytesIO(map_png(values, segmentation))) as picture:
         assert picture.mode == "P" and np.array_equal(np.asarray(picture), values)
         legend = json.loads(picture.info["legend"])
@@ -95,5 +95,5 @@ def test_coloured_splats_have_the_colours_of_their_words(clear: Scene, tmp_path:
     segmentation = segment(clear, ["apple", "book"], EYE[:2])
     clear.export(tmp_path / "named.ply", segmentation, "coloured")
     colours = view_colours(read_splats(tmp_path / "named.ply"), clear.cameras["middle"]).numpy()
-    np.testing.assert_allclose(255 * colours, segmentation.colours[segmentation.values], atol=1e-2)
+    np.testing.assert_allclose(255 * colours, segmentation.colours[segmentation.labels], atol=1e-2)
     assert tuple(segmentation.colours[0]) == NO_CLUSTER_COLOUR
