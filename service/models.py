@@ -369,9 +369,6 @@ class Question(Query, LiftQuestion):
     like: Examples = _query_field("like")
     negatives: Texts = _query_field("negatives")
     unlike: Examples = _query_field("unlike")
-    what: Literal["object", "scores"] = Field(
-        "object", description="of splats: the selected ones, or all in the colours of their scores"
-    )
 
 
 class QuestionParameters(Question):
@@ -406,9 +403,9 @@ class NamedQuestion(Question):
 class ExportRequest(Words):
     """The labels of a file: the answers of questions, every splat's best word, or the objects of the lift."""
 
-    of: Literal["questions", "words", "objects"] = Field("objects", description="the labels of the content")
+    of: Literal["questions", "words", "objects"] = Field("objects", description="what the labels are of")
     questions: Annotated[list[NamedQuestion], Field(max_length=QUESTIONS, fail_fast=True)] = Field(
-        [], description="for content `questions`: each is a class of the labels"
+        [], description="for `of` questions: each is a class of the labels"
     )
     format: Literal["ply", "glb", "usdz", "names", "masks"] = Field("ply", description="the kind of file")
     view: str | None = Field(
@@ -465,7 +462,7 @@ class NearestWordsAnswer(BestWords, OfLift):
     encoder: str
 
 
-class WordsAnswer(SuggestedWords, OfLift):
+class SuggestedWordsAnswer(SuggestedWords, OfLift):
     """Words that a lift can be queried with."""
 
 
@@ -580,7 +577,7 @@ class Selection(OfLift):
         """Routes of the selection and of its splats."""
         path = f"/lifts/{self.lift}/selections/{self.id}"
         question = f"lift={self.lift}&sets=selection:{self.id}"
-        outputs = {name: f"/query/{name}?{question}" for name in ("splats", "selection")}
+        outputs = {name: f"/query/{name}?{question}" for name in ("object", "selection")}
         return {"self": path, "edits": f"{path}/edits", "query": f"/query?{question}", **outputs}
 
 

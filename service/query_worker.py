@@ -50,13 +50,11 @@ SCENES = 2  # lifts that are kept open
 CACHE_BYTES = 256 << 20  # of answers and views that are kept
 ENTRY_BYTES = 2 << 10  # of what is no array in a cached value: an object, a word
 PIPE_BYTES = 256 << 10  # of a document in the pipe; a larger one is a file, so that a slow client keeps no memory
-DOCUMENTS = ("query", "objects", "segment", "what", "askable", "catalogue", "tree")
+DOCUMENTS = ("query", "objects", "segment", "nearest_words", "suggested_words", "scene_objects", "tree")
 VALUES = ("views", "edit", "count_objects")  # for the HTTP process
 WORD_COSINES = 1 << 31  # of splats times words: about a minute and a half on one core
 MASK_PIXELS = 1 << 26  # of all views of an export: a minute, as for the largest picture
-# Files of many words by operation, and of splats by `what`: what `Scene.blocks_of` calls them
-WORD_FILES = ("labels", "map", "picture")
-SPLATS_FILES = {"object": "object", "scores": "coloured"}
+WORD_FILES = ("labels", "map", "picture")  # of many words
 VIEW_LINKS = ("render", "mask", "attention")  # links of an answer that end with a view
 Request = dict[str, Any]
 
@@ -105,17 +103,17 @@ class Answers:
         self._warm_kernel(Kernel.GAUSSIAN_3D)
 
     def reply(self, request: Request, _: Reporter) -> dict[str, Any]:
-        """Answer by a value or the ``content`` of a document; large ones and files are written to the draft."""
+        """Answer by a value or a ``document``; large ones and files are written to the draft."""
         operation = request["operation"]
         if request["lift"] in self._scenes:  # each request describes its selections, whatever another request set
             self._scenes[request["lift"]].selections.clear()
         if operation in VALUES:
             return getattr(self, operation)(request)
         if operation in DOCUMENTS:
-            content = json_of(request["head"] | getattr(self, operation)(request))
-            if len(content) <= PIPE_BYTES:
-                return {"content": content.decode()}
-            blocks: Iterable[bytes] = [content]
+            document = json_of(request["head"] | getattr(self, operation)(request))
+            if len(document) <= PIPE_BYTES:
+                return {"document": document.decode()}
+            blocks: Iterable[bytes] = [document]
         else:
             blocks = self._file(request)
         with Path(request["draft"]).open("wb") as file:
@@ -221,17 +219,17 @@ class Answers:
     def segment(self, request: Request) -> dict[str, Any]:
         return self._segmentation(request).summary.model_dump(mode="json")
 
-    def what(self, request: Request) -> dict[str, Any]:
+    def nearest_words(self, request: Request) -> dict[str, Any]:
         words, encoder = self._words(request)
         best = self._scene(request).nearest_words(request["example"], words, top=request["top"], encoder=encoder)
         return {"words": [word.model_dump(mode="json") for word in best]}
 
-    def askable(self, request: Request) -> dict[str, Any]:
+    def suggested_words(self, request: Request) -> dict[str, Any]:
         encoder = self._text_encoder(request)
-        words = self._scene(request).askable(request["text"], request["count"], encoder=encoder)
+        words = self._scene(request).suggested_words(request["text"], request["limit"], encoder=encoder)
         return words.model_dump(mode="json")
 
-    def catalogue(self, request: Request) -> dict[str, Any]:
+    def scene_objects(self, request: Request) -> dict[str, Any]:
         tree, labels = self._named_tree(request), request["object_labels"]
         first, last = request["first"], request["first"] + request["count"]
         objects = [
@@ -284,13 +282,12 @@ class Answers:
         if operation == "export":
             return self._export(request)
         if operation == "colours":
-            return scene.blocks_of(scene.colours(request["what"]))
+            return scene.blocks_of(scene.colours(request["layer"]))
         if operation in WORD_FILES:
             return scene.blocks_of(self._segmentation(request), operation, view=view)
         if "query" in request:
             view_mask = self._view_mask(request) if operation in ("mask", "attention") else None
-            kind = SPLATS_FILES[request["what"]] if operation == "splats" else operation
-            return scene.blocks_of(self._answer(request), kind, view=view, view_mask=view_mask)
+            return scene.blocks_of(self._answer(request), operation, view=view, view_mask=view_mask)
         scene = scene.without(request.get("hide", ()))
         blocks = scene.blocks_of(None, request.get("channel", "splats"), view=view)
         return compressed(blocks) if request.get("compressed") else blocks
@@ -299,7 +296,7 @@ class Answers:
         """Return a file with labels: those of answers, of words or of objects."""
         scene = self._scene(request)
         views = scene.metadata.views if request["of_view"] is None else (request["of_view"],)
-        views = views if request["what"] == "masks" else ()
+        views = views if request["content"] == "masks" else ()
         pixels = sum(math.prod(scene.cameras[view].photo_size) for view in views)
         if pixels > MASK_PIXELS:
             expected, got = f"views of at most {MASK_PIXELS} pixels together", f"{pixels} in {len(views)} views"
@@ -313,7 +310,7 @@ class Answers:
             source = self._segmentation(request)
         else:
             source = self._labelled_objects(request)
-        return scene.blocks_of(source, request["what"], view=request["of_view"], suffix=request["suffix"])
+        return scene.blocks_of(source, request["content"], view=request["of_view"], suffix=request["suffix"])
 
     def _labelled_objects(self, request: Request) -> SceneTree:
         """Return the tree of a lift with the names that people gave."""

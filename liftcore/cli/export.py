@@ -61,14 +61,14 @@ def run(options: argparse.Namespace) -> int:
         content = "object"
     elif suffix in (".splat", ".spz") or source is None:
         content, source = "splats", None
-    exports = {"output": partial(scene.export, source=source, what=content)}
+    exports = {"output": partial(scene.export, source=source, content=content)}
     if content == "labelled" and suffix == ".ply":
         files["names"] = options.output.with_name(f"{options.output.name}.json")
         check_outputs(files, options, scene, kind=kind)
-        exports["names"] = partial(scene.export, source=source, what="names")
+        exports["names"] = partial(scene.export, source=source, content="names")
     paths = write_files(files, exports)
     splats = int(scene.members(source).sum()) if isinstance(source, int) else len(scene.features)
-    document: dict[str, Any] = {"files": paths, "splats": splats, "what": content}
+    document: dict[str, Any] = {"files": paths, "splats": splats, "content": content}
     document["world"] = scene.world.model_dump(mode="json")
     if source is not None and not isinstance(source, int) and content != "object":
         labels = scene.labels(source)
@@ -90,7 +90,7 @@ def run_render(options: argparse.Namespace) -> int:
         raise InvalidQuery("--view", expected="a view to render", got="no --view and no --camera")
     scene = common.open_lift(options)
     check_outputs(files, options, scene)
-    paths = write_files(files, {"output": partial(scene.export, what=options.channel, view=view)})
+    paths = write_files(files, {"output": partial(scene.export, content=options.channel, view=view)})
     document = {"channel": options.channel, "out": paths["output"]}
     reply(document, as_json=options.json, lines=[paths["output"]])
     return 0

@@ -36,7 +36,7 @@ def run(options: argparse.Namespace) -> int:
     scene = Scene(options.lift, splats=options.splats, world=world_of(options))
     check_outputs(files, options, scene)
     encoder, tree = named_tree(options, scene)
-    exports: dict[str, Any] = {"csv": partial(scene.export, source=tree, what="csv")}
+    exports: dict[str, Any] = {"csv": partial(scene.export, source=tree, content="csv")}
     if not options.tree:
         tree = tree.model_copy(update={"count": len(tree.objects), "nodes": tree.objects})
     names = {node.id: "-".join(["object", *map(str, node.path)]) for node in tree.nodes}

@@ -78,7 +78,7 @@ def run(options: argparse.Namespace) -> int:
     if options.photo is not None and view_mask is not None:
         photo = read_image(options.photo, view_mask.mask.shape[::-1])[0]
     export = partial(scene.export, source=answer, view=view, view_mask=view_mask, photo=photo)
-    document["files"] = write_files(files, {kind: partial(export, what=kind) for kind in files})
+    document["files"] = write_files(files, {kind: partial(export, content=kind) for kind in files})
     if options.object is not None and options.object.suffix.lower() in LOCAL_SUFFIXES and any(scene.splats.origin):
         document["origin"] = scene.splats.origin
     reply(document, as_json=options.json, lines=_lines(document))

@@ -57,7 +57,7 @@ def run(options: argparse.Namespace) -> int:
     if files or not options.example:
         segmentation = scene.segment(words, encoder=encoder, progress=True)
         document["answer"] = segmentation.summary.model_dump(mode="json")
-        exports = {kind: partial(scene.export, source=segmentation, what=kind, view=view) for kind in files}
+        exports = {kind: partial(scene.export, source=segmentation, content=kind, view=view) for kind in files}
         document["files"] = write_files(files, exports)
     reply(document, as_json=options.json, lines=_lines(document))
     return 0

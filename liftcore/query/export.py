@@ -16,7 +16,6 @@ import numpy as np
 from liftcore.errors import InvalidQuery
 from liftcore.io.labels import document_bytes
 from liftcore.io.splats import blocks_as, labelled, recoloured, some_rows
-from liftcore.query.catalogue import table_csv
 from liftcore.query.coco import masks_json
 from liftcore.query.colours import NOT_SEEN_COLOUR, heat_colours
 from liftcore.query.labels import labels
@@ -24,6 +23,7 @@ from liftcore.query.objects import MOST_SPLATS, objects
 from liftcore.query.question import Answer
 from liftcore.query.scene import Scene
 from liftcore.query.segment import label_map, map_png, picture_png
+from liftcore.query.tree import table_csv
 
 if TYPE_CHECKING:  # these load torch
     from PIL.Image import Image
@@ -65,7 +65,7 @@ def blocks_of(export: Export) -> Iterable[bytes]:
         content = content or by_suffix.get(export.suffix, "")
     content = content or next(iter(files))
     if content not in files:
-        raise InvalidQuery("what", expected=f"one of {', '.join(files)}", got=repr(content))
+        raise InvalidQuery("content", expected=f"one of {', '.join(files)}", got=repr(content))
     return files[content](replace(export, content=content))
 
 

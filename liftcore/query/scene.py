@@ -278,7 +278,7 @@ class Scene:
             words: n, that name them. vectors: [n, F], torch or numpy, their text vectors, of any length above zero.
                 None: the encoder computes them.
         """
-        from liftcore.query.catalogue import tree
+        from liftcore.query.tree import tree
 
         if words and vectors is None:
             vectors = self.encoder(encoder).encode(words)
@@ -345,8 +345,8 @@ class Scene:
             raise InvalidQuery("words", expected=expected, got="none", hint=hint)
         return list(dict.fromkeys(words))
 
-    def askable(self, text: str = "", count: int = 8, *, encoder: AnyEncoder = None) -> SuggestedWords:
-        """Suggest at most ``count`` words that complete a text, and words of the lift's objects.
+    def suggested_words(self, text: str = "", limit: int = 8, *, encoder: AnyEncoder = None) -> SuggestedWords:
+        """Suggest at most ``limit`` words that complete a text, and words of the lift's objects.
 
         Raises:
             InvalidQuery: the lift's text space names no encoder.
@@ -360,13 +360,13 @@ class Scene:
         table = table_of(reader)
         if table is not None:
             scene_words = object_words(self, table.words, table.embeddings)
-            words = tuple(SuggestedWord(**word._asdict()) for word in table.vocabulary.complete(text, count))
+            words = tuple(SuggestedWord(**word._asdict()) for word in table.vocabulary.complete(text, limit))
             return SuggestedWords(open_vocabulary=False, words=words, scene_words=scene_words)
         references = references_of(reader, self.metadata.text_space)
         scene_words = () if isinstance(references, str) else object_words(self, references.words, references.vectors)
         return SuggestedWords(open_vocabulary=True, words=(), scene_words=scene_words)
 
-    def colours(self, what: str) -> np.ndarray:
+    def colours(self, layer: str) -> np.ndarray:
         """Colour all splats by a layer, [P, 3] u8 sRGB.
 
         ``pca`` are three principal components of the features, ``cluster`` a colour a cluster; ``total_weight`` (by
@@ -375,15 +375,15 @@ class Scene:
         Raises:
             InvalidQuery: the lift has no clusters, or no confidence.
         """
-        if what == "pca":
+        if layer == "pca":
             colours = np.round(255 * self.principal.numpy()).astype(np.uint8)
-        elif what == "cluster":
+        elif layer == "cluster":
             clusters = self.layer("cluster")
             colours = cluster_colours(int(clusters.max()) + 1)[clusters]
         else:
-            values = self.layer("confidence" if what == "confidence" else "total_weight").astype(np.float32)
+            values = self.layer("confidence" if layer == "confidence" else "total_weight").astype(np.float32)
             valid = self.has_feature & np.isfinite(values)
-            if what == "total_weight":
+            if layer == "total_weight":
                 valid &= values > 0
                 values = np.log(np.where(valid, values, 1.0))
             colours = heat_colours(values, valid)
@@ -407,19 +407,19 @@ class Scene:
 
         return warm_up_kernel(kernel)
 
-    def export(self, path: Path | str, source: Source = None, what: str = "", **options: Any) -> None:
+    def export(self, path: Path | str, source: Source = None, content: str = "", **options: Any) -> None:
         """Write a file, whole or not at all; arguments and errors as in `blocks_of`, with the suffix of the path."""
         from liftcore.io.files import whole_file
 
         options = {"suffix": Path(path).suffix.lower(), **options}
-        content = self.blocks_of(source, what, **options)
+        blocks = self.blocks_of(source, content, **options)
         with whole_file(Path(path)) as handle:
-            handle.writelines(content)
+            handle.writelines(blocks)
 
     def blocks_of(
         self,
         source: Source = None,
-        what: str = "",
+        content: str = "",
         *,
         view: str | Camera | None = None,
         suffix: str = "",
@@ -432,7 +432,7 @@ class Scene:
         Args:
             source: a query or its answer, answers by names, a segmentation, a tree, the id of an object or another
                 node, or an array; None: the scene.
-            what: of an answer object, coloured, scores, selection, mask, attention or overlay; of a segmentation
+            content: of an answer object, coloured, scores, selection, mask, attention or overlay; of a segmentation
                 coloured, labels, map or picture; of a tree csv, of its objects; of all these labelled
                 (splats with labels), names (of the labels) or masks (COCO's JSON, in the views); of the scene a
                 channel of `render`, or splats; of an array npy. Empty: the first of
@@ -449,7 +449,7 @@ class Scene:
         from liftcore.query.question import Query
 
         source = self._answer(source, encoder) if isinstance(source, str | Query) else source
-        return blocks_of(Export(self, source, what, view, suffix, view_mask, photo))
+        return blocks_of(Export(self, source, content, view, suffix, view_mask, photo))
 
     def _answer(self, query: Query | str | Answer, encoder: AnyEncoder) -> Answer:
         from liftcore.query.question import Answer

@@ -8,7 +8,7 @@ Examples stand in place of words, "more of this":
 | `VIEW:box:x0,y0,x1,y1` | common to the pixels of a box, and not around it; columns x0 up to x1 without x1 |
 | `VIEW:stroke:x0,y0,x1,y1,...` | common to the pixels on the line through these corners, two or more |
 | `splat:J` | the feature of a splat, by its row in the splat file |
-| `object:N` | the mean of an object's features, by its number in the lift (`liftcore.query.catalogue`) |
+| `object:N` | the mean of an object's features, by its number in the lift (`liftcore.query.tree`) |
 | `selection:NAME` | the mean of the features of a selection (`liftcore.query.selections`) |
 
 `liftcore.query.areas` computes features of boxes and strokes. A vector has no notation. Names of views may contain

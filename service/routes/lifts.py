@@ -194,7 +194,7 @@ def list_objects(
 ) -> Response:
     """List the objects of the scene, found by masks when it was lifted; a vocabulary names them."""
     record = deps.store.lift(owner, lift)
-    work = _nodes("catalogue", record, deps, owner, options) | {"object_labels": labels_of(record, deps)}
+    work = _nodes("scene_objects", record, deps, owner, options) | {"object_labels": labels_of(record, deps)}
     return respond(request, deps, work)
 
 
@@ -220,7 +220,7 @@ register_url_convertor("file", OneOf("splats", "colours"))
 
 @router.get("/lifts/{lift}/{file:file}", responses=content_of(BINARY, NPY), response_class=Response)
 def get_viewer_file(
-    lift: str, file: Literal["splats", "colours"], request: Request, deps: Deps, owner: Caller, what: Layer = "pca"
+    lift: str, file: Literal["splats", "colours"], request: Request, deps: Deps, owner: Caller, layer: Layer = "pca"
 ) -> Response:
     """Download what a web viewer draws, with rows as in the lift.
 
@@ -236,4 +236,4 @@ def get_viewer_file(
         answer = respond(request, deps, work, BINARY, f"scene-{record.id}.splat")
         answer.headers.update({"Vary": "Accept-Encoding"} | ({"Content-Encoding": "zstd"} if compressed else {}))
         return answer
-    return respond(request, deps, scene_request("colours", record, deps) | {"what": what}, NPY)
+    return respond(request, deps, scene_request("colours", record, deps) | {"layer": layer}, NPY)

@@ -37,9 +37,9 @@ from service.models import (
     RenderRequest,
     SegmentAnswer,
     SegmentRequest,
+    SuggestedWordsAnswer,
     SuggestedWordsRequest,
     Words,
-    WordsAnswer,
 )
 from service.routes import BINARY, Caller, Deps, OneOf, Parts, cache_headers, content_of, get_and_post, unchanged
 from service.selections import bits_of_selection, get_selection, object_labels
@@ -50,14 +50,15 @@ NO_ENCODER: dict[str, Any] = {"encoder": None, "encoder_version": None}  # of a 
 SELECTION = "selection:"  # prefix of examples that need a stored selection
 NPY, PNG, JSON = "application/x-npy", "image/png", "application/json"
 # The outputs of a question, by name: media type, and what they are; pictures need a view, or a camera in a body
-Output = Literal["objects", "scores", "selection", "mask", "attention", "splats"]
+Output = Literal["objects", "scores", "selection", "mask", "attention", "object", "coloured"]
 OUTPUTS: dict[Output, tuple[str, str]] = {
     "objects": (JSON, "the objects of the answer, groups of splats that touch: the place and size of each"),
     "scores": (NPY, "the score of each splat: float32 [P]"),
     "selection": (NPY, "the selected splats: bool [P]; with `auto` not just those at or above the threshold"),
     "mask": (PNG, "the mask of a view, white where the selection is"),
     "attention": (PNG, "the scores in a view, in colours"),
-    "splats": (BINARY, "the selected splats, or with `what=scores` all in the colours of their scores: a PLY"),
+    "object": (BINARY, "the selected splats: a PLY"),
+    "coloured": (BINARY, "all splats in the colours of their scores: a PLY"),
 }
 PICTURES = ("mask", "attention", "map", "picture")
 WordOutput = Literal["labels", "map", "picture"]
@@ -66,7 +67,7 @@ WORD_OUTPUTS: dict[WordOutput, tuple[str, str]] = {
     "map": (PNG, "these numbers for a view's pixels, with a palette, and words by number as text `legend`"),
     "picture": (PNG, "a view tinted with the colours of its words, beside a legend"),
 }
-# Files with labels, by format: what `Scene.blocks_of` calls them, suffix, media type, and what they are
+# Files with labels, by format: the content (`Scene.blocks_of`), suffix, media type, and what they are
 EXPORTS: dict[str, tuple[str, str, str, str]] = {
     "ply": ("labelled", ".ply", BINARY, "the splats with columns of numbers, which `names` explains"),
     "glb": ("labelled", ".glb", BINARY, "glTF with feature ids and property tables"),
@@ -108,8 +109,8 @@ def respond(
     except BaseException:
         draft.unlink(missing_ok=True)
         raise
-    if "content" in answer:
-        return Response(answer["content"], headers=headers, media_type=media_type)
+    if "document" in answer:
+        return Response(answer["document"], headers=headers, media_type=media_type)
     return DraftResponse(draft, headers=headers, media_type=media_type, filename=filename)
 
 
@@ -226,21 +227,18 @@ def _links(question: Question, lift: str) -> dict[str, str]:
         fields = question.model_dump(mode="json", include=set(names), exclude_defaults=True)
         fields["threshold"] = question.threshold
     links = {"lift": f"/lifts/{lift}", "render": f"/render?lift={lift}"}
-    names = ("scores", "objects", "mask", "attention")
-    for name, output in {**dict(zip(names, names, strict=True)), "object": "splats", "coloured": "splats"}.items():
-        channel = {"what": "scores"} if name == "coloured" else {}
-        links[name] = f"/query/{output}?{urlencode(fields | channel | {'lift': lift}, doseq=True)}"
-    return links
+    address = urlencode(fields | {"lift": lift}, doseq=True)
+    return links | {name: f"/query/{name}?{address}" for name in OUTPUTS if name != "selection"}
 
 
-@router.get("/query/words", response_model=WordsAnswer)
-def query_words(
+@router.get("/query/suggested_words", response_model=SuggestedWordsAnswer)
+def suggested_words(
     words: Annotated[SuggestedWordsRequest, Parameter()], request: Request, deps: Deps, owner: Caller
 ) -> Response:
     """List words: completions of a text, and words for the objects of the scene."""
     lift = deps.store.lift(owner, words.lift)
-    work = with_encoder(scene_request("askable", lift, deps), words, lift, deps, owner)
-    return respond(request, deps, work | {"text": words.text, "count": words.limit, "head": {"lift": lift.id}})
+    work = with_encoder(scene_request("suggested_words", lift, deps), words, lift, deps, owner)
+    return respond(request, deps, work | {"text": words.text, "limit": words.limit, "head": {"lift": lift.id}})
 
 
 @router.post("/query/segment", response_model=SegmentAnswer)
@@ -283,9 +281,9 @@ def export(parameters: ExportRequest, request: Request, deps: Deps, owner: Calle
     elif parameters.of == "words" or parameters.encoder is not None or parameters.table is not None:
         work = word_request("export", parameters, lift, deps, owner)
     name = "-".join(re.findall(r"[A-Za-z0-9]+", " ".join(title)))[:80] or "splats"
-    what, suffix, media_type, _ = EXPORTS[parameters.format]
+    content, suffix, media_type, _ = EXPORTS[parameters.format]
     work |= {"of": parameters.of, "of_view": parameters.view, "object_labels": labels_of(lift, deps)}
-    work |= {"what": what, "suffix": suffix}
+    work |= {"content": content, "suffix": suffix}
     return respond(request, deps, work, media_type, f"{name}-{lift.id}{suffix}")
 
 
@@ -313,11 +311,11 @@ def example_text(example: str | tuple[float, ...]) -> str:
     return example if isinstance(example, str) else f"a vector of {len(example)} channels"
 
 
-@router.post("/query/what", response_model=NearestWordsAnswer)
-def name_example(words: NearestWordsRequest, request: Request, deps: Deps, owner: Caller) -> Response:
+@router.post("/query/nearest_words", response_model=NearestWordsAnswer)
+def nearest_words(words: NearestWordsRequest, request: Request, deps: Deps, owner: Caller) -> Response:
     """List the words nearest to a pixel, a splat or a vector."""
     lift = deps.store.lift(owner, words.lift)
-    work = word_request("what", words, lift, deps, owner) | {"example": words.example, "top": words.top}
+    work = word_request("nearest_words", words, lift, deps, owner) | {"example": words.example, "top": words.top}
     work["head"] |= {"example": example_text(words.example)}
     return respond(request, deps, work)
 
@@ -332,11 +330,11 @@ def query_output(
 ) -> Response:
     """Return an output of a question."""
     lift = deps.store.lift(owner, question.lift)
-    work = query_request(output, question, lift, deps, owner) | {"what": question.what, "head": {"lift": lift.id}}
+    work = query_request(output, question, lift, deps, owner) | {"head": {"lift": lift.id}}
     if output in PICTURES:
         work |= seen_from(question)
-    filename = f"{question.what}-{lift.id}.ply" if output == "splats" else None
-    return respond(request, deps, work, OUTPUTS[output][0], filename)
+    media_type = OUTPUTS[output][0]
+    return respond(request, deps, work, media_type, f"{output}-{lift.id}.ply" if media_type == BINARY else None)
 
 
 @get_and_post(

@@ -150,7 +150,7 @@ def test_click_takes_the_object_and_another_its_patch(page: Browser) -> None:
     page.until(f"{SETS}.length === 2")
     page.until(FIND_COLOUR)
     assert page.value("splatlift.query.current.count") == 40
-    assert page.value("document.querySelectorAll('#catalogue-list [aria-pressed=true]').length") == 2
+    assert page.value("document.querySelectorAll('#scene-objects-list [aria-pressed=true]').length") == 2
     page.press("#reset-view")
     page.until("splatlift.viewer.settled")
     page.press("#scene", *splat_at(page, LAMP))
@@ -183,13 +183,13 @@ def test_objects_unfold_into_parts_by_keyboard_and_by_clicks(
 ) -> None:
     page.open(f"{server.address}/?lift={scene_with_parts}")
     page.until(f"{READY} && splatlift.objects.nodes.size === 5")
-    unfold = "document.querySelector('#catalogue-list [aria-expanded]')"
+    unfold = "document.querySelector('#scene-objects-list [aria-expanded]')"
     assert page.value(f"{unfold}.getAttribute('aria-label')") == "2 parts of lamp"
     page.value(f"{unfold}.focus()")
     page.key("Enter")
-    page.until("document.querySelectorAll('#catalogue-list .parts li').length === 2")
+    page.until("document.querySelectorAll('#scene-objects-list .parts li').length === 2")
     assert page.value(f"document.activeElement === {unfold} && {unfold}.getAttribute('aria-expanded')") == "true"
-    page.press("#catalogue-list .parts .object")
+    page.press("#scene-objects-list .parts .object")
     page.until(f"{SETS}.join() === 'object:3' && {FIND_COLOUR}")
     assert page.value("splatlift.query.current.count") == 10 and text_of(page, "#chips .chip").startswith(
         "part 1 of the lamp"
@@ -214,10 +214,10 @@ def test_objects_unfold_into_parts_by_keyboard_and_by_clicks(
 
 
 def test_object_takes_a_name_by_which_it_is_found(page: Browser, server: PageServer) -> None:
-    first = "document.querySelector('#catalogue-list .object span').firstChild.textContent"
+    first = "document.querySelector('#scene-objects-list .object span').firstChild.textContent"
     page.until("splatlift.objects.items.length === 3")
-    page.press("#catalogue-list [title='Name this object']")
-    page.write("#catalogue-list input", "Garfield")
+    page.press("#scene-objects-list [title='Name this object']")
+    page.write("#scene-objects-list input", "Garfield")
     page.key("Enter")
     page.until(f"{first} === 'Garfield'")
     page.open(server.address)
@@ -232,8 +232,8 @@ def test_hidden_object_is_neither_drawn_nor_clicked(page: Browser, server: PageS
     page.until("splatlift.objects.items.length === 3")
     place = splat_at(page, LAMP)
     assert max(columns(page)) > 60
-    page.press("#catalogue-list [aria-label='Hide lamp']")
-    page.until("document.querySelectorAll('#catalogue-list li').length === 2")
+    page.press("#scene-objects-list [aria-label='Hide lamp']")
+    page.until("document.querySelectorAll('#scene-objects-list li').length === 2")
     for _ in range(2):
         page.until("splatlift.viewer.settled")
         assert max(columns(page)) < 60
@@ -241,9 +241,9 @@ def test_hidden_object_is_neither_drawn_nor_clicked(page: Browser, server: PageS
         page.until("document.querySelector('#toast').textContent === 'There is no splat at this point.'")
         page.open(server.address)  # for good
         page.until(f"{READY} && splatlift.objects.items.length === 3")
-        assert page.value("document.querySelectorAll('#catalogue-list li').length") == 2
-    page.press("#catalogue-hidden")
-    page.press("#catalogue-list [aria-label='Show lamp']")
+        assert page.value("document.querySelectorAll('#scene-objects-list li').length") == 2
+    page.press("#scene-objects-hidden")
+    page.press("#scene-objects-list [aria-label='Show lamp']")
     page.until("!splatlift.objects.items.some(object => object.hidden) && splatlift.viewer.settled")
     assert max(columns(page)) > 60
 
@@ -414,7 +414,7 @@ def test_link_opens_question_layer_and_camera_again(page: Browser, server: PageS
     page.key("ArrowRight")
     page.press("#tab-look")
     page.press("#panel-look input[value=pca]")
-    page.until("location.search.includes('what=pca')")
+    page.until("location.search.includes('layer=pca')")
     link, place = page.value("location.href"), page.value("splatlift.viewer.place3d")
     page.open("about:blank#")
     page.open(link)
@@ -423,7 +423,7 @@ def test_link_opens_question_layer_and_camera_again(page: Browser, server: PageS
     assert page.value(WORDS) == ["apple", "lamp"] and page.value("splatlift.layers.layerName") == "pca"
     assert page.value("splatlift.viewer.place3d") == pytest.approx(place, rel=1e-3, abs=1e-3)
     rest = "instances=2&keep=largest&odd=1"
-    page.open(f"{server.address}/?lift={server.lift}&view=right&text=apple&threshold=0.5&what=odd&show=odd&{rest}")
+    page.open(f"{server.address}/?lift={server.lift}&view=right&text=apple&threshold=0.5&layer=odd&show=odd&{rest}")
     page.until(READY)
     page.until(FIND_COLOUR)
     assert page.value("[splatlift.layers.view.name, splatlift.query.current.cut]") == ["right", 0.5]
@@ -511,7 +511,7 @@ def test_lines_to_take_away_ask_the_same(page: Browser) -> None:
     exec(text_of(page, "#python"), names)  # over HTTP, as this encoder is a table of the server
     assert names["answer"]["count"] == page.value("splatlift.query.current.count") > 0
     assert names["answer"]["threshold"]["value"] == pytest.approx(page.value("splatlift.query.current.cut"))
-    addresses = ["object", "boxes", "mask", "scores"]
+    addresses = ["object", "objects", "mask", "scores"]
     requests = (
         f"{json.dumps(addresses)}.map(what => fetch(splatlift.exporter.address(what)).then(reply => reply.status))"
     )
@@ -561,7 +561,7 @@ def test_shared_scene_is_asked_by_its_link_and_changed_by_nobody(browser: Browse
         browser.until(f"{READY} && document.querySelector('#whose').textContent.startsWith('Shared with Bob until')")
         assert browser.value("location.href").startswith(f"{server.address}/?lift={server.lift}")
         assert link.partition("#key=")[2] not in browser.value("location.href + document.cookie")
-        for selector in ("#tab-bring", "#sharing", "#by-hand", "#catalogue-list .edit"):
+        for selector in ("#tab-bring", "#sharing", "#by-hand", "#scene-objects-list .edit"):
             visible_columns = f"[...document.querySelectorAll('{selector}')].some(one => one.checkVisibility())"
             assert browser.value(visible_columns) is False, selector
         ask(browser, "lamp")

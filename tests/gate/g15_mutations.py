@@ -115,8 +115,8 @@ def valid_requests(lift: str, body: dict[str, Any]) -> list[Request]:
     order = {name: body[name] for name in ("splats", "cameras", "features")}
     reads = [
         ("/query", query | {"top": 3, "threshold": "auto"}), ("/query", {"lift": lift, "like": "v1:16,12"}),
-        ("/query/objects", query), ("/query/mask", query | view), ("/query/scores", query), ("/query/splats", query),
-        ("/query/words", {"lift": lift, "table": body["table"]}), ("/render", view | {"channel": "rgb"}),
+        ("/query/objects", query), ("/query/mask", query | view), ("/query/scores", query), ("/query/object", query),
+        ("/query/suggested_words", {"lift": lift, "table": body["table"]}), ("/render", view | {"channel": "rgb"}),
         ("/lifts", {"limit": 2}), (f"/lifts/{lift}", {}), (f"/lifts/{lift}/features", {}),
         (f"/lifts/{lift}/objects", {"limit": 2}), (f"/lifts/{lift}/tree", {}), (f"/lifts/{lift}/selections", {}),
         ("/assets", {"limit": 2}), (f"/assets/{body['splats']}", {}), (f"/assets/{body['splats']}/content", {}),

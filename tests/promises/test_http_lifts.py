@@ -62,12 +62,12 @@ def test_downloaded_lift_is_the_file_that_the_library_reads(
 
 
 def test_each_splat_has_a_colour_of_its_features(client: httpx.Client, lift: dict[str, Any]) -> None:
-    colours = array(client.get(f"/lifts/{lift['id']}/colours", params={"what": "pca"}).content)
+    colours = array(client.get(f"/lifts/{lift['id']}/colours", params={"layer": "pca"}).content)
     assert (colours.shape, colours.dtype) == ((COUNT, 3), np.uint8)
     means = colours.reshape(3, SPLATS_A_CLUSTER, 3).mean(axis=1)  # of three words, which lie apart
     assert min(np.abs(means[a] - means[b]).max() for a, b in ((0, 1), (0, 2), (1, 2))) > 60
     for wrong in ("cluster", "magic"):  # this lift has no clusters
-        assert assert_problem(client.get(f"/lifts/{lift['id']}/colours", params={"what": wrong}), 422)["argument"]
+        assert assert_problem(client.get(f"/lifts/{lift['id']}/colours", params={"layer": wrong}), 422)["argument"]
 
 
 def test_views_have_the_cameras_of_their_file(client: httpx.Client, lift: dict[str, Any]) -> None:

@@ -100,7 +100,7 @@ def test_nothing_selected_is_said_and_has_no_splats(client: httpx.Client, lift: 
     answer = client.get("/query", params=fields).json()
     assert (answer["count"], answer["clear"], answer["box"]) == (0, False, None)
     assert "object" not in answer["links"]
-    problem = assert_problem(client.get("/query/splats", params=fields), 422)
+    problem = assert_problem(client.get("/query/object", params=fields), 422)
     assert "threshold" in problem["hint"]
 
 
@@ -159,9 +159,14 @@ def test_uploaded_table_answers_and_completes(client: httpx.Client, lift: dict[s
     fields = {"lift": lift["id"], "table": table}
     problem = assert_problem(client.get("/query", params=fields | {"text": "boaat"}), 422)
     assert (problem["argument"], problem["nearest"]) == ("text.0", ["boat"])
-    words = client.get("/query/words", params=fields | {"text": "no"}).json()
+    path = "/query/suggested_words"
+    words = client.get(path, params=fields | {"text": "no"}).json()
     assert [entry["word"] for entry in words["words"]] == ["novel"]
-    assert set(client.get("/query/words", params=fields).json()["scene_words"]) == {"fruit", "novel", "light"}
+    assert set(client.get(path, params=fields).json()["scene_words"]) == {
+        "fruit",
+        "novel",
+        "light",
+    }
     assert_problem(client.get("/query", params=fields | {"text": "light", "encoder": "default"}), 422)
     assert_problem(client.get("/query", params=fields | {"text": "light", "table": lift["splats"]}), 422)
     for words in ([], ["novel", "novel"], ["zeppelin"]):

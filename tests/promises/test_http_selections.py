@@ -74,7 +74,7 @@ def test_selection_of_bits_is_asked_exported_and_an_example(
     assert answer["count"] == 3
     for name, link in answer["links"].items():
         assert client.get(link).status_code == 200, name
-    assert b"element vertex 3\n" in client.get(selection["links"]["splats"]).content[:200]
+    assert b"element vertex 3\n" in client.get(selection["links"]["object"]).content[:200]
     like = {"lift": lift["id"], "like": f"selection:{selection['id']}"}
     assert client.get("/query", params=like).json()["count"] > 10
     edit_of(client, selection, operation="set", query={"sets": ["object:0"]})

@@ -109,9 +109,9 @@ class Interfaces:
         assert self.command(name, *words, option, path) is not None
         return path.read_bytes()
 
-    def exported(self, file: str, source: Any, what: str = "", **options: Any) -> bytes:
+    def exported(self, file: str, source: Any, content: str = "", **options: Any) -> bytes:
         """Return the file that the library writes."""
-        self.scene.export(self.folder / file, source, what, **options)
+        self.scene.export(self.folder / file, source, content, **options)
         return (self.folder / file).read_bytes()
 
     def ask(self, fields: dict[str, Any]) -> lc.Answer | None:
@@ -277,11 +277,11 @@ def test_hidden_objects_are_left_out_of_pictures(interfaces: Interfaces) -> None
 def test_splats_of_an_answer_are_the_same_files(interfaces: Interfaces) -> None:
     fields = {"text": ["lamp"], "threshold": 0.5}
     answer, words = interfaces.ask(fields), [*words_of(fields), *encoder_of(interfaces, fields)]
-    for what, option, kind in (("object", "--object", "object"), ("scores", "--coloured", "coloured")):
-        expected = interfaces.exported("out.ply", answer, kind)
-        assert interfaces.written_file("query", option, "out.ply", *words) == expected
+    for name in ("object", "coloured"):
+        expected = interfaces.exported("out.ply", answer, name)
+        assert interfaces.written_file("query", f"--{name}", "out.ply", *words) == expected
         for send in (interfaces.get, interfaces.post):
-            assert send("/query/splats", what=what, **fields).content == expected
+            assert send(f"/query/{name}", **fields).content == expected
     count = len(lc.read_splats(interfaces.folder / "out.ply").means)
     assert count == len(interfaces.scene.features)
 
@@ -308,7 +308,7 @@ def test_objects_and_their_tree_are_the_same_lists(interfaces: Interfaces) -> No
 
 def test_splats_of_an_object_are_the_same_file(interfaces: Interfaces) -> None:
     expected = interfaces.exported("object.ply", 1)
-    assert interfaces.get("/query/splats", sets="object:1").content == expected
+    assert interfaces.get("/query/object", sets="object:1").content == expected
     assert interfaces.written_file("export", "-o", "object.ply", "--object", 1) == expected
     assert len(lc.read_splats(interfaces.folder / "object.ply").means) == interfaces.scene.members(1).sum() > 0
 
@@ -340,7 +340,9 @@ def test_labels_of_many_words_are_the_same(interfaces: Interfaces) -> None:
 def test_nearest_words_of_an_example_are_the_same(interfaces: Interfaces, example: str) -> None:
     nearest = interfaces.scene.nearest_words(example, encoder=interfaces.encoder)
     expected = [document_of(word) for word in nearest]
-    assert interfaces.post("/query/what", example=example, table=interfaces.table).json()["words"] == expected
+    assert (
+        interfaces.post("/query/nearest_words", example=example, table=interfaces.table).json()["words"] == expected
+    )
     options = ("--example", example, "--table", interfaces.files["table"])
     output = interfaces.command("segment", *options)
     assert output is not None and output["examples"] == [{"example": example, "words": expected}]

@@ -4,7 +4,7 @@ import { fetchAnswer, heatOf, questionLabel, linkedQuestions, paintedQuestions }
 import { byId, formatCount, el, notify } from "./dom.js";
 import { fetchBytes, problemText } from "./service.js";
 
-const RIGHT_PARAMETERS = ["beside", "camera", "show", "view", "what"]; // that the left side leaves out
+const RIGHT_PARAMETERS = ["beside", "camera", "layer", "show", "view"]; // that the left side leaves out
 
 export class Comparison {
   // viewer(): the viewer of the right side. createViewer(canvas): one for the left. currentLink(): the link of the page.

@@ -18,9 +18,8 @@ export class ExportPanel {
   address(kind) {
     const question = this.query.current;
     const view = this.layers.view?.name;
-    const path = { scores: "/query/scores", mask: "/query/mask", object: "/query/splats", boxes: "/query/objects" }[kind];
-    const options = { mask: { view }, object: { what: "object" } }[kind] || {};
-    return `${path}?${this.query.requestParameters(question, options)}`;
+    const options = kind === "mask" ? { view } : {};
+    return `/query/${kind}?${this.query.requestParameters(question, options)}`;
   }
 
   // Save a file with all questions or labels; with ofObjects, with the objects of the scene.
@@ -46,10 +45,10 @@ export class ExportPanel {
     const view = this.layers.view?.name;
     const [path, body, fileName] = {
       labels: ["/query/segment/labels", this.labelBody(), "words.npy"], map: ["/query/segment/map", this.labelBody(view), `words-${view}.png`],
-      legend: ["/query/segment/picture", this.labelBody(view), `legend-${view}.png`],
+      picture: ["/query/segment/picture", this.labelBody(view), `legend-${view}.png`],
     }[kind] || [];
     const title = this.query.current ? questionLabel(this.query.current) : "scene";
-    const name = fileName || { scores: `${title}-scores.npy`, mask: `${title}-${this.layers.view?.name}.png`, object: `${title}.ply`, boxes: `${title}-boxes.json` }[kind];
+    const name = fileName || { scores: `${title}-scores.npy`, mask: `${title}-${this.layers.view?.name}.png`, object: `${title}.ply`, objects: `${title}-boxes.json` }[kind];
     try {
       await download(path || this.address(kind), name.replaceAll(/[/\\:*?"<>|]/g, "-"), body, true);
     } catch (problem) {

@@ -107,7 +107,7 @@ export class LayerPanel {
     }
     try {
       const { lift } = this;
-      if (!this.colourCache.has(name)) this.colourCache.set(name, readNpy(await fetchBytes(`/lifts/${lift.id}/colours?what=${name}`)));
+      if (!this.colourCache.has(name)) this.colourCache.set(name, readNpy(await fetchBytes(`/lifts/${lift.id}/colours?layer=${name}`)));
       if (lift !== this.lift || name !== this.layerName) return;
       this.layerColours = this.colourCache.get(name);
       this.onChange();

@@ -156,7 +156,7 @@ function sliderRested() {
 function link() {
   if (!lift || isOpening || isNavigating) return;
   const parameters = linkParameters();
-  const fixed = ["view", "what", "show", "hide", "camera", "heat"];
+  const fixed = ["view", "layer", "show", "hide", "camera", "heat"];
   const state = String([...parameters].filter(([name]) => !fixed.includes(name)));
   const isPending = query.questions.some(question => !question.answer && !question.problem);
   if (historyState !== null && historyState !== state && isPending) return; // the answer will make the entry
@@ -170,7 +170,7 @@ function linkParameters() {
   query.link(parameters);
   editor.link(parameters);
   labels.link(parameters);
-  if (layers.layerName !== "rgb") parameters.set("what", layers.layerName);
+  if (layers.layerName !== "rgb") parameters.set("layer", layers.layerName);
   if (layers.mode !== "scene" && !layers.fallback) parameters.set("show", layers.mode);
   if (byId("hide").checked) parameters.set("hide", "1");
   if (viewer?.mesh) parameters.set("camera", viewer.place3d.map(value => Number(value.toPrecision(5))).join(","));
@@ -299,7 +299,7 @@ async function open(id, fresh = false) {
     if (content) await loadSplats(content, parameters);
     describeScene();
     showWarnings(lift);
-    if (parameters.has("what")) await layers.setLayer(parameters.get("what"));
+    if (parameters.has("layer")) await layers.setLayer(parameters.get("layer"));
     layers.setMode(parameters.get("show") || (layers.fallback ? "view" : "scene"));
     byId("hide").checked = parameters.has("hide");
     showLoading(null);

@@ -13,12 +13,12 @@ export class ObjectList {
   // shows most of the box. namesByTerm: a Map of names of objects and selections. onHide(splats): hidden splats changed.
   constructor({ selectSets, selectedSets, flyToBox, namesByTerm, onHide }) {
     Object.assign(this, { selectSets, selectedSets, flyToBox, namesByTerm, onHide, items: [], selections: [], nodes: new Map(), openNodes: new Set() });
-    byId("catalogue-hidden").addEventListener("click", () => { this.showsHidden = !this.showsHidden; this.render(); });
+    byId("scene-objects-hidden").addEventListener("click", () => { this.showsHidden = !this.showsHidden; this.render(); });
   }
 
   async setLift(lift) {
     Object.assign(this, { lift, items: [], selections: [], nodes: new Map(), openNodes: new Set(), showsHidden: false });
-    byId("catalogue-most").textContent = "";
+    byId("scene-objects-most").textContent = "";
     this.render();
     if (lift) fetchJson(`/lifts/${lift.id}/selections`).then(({ selections }) => { if (lift === this.lift) this.setObjects(this.items, selections); }).then(() => this.render(), () => {});
     if (!lift?.links.objects) return; // old lifts have no objects
@@ -26,7 +26,7 @@ export class ObjectList {
       const { objects, encoderQuery, total } = await fetchObjects(lift);
       if (lift === this.lift) this.setObjects(objects);
       this.hideSplats();
-      if (lift === this.lift && total > objects.length) byId("catalogue-most").textContent = `The first ${formatCount(objects.length)} of ${formatCount(total)} objects. Click in the scene to select others.`;
+      if (lift === this.lift && total > objects.length) byId("scene-objects-most").textContent = `The first ${formatCount(objects.length)} of ${formatCount(total)} objects. Click in the scene to select others.`;
       this.render();
       const { nodes } = objects.length && lift.links.tree ? await fetchJson(`${lift.links.tree}?limit=${MAX_NODES}${encoderQuery}`) : { nodes: [] };
       if (lift === this.lift) this.nodes = new Map(nodes.map(node => [node.id, node]));
@@ -82,19 +82,19 @@ export class ObjectList {
     const selected = this.selectedSets();
     const visible = this.items.filter(object => !this.isBackground(object) && (this.showsHidden || !object.hidden));
     const hidden = this.items.filter(object => object.hidden).length;
-    byId("catalogue").hidden = !this.items.length && !this.selections.length;
-    byId("catalogue-own").replaceChildren(...this.selections.map(selection => el("li", {},
+    byId("scene-objects").hidden = !this.items.length && !this.selections.length;
+    byId("scene-objects-own").replaceChildren(...this.selections.map(selection => el("li", {},
       el("button", { type: "button", className: "object", "aria-pressed": String(selected.includes(`selection:${selection.id}`)), on: { click: event => this.selectSelection(selection, event.shiftKey) } },
         el("span", {}, selection.name, el("small", {}, `${plural(selection.count, "splat")}, selection`))),
       confirmButton("Delete", () => this.deleteSelection(selection.id)))));
-    byId("catalogue-hidden").hidden = !hidden;
-    byId("catalogue-hidden").textContent = this.showsHidden ? "Hide the hidden objects" : `Show ${plural(hidden, "hidden object")}`;
+    byId("scene-objects-hidden").hidden = !hidden;
+    byId("scene-objects-hidden").textContent = this.showsHidden ? "Hide the hidden objects" : `Show ${plural(hidden, "hidden object")}`;
     const focusedId = document.activeElement?.dataset.unfolds; // the button is replaced
-    byId("catalogue-list").replaceChildren(...visible.map(object => el("li", { className: object.hidden ? "hidden-object" : "" }, ...this.objectButtons(object, selected),
+    byId("scene-objects-list").replaceChildren(...visible.map(object => el("li", { className: object.hidden ? "hidden-object" : "" }, ...this.objectButtons(object, selected),
       el("button", { type: "button", className: "plain edit", title: "Name this object", "aria-label": `Name ${object.title}`, on: { click: event => this.editName(object, event.target.closest("li")) } }, "\u270e"),
       el("button", { type: "button", className: "plain edit", "aria-label": `${object.hidden ? "Show" : "Hide"} ${object.title}`, on: { click: () => this.changeObject(object, { hidden: !object.hidden }) } }, object.hidden ? "Show" : "Hide"),
       ...this.partList(object, selected))));
-    if (focusedId) byId("catalogue-list").querySelector(`[data-unfolds="${focusedId}"]`)?.focus();
+    if (focusedId) byId("scene-objects-list").querySelector(`[data-unfolds="${focusedId}"]`)?.focus();
   }
 
   // The button that selects an object or a part, after the one that shows its parts, if it has any.

@@ -57,7 +57,7 @@ export class QueryPanel {
   // Completions of a typed text, and words of the scene's objects. Each text is requested once.
   suggestWords(text) {
     const { lift, completionCache: cache } = this;
-    if (!cache.has(text)) cache.set(text, fetchJson(`/query/words?${queryString({ lift: lift.id, text, limit: MAX_COMPLETIONS })}`));
+    if (!cache.has(text)) cache.set(text, fetchJson(`/query/suggested_words?${queryString({ lift: lift.id, text, limit: MAX_COMPLETIONS })}`));
     return cache.get(text);
   }
 

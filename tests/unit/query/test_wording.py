@@ -134,5 +134,5 @@ def test_words_of_the_scene_are_suggested_for_an_unknown_one(scene: Scene) -> No
     with pytest.raises(InvalidQuery) as info:
         scene.ask("sky", encoder=table)
     assert set(info.value.nearest or ()) == {"apple", "book", "lamp"}  # what is in the scene
-    assert scene.askable("ap", encoder=table).words[0].word == "apple"
-    assert set(scene.askable(encoder=table).scene_words) == {"apple", "book", "lamp"}
+    assert scene.suggested_words("ap", encoder=table).words[0].word == "apple"
+    assert set(scene.suggested_words(encoder=table).scene_words) == {"apple", "book", "lamp"}

@@ -17,7 +17,6 @@ from liftcore.io.splats import read_places, read_splats
 from liftcore.io.spz import spz_blocks
 from liftcore.lifting.planning.views import visibility
 from liftcore.query.ask import ask
-from liftcore.query.catalogue import table_csv, tree
 from liftcore.query.labels import labels
 from liftcore.query.objects import objects
 from liftcore.query.question import Query
@@ -25,6 +24,7 @@ from liftcore.query.render import expected_depth, render
 from liftcore.query.scene import Scene
 from liftcore.query.segment import segment
 from liftcore.query.terms import Vector
+from liftcore.query.tree import table_csv, tree
 from liftcore.scene.cameras import Camera, Cameras, viewmat_of
 from liftcore.scene.compositing import CompositingParams
 from liftcore.scene.kernel import Kernel
