@@ -169,7 +169,7 @@ def _run_steps(
     if settings.finds_objects(statistics.masks):
         with timings.stage("objects"):
             objects, node_vectors = algebra.find_objects()
-    levels_apart = node_vectors is not None and node_vectors.levels_disagree and len(views) >= MIN_LEVEL_VIEWS
+    levels_apart = node_vectors is not None and node_vectors.must_separate and len(views) >= MIN_LEVEL_VIEWS
     if settings.robust:
         if statistics.masks:
             with timings.stage("consensus"):

@@ -27,7 +27,7 @@ from liftcore.query.presence import LEAST_WORDS, References, estimate_presence, 
 from liftcore.query.question import LabelSummary, NamedSplats
 from liftcore.query.scene import Scene, as_numpy
 from liftcore.query.scores import cosines
-from liftcore.query.selection import CompetingWords, levels_disagree, part_nodes
+from liftcore.query.selection import CompetingWords, asks_nodes, part_nodes
 from liftcore.query.threshold import find_threshold
 from liftcore.runtime.one_line import one_line
 from liftcore.runtime.one_thread import one_thread
@@ -183,7 +183,7 @@ def segment(
 def _parts(scene: Scene, unit: np.ndarray, references: References | str | None) -> np.ndarray:
     """Return the nodes of parts that each of some words [n, F] f32 names, [n, N] bool."""
     mask = np.zeros((len(unit), 0 if scene.node_parents is None else len(scene.node_parents)), np.bool_)
-    if isinstance(references, References) and levels_disagree(scene):
+    if isinstance(references, References) and asks_nodes(scene):
         queries = (CompetingWords.among(references, word[None]) for word in unit)
         for row, nodes in enumerate(part_nodes(scene, queries)):
             mask[row, nodes] = True

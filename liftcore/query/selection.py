@@ -43,8 +43,8 @@ SAMPLED = 256  # splats sampled from each octave of the ranking: a million splat
 MOSTLY_SELECTED = 2 / 3  # share of an object's total weight from which it is mostly selected
 PARTLY_SELECTED = 1 / 3  # share of an object's total weight below which its mean does not represent the selected part
 LEAST_FIRST = 0.1  # of the total weight at which the word is the nearest of all, that a clear answer selects
-LEVELS_AGREE = 0.9  # cosine of parts and wholes, about the mean, from which levels have one meaning; equal ones: .95.
-# Lifting separates levels below .8 alone: that costs a pass a level, and asking nodes in place of splats nothing.
+ONE_MEANING = 0.9  # cosine of parts and wholes, about the mean, from which words ask splats, not nodes; equal: .95.
+# A lift separates levels below .8 (`solve.objects.SEPARATE_BELOW`): that costs a pass a level, and nodes nothing.
 SAME_WORD = 1 - 1e-4  # cosine from which two words of a table are one
 _BLOCK = 1 << 10  # splats that are compared with a pack's words at once: as many as fit the CPU cache
 
@@ -194,10 +194,10 @@ def correct_by_objects(scene: Scene, selected: np.ndarray, competitors: Competin
     return corrected, ", ".join(clauses)
 
 
-def levels_disagree(scene: Scene) -> bool:
+def asks_nodes(scene: Scene) -> bool:
     """Return True if masks of parts and of wholes differ in meaning: then a splat's feature, their sum, has both."""
     level_agreement = (scene.metadata.diagnostics.get("objects") or {}).get("level_agreement")
-    return level_agreement is not None and level_agreement < LEVELS_AGREE
+    return level_agreement is not None and level_agreement < ONE_MEANING
 
 
 def part_nodes(scene: Scene, queries: Iterable[CompetingWords]) -> Iterator[list[int]]:
@@ -209,12 +209,12 @@ def part_nodes(scene: Scene, queries: Iterable[CompetingWords]) -> Iterator[list
     more than halfway from that whole to that part have the same name.
     """
     parents, features = scene.node_parents, scene.node_features
-    if parents is None or features is None or not levels_disagree(scene):
+    if parents is None or features is None or not asks_nodes(scene):
         yield from ([] for _ in queries)
         return
     vectors, paths = features.astype(np.float32), scene.node_paths
     has_vector = np.linalg.norm(vectors, axis=1) > 0
-    is_alike = (parents >= 0) & (_about(scene, vectors[parents], vectors) >= LEVELS_AGREE)
+    is_alike = (parents >= 0) & (_about(scene, vectors[parents], vectors) >= ONE_MEANING)
     from_the_largest = sorted(range(len(parents)), key=lambda node: len(paths[node]))
     widest = np.arange(len(parents))  # the largest node of the same meaning above each, or itself
     for node in from_the_largest:

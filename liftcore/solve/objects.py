@@ -40,7 +40,7 @@ OBSERVES = 0.3  # share of a region that a level must see to observe it, as for 
 CONTAINS = 0.7  # of the visible share of a region; with less, the region lies across two others
 SAME_SPLATS = 0.9  # share of a whole's splats from which a part is that whole
 MOST_OF_SCENE = 0.8  # share of all splats; a larger root separates nothing
-SAY_THE_SAME = 0.8  # cosine of parts and wholes; .95 and more for masks with the same name
+SEPARATE_BELOW = 0.8  # cosine of parts and wholes; .95 and more for masks with the same name
 MOST_REGIONS = 1 << 12
 FEWEST_VIEWS = 16  # that provide nodes, if there are as many, for any number of regions
 MOST_SPLATS = 1 << 11  # of a region, evenly chosen, which estimate its shares
@@ -297,9 +297,9 @@ class NodeVectors:
     level_agreement: float | None  # cosine of parts and their wholes, less the scene's mean; None without parts
 
     @property
-    def levels_disagree(self) -> bool:
-        """True if vectors of objects and of their parts differ."""
-        return self.level_agreement is not None and self.level_agreement < SAY_THE_SAME
+    def must_separate(self) -> bool:
+        """True if vectors of objects and of their parts differ so much that a lift separates the levels."""
+        return self.level_agreement is not None and self.level_agreement < SEPARATE_BELOW
 
     @classmethod
     def of(cls, codebook: Codebook, totals: np.ndarray, objects: RegionObjects) -> "NodeVectors":
@@ -355,7 +355,7 @@ def object_facts(objects: RegionObjects, vectors: NodeVectors) -> dict[str, Any]
         largest = int(shares.argmax())
         rest = "objects are its parts" if largest >= objects.count else "it has no parts: use finer masks"
         warnings.append(f"masks hold {facts['largest_share']:.0%} of the splats together as one object; {rest}")
-    if vectors.levels_disagree:
+    if vectors.must_separate:
         warnings.append(
             f"masks of objects and of their parts have different vectors (cosine "
             f"{vectors.level_agreement:.2f}), and a splat's feature is the sum of both: query nodes of the tree, "

@@ -21,7 +21,7 @@ denominators, ``has_feature`` and total weight do not change. There are no tuned
 
 **Levels are separate where they disagree.** A whole and its part may have different vectors, and both are correct:
 their sum is neither, and at every border objects with the same vector on two levels would outvote the others. Where
-masks of parts and wholes differ (`NodeVectors.levels_disagree`), the step runs once a level, with W of this level
+masks of parts and wholes differ (`NodeVectors.must_separate`), the step runs once a level, with W of this level
 alone, so each level keeps its weight at each splat. Cells of grids are one level. Levels that agree are compared
 together, as each adds an observation, which matters with few views.
 
