@@ -52,6 +52,10 @@ class InvalidRequest(ServiceError):
     kind = "invalid-request"
 
 
+class OutOfTime(InvalidRequest):
+    """A file or a request whose process takes more seconds than it may."""
+
+
 class MalformedRequest(ServiceError):
     """A body that is not JSON, or a part of a file; or a request whose end a proxy may see elsewhere."""
 

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import IO, Any, BinaryIO, NamedTuple
 
 from liftcore.errors import SplatliftError
-from service.errors import FULL, Busy, Fault, InvalidRequest, NoSpace, ProcessDied, fault_of
+from service.errors import FULL, Busy, Fault, InvalidRequest, NoSpace, OutOfTime, ProcessDied, fault_of
 
 TASKS = "service.tasks"  # what a spare child has imported
 TICK_SECONDS = 0.2  # until a cancel, a stop or a limit is noticed
@@ -61,6 +61,7 @@ class Ending(NamedTuple):
     last: Message | None
     reason: str = ""
     was_killed: bool = False  # from outside: the order need not be to blame
+    was_late: bool = False  # it took more seconds than it may
 
 
 class Child:
@@ -204,12 +205,12 @@ class Children:
         child, last = self._take(), None
         if not reusable:
             self._keep(None)  # for checks beside it, and for the next job
-        deadline = time.monotonic() + seconds
+        deadline, late = time.monotonic() + seconds, f"it took more than {seconds:g} s"
 
         def reason_now() -> str:
             if self.stopping.is_set():
                 return "the server stops"
-            return f"it took more than {seconds:g} s" if time.monotonic() > deadline else why_end()
+            return late if time.monotonic() > deadline else why_end()
 
         reasons = list[str]()
         try:
@@ -233,9 +234,9 @@ class Children:
             return Ending(last)
         ending = f"signal {-status}" if status < 0 else f"status {status}"
         was_killed = reasons == [STOPPED] or (not reasons and status == -signal.SIGKILL)
-        return Ending(None, "".join(reasons) or f"its process ended with {ending}", was_killed)
+        return Ending(None, "".join(reasons) or f"its process ended with {ending}", was_killed, reasons == [late])
 
-    def check(self, order: Message, seconds: float, argument: str) -> Message:
+    def result_of(self, order: Message, seconds: float, argument: str) -> Message:
         """Return the result of an order that a request waits for. After a kill from outside it is sent again.
 
         All tries together have the seconds.
@@ -253,7 +254,8 @@ class Children:
             raise Busy(
                 argument, expected="a process that works on it", got="one that was ended", hint="send it again"
             )
-        raise InvalidRequest(
+        error = OutOfTime if ending.was_late else InvalidRequest
+        raise error(
             argument, expected="a file that its reader can take", got=ending.reason,
             hint="it may be broken, or need more memory or time than an upload may take",
         )  # fmt: skip

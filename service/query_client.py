@@ -7,7 +7,7 @@ import threading
 import time
 from typing import Any
 
-from service.errors import Busy, InvalidRequest, ProcessDied, TimedOut
+from service.errors import Busy, InvalidRequest, OutOfTime, ProcessDied, TimedOut
 from service.process import Children
 
 WAITING = 16  # calls that wait or run
@@ -37,13 +37,13 @@ class QueryClient(Children):
             if not self._turn.acquire(timeout=self._seconds):
                 raise Busy("query", expected="a turn in time", got="none", hint="try again soon")
             try:
-                return self.check(request, deadline - time.monotonic(), "query")
+                return self.result_of(request, deadline - time.monotonic(), "query")
             finally:
                 self._turn.release()
-        except InvalidRequest:
-            if time.monotonic() < deadline:
-                raise ProcessDied("query", expected="an answer", got="an error of the server") from None
+        except OutOfTime:
             expected = f"an answer within {self._seconds:g} s"
             raise TimedOut("query", expected=expected, got="none yet") from None
+        except InvalidRequest:
+            raise ProcessDied("query", expected="an answer", got="an error of the server") from None
         finally:
             self._places.release()

@@ -111,7 +111,7 @@ def adopt(store: Store, settings: ServiceSettings, path: Path, metadata: dict[st
                 draft = scratch / kind
                 draft.symlink_to(source.resolve())
                 order = {"task": "check", "kind": kind, "file": str(source), "scratch": str(scratch), "names": {}}
-                return draft, children.check(order, settings.check_seconds, kind)
+                return draft, children.result_of(order, settings.check_seconds, kind)
 
             for kind, file in (("splats", metadata["splats"]), ("cameras", metadata["cameras"]), *packs):
                 source = Path(file["path"])

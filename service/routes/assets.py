@@ -115,8 +115,8 @@ async def check_upload(deps: Parts, kind: str, draft: Path, cameras: Asset | Non
     if cameras is not None:
         order |= {"cameras": str(cameras.file)}
         order["names"][str(cameras.file)] = cameras.client_name
-    check = deps.children.check
-    return await anyio.to_thread.run_sync(check, order, settings.check_seconds, kind, limiter=deps.checks)
+    result_of = deps.children.result_of
+    return await anyio.to_thread.run_sync(result_of, order, settings.check_seconds, kind, limiter=deps.checks)
 
 
 @router.get("/assets/{asset}")

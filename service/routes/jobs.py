@@ -74,7 +74,7 @@ def _plan(order: dict[str, Any], deps: Parts, owner: Owner) -> dict[str, Any]:
     work = work_of(order, deps.store, owner, deps.settings)
     with deps.store.scratch() as scratch:
         work |= {"task": "plan", "kind": "plan", "scratch": str(scratch), "memory": deps.settings.check_memory_bytes}
-        return deps.children.check(work, deps.settings.check_seconds, "plan")
+        return deps.children.result_of(work, deps.settings.check_seconds, "plan")
 
 
 @router.get("/jobs/{job}")

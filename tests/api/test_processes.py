@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.errors import Busy, Fault, InvalidRequest
+from service.errors import Busy, Fault, InvalidRequest, OutOfTime, TimedOut
 from service.process import Children
 from service.query_client import QueryClient
 from tests.promises.bad_files import BAD_FILES, BadFile
@@ -58,6 +58,11 @@ def check_of(folder: Path, kind: str, content: bytes, **more: Any) -> dict[str, 
     } | more
 
 
+def check_cameras(children: Children, folder: Path) -> dict[str, Any]:
+    """Check good cameras in a child."""
+    return children.result_of(check_of(folder, "cameras", cameras_json()), 600, "cameras")
+
+
 def kill(signal_number: int) -> None:
     for process in running():
         os.kill(process, signal_number)
@@ -65,29 +70,29 @@ def kill(signal_number: int) -> None:
 
 def test_child_of_a_check_is_used_again(children: Children, tmp_path: Path) -> None:
     for _ in range(3):
-        result = children.check(check_of(tmp_path, "cameras", cameras_json()), 600, "cameras")
+        result = check_cameras(children, tmp_path)
         assert (result["suffix"], result["counts"]["views"]) == (".json", 3)
     before = running()
     with pytest.raises(Fault) as error:
-        children.check(check_of(tmp_path, "cameras", b"{"), 600, "cameras")
+        children.result_of(check_of(tmp_path, "cameras", b"{"), 600, "cameras")
     assert error.value.fault["status"] == 422 and str(tmp_path) not in json.dumps(error.value.fault)
     assert running() == before
 
 
 def test_order_beyond_its_time_or_memory_is_refused(children: Children, tmp_path: Path) -> None:
     order = check_of(tmp_path, "splats", ply(np.repeat(splat_rows(), 20_000, axis=0)))
-    with pytest.raises(InvalidRequest, match="it took more than"):
-        children.check(order, 0.0, "splats")
+    with pytest.raises(OutOfTime, match="it took more than"):
+        children.result_of(order, 0.0, "splats")
     with pytest.raises((Fault, InvalidRequest)):
-        children.check(order | {"memory": 1 << 20}, 600, "splats")
-    assert children.check(check_of(tmp_path, "cameras", cameras_json()), 600, "cameras")["counts"]["views"] == 3
+        children.result_of(order | {"memory": 1 << 20}, 600, "splats")
+    assert check_cameras(children, tmp_path)["counts"]["views"] == 3
 
 
 def test_children_that_are_killed_or_stopped_are_replaced(children: Children, tmp_path: Path) -> None:
     for signal_number in (signal.SIGKILL, signal.SIGSTOP):
         until(children.is_ready)
         kill(signal_number)
-        assert children.check(check_of(tmp_path, "cameras", cameras_json()), 600, "cameras")["counts"]["views"] == 3
+        assert check_cameras(children, tmp_path)["counts"]["views"] == 3
 
 
 def test_reason_ends_an_order_with_its_group(children: Children, tmp_path: Path) -> None:
@@ -104,7 +109,7 @@ def test_stopped_children_take_no_order(tmp_path: Path) -> None:
     children = Children()
     children.stop()
     with pytest.raises(Busy):
-        children.check(check_of(tmp_path, "cameras", cameras_json()), 600, "cameras")
+        check_cameras(children, tmp_path)
 
 
 def names_in_emoji() -> bytes:
@@ -121,7 +126,7 @@ BOMBS.append(BadFile("cameras", "10,000 names in emoji", names_in_emoji, ""))
 @pytest.mark.parametrize("row", BOMBS, ids=lambda row: row.name)
 def test_bomb_is_refused_with_reasons(children: Children, tmp_path: Path, row: BadFile) -> None:
     with pytest.raises(Fault) as error:
-        children.check(check_of(tmp_path, row.kind, row.data(), memory=1 << 30), 600, row.kind)
+        children.result_of(check_of(tmp_path, row.kind, row.data(), memory=1 << 30), 600, row.kind)
     fault = error.value.fault
     assert fault["status"] == 422 and fault["expected"] and fault["got"] and len(json.dumps(fault)) < 5000
 
@@ -173,6 +178,13 @@ def test_unforeseen_error_fails_its_question_alone(queries: QueryClient, change:
     assert (error.value.fault["status"], error.value.fault["type"]) == (500, "/problems/crashed")
     assert fault_of_request(queries) == fault
     assert running() == process  # the same one answers
+
+
+def test_query_beyond_its_time_is_refused() -> None:
+    client = QueryClient("lvis", 0.0)
+    with pytest.raises(TimedOut):
+        client.call(REQUEST)
+    client.stop()
 
 
 def test_calls_beyond_the_line_or_after_the_stop_are_refused(queries: QueryClient) -> None:
