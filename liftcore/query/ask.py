@@ -291,7 +291,7 @@ def _nearer_words(
     own_rows = request.rows[:positives][request.by_cosine[:positives]]
     if not isinstance(references, References) or not len(own_rows):
         return ()
-    rows, weights = best_splats(scene, np.where(selected, scores, np.float32(-1.0)) if selected.any() else scores)
+    rows, weights = best_splats(scene, scores, selected if selected.any() else True)
     if not len(rows):
         return ()
     names = {

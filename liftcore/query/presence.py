@@ -187,8 +187,13 @@ def any_present(words: Sequence[Presence]) -> Presence:
     return Presence(present=first.present, presence=first.presence, reason=reason)
 
 
-def best_splats(scene: Scene, scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def best_splats(
+    scene: Scene, scores: np.ndarray, selected: np.ndarray | bool = True
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the splats of the highest scores [P] that have LEAST_SHARE of the total weight, and their weights.
+
+    Args:
+        selected: [P] bool, the splats among which they are; all of them if these have less.
 
     Returns:
         [m] i64, at most MOST_SPLATS, descending by score; and [m] f64, their total weight.
@@ -196,7 +201,7 @@ def best_splats(scene: Scene, scores: np.ndarray) -> tuple[np.ndarray, np.ndarra
     total_weight = np.where(scene.has_feature, scene.total_weight, np.float32(0.0))
     total_weight = total_weight if total_weight.any() else scene.has_feature.astype(np.float32)
     least, count = LEAST_SHARE * float(total_weight.sum(dtype=np.float64)), min(_FIRST, len(scores))
-    ranked = np.where(scene.has_feature, -scores, np.float32(np.inf))
+    ranked = np.where(scene.has_feature & selected, -scores, np.float32(np.inf))
     while True:  # a quarter of the time of a complete order
         rows = np.argpartition(ranked, count - 1)[:count] if count < len(ranked) else np.arange(count)
         if count == len(ranked) or total_weight[rows].sum(dtype=np.float64) >= least:
@@ -204,7 +209,7 @@ def best_splats(scene: Scene, scores: np.ndarray) -> tuple[np.ndarray, np.ndarra
         count = min(4 * count, len(ranked))
     rows = rows[np.lexsort((rows, ranked[rows]))]
     rows = rows[: int(np.searchsorted(np.cumsum(total_weight[rows], dtype=np.float64), least)) + 1]
-    rows = rows[total_weight[rows] > 0]
+    rows = rows[(total_weight[rows] > 0) & (ranked[rows] < np.inf)]
     heaviest = np.sort(np.argsort(-total_weight[rows], kind="stable")[:MOST_SPLATS])
     return rows[heaviest], total_weight[rows[heaviest]].astype(np.float64)
 
