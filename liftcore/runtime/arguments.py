@@ -83,5 +83,5 @@ def device_name(device: object) -> object:
 
 def nearest(text: str, names: Iterable[str], count: int) -> str:
     """Return a hint with the ``count`` most similar names, of the first thousands, by their first letters."""
-    short_names = [name[:_CHARACTERS] for name in islice(names, _MAX_NAMES)]
+    short_names = dict.fromkeys(name[:_CHARACTERS] for name in islice(names, _MAX_NAMES))
     return f"nearest: {', '.join(get_close_matches(text[:_CHARACTERS], short_names, count, cutoff=0.0))}"
