@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -351,9 +351,9 @@ def _select_rows(
     query, positives = request.query, len(request.query.positives)
     valid_scores = scores[scene.has_feature]
     in_words = (request.by_cosine & mask)[:positives]
-    competitors = _competing_words(request, request.rows[:positives][in_words])
+    reference_words, table_words = _competing_words(request, request.rows[:positives][in_words])
+    competitors = reference_words or table_words
     is_automatic = query.threshold == "auto" and in_words.any() and in_words.sum() == mask[:positives].sum()
-    has_references = bool(competitors) and isinstance(request.references, References)
     lack = explain_no_selection(valid_scores)
     is_of_word = lack and is_automatic and valid_scores.any()
     is_example = query.threshold == "auto" and not in_words.any() and len(mask) == 1
@@ -368,16 +368,16 @@ def _select_rows(
     selected = scene.has_feature & (scores >= np.float32(threshold.value))
     if not is_automatic:
         return threshold, selected, None
-    is_unclear = not has_references and has_one_mode(
+    is_unclear = reference_words is None and has_one_mode(
         valid_scores, threshold.value, scene.weights, scene.effective_count
     )
     threshold = threshold.replace(clear=threshold.clear and not is_unclear)
     if is_unclear and _are_of_word(scene, valid_scores, scores, competitors):
         threshold, selected = _select_all(scene, valid_scores)
-    if not competitors:
+    if competitors is None:
         return threshold, selected, None
-    comparison = compare_ranks(scene, scores, threshold.value, competitors[0])
-    if has_references and comparison.rest >= NEAR:
+    comparison = compare_ranks(scene, scores, threshold.value, competitors)
+    if reference_words is not None and comparison.rest >= NEAR:
         return *_select_all(scene, valid_scores), None
     if comparison.lowest > threshold.value:
         retry = find_threshold(valid_scores, "auto", scene.weights, comparison.lowest)
@@ -387,17 +387,17 @@ def _select_rows(
         threshold = retry.replace(value=value, explanation=explanation, clear=is_clear)
         selected = scene.has_feature & (scores >= np.float32(value))
     threshold = threshold.replace(clear=threshold.clear and comparison.first >= LEAST_FIRST)
-    if competitors[-1].nearer_limit == 0:  # a small table: splats nearer to another of its words are not selected
-        selected = nearest_to_query(scene, selected, competitors[-1])
-    return threshold, selected, competitors[0]
+    if table_words is not None:
+        selected = nearest_to_query(scene, selected, table_words)
+    return threshold, selected, competitors
 
 
 def _are_of_word(
-    scene: Scene, valid_scores: np.ndarray, scores: np.ndarray, competitors: Sequence[CompetingWords]
+    scene: Scene, valid_scores: np.ndarray, scores: np.ndarray, competitors: CompetingWords | None
 ) -> bool:
     """Return True if scores without a valley are those of the word: against competing words, or by themselves."""
-    if competitors:
-        return compare_ranks(scene, scores, math.inf, competitors[0]).rest >= NEAR
+    if competitors is not None:
+        return compare_ranks(scene, scores, math.inf, competitors).rest >= NEAR
     return float(valid_scores.min()) >= SAME_AS_WORD
 
 
@@ -453,16 +453,16 @@ def _select_each(
     return lowest.replace(explanation=explanation, clear=all(cut.clear for cut in cuts)), selected
 
 
-def _competing_words(request: ResolvedQuery, directions: np.ndarray) -> list[CompetingWords]:
-    """Return the words that compete with the positives [p, F]: reference words, then the others of a small table."""
-    if not len(directions):
-        return []
-    competitors = (
-        [CompetingWords.among(request.references, directions)] if isinstance(request.references, References) else []
-    )
-    if request.small_table is not None:
-        competitors.append(CompetingWords.of_small_table(request.small_table, directions))
-    return [words for words in competitors if len(words.vectors)]
+def _competing_words(
+    request: ResolvedQuery, directions: np.ndarray
+) -> tuple[CompetingWords | None, CompetingWords | None]:
+    """Return the words that compete with the positives [p, F]: reference words, and the others of a small table."""
+    reference_words = table_words = None
+    if len(directions) and isinstance(request.references, References):
+        reference_words = CompetingWords.among(request.references, directions)
+    if len(directions) and request.small_table is not None:
+        table_words = CompetingWords.of_small_table(request.small_table, directions)
+    return reference_words, table_words if table_words and len(table_words.vectors) else None
 
 
 def _presence(scene: Scene, request: ResolvedQuery, similarities: np.ndarray) -> tuple[Presence, np.ndarray]:
