@@ -83,7 +83,7 @@ def code_features(
     if loss > (MOST_LOSS_OF_MASKS if of_masks else MOST_LOSS):
         return f"Features are exact: as codes their mean cosine about the scene's mean would be {1 - loss:.3f}."
     present = np.bincount(groups) > 0  # a cut may leave nothing on one side
-    code, number = np.zeros(len(features), np.uint16), np.count_nonzero(present)
+    code, number = np.zeros(len(features), np.uint16), int(np.count_nonzero(present))
     code[rows] = np.cumsum(present)[groups]
     sums = np.zeros((number + 1, features.shape[1]))  # of all splats: a sample has ten a group
     for first in range(0, len(code), BLOCK):

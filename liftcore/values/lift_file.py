@@ -85,7 +85,7 @@ def save_lift(lift: Lift, path: Path | str) -> None:
         if ((lift.code.int() > 0) == lift.has_feature).all():
             del tensors["has_feature"]
     if lift.object is not None and lift.object_views is not None and lift.node is not None:
-        node, parents = lift.node.cpu().numpy(), lift.node_parents.cpu().numpy()
+        node, parents = lift.node.cpu().numpy(), tensors["node_parents"].cpu().numpy()
         if np.array_equal(_objects_of(node, parents, len(lift.object_views)), lift.object.cpu().numpy()):
             del tensors["object"]
     write_tensors(as_path(path), tensors, {"splatlift": lift.metadata.model_dump_json()})
@@ -125,9 +125,9 @@ def _objects_of(node: np.ndarray, parents: np.ndarray, objects: int) -> np.ndarr
     """Return the object [P] i32 that each splat's node is or is a part of, one of the first nodes; -1: none."""
     above, numbers = np.append(parents, np.int32(-1)), np.arange(len(parents) + 1, dtype=np.int32)
     numbers[-1] = -1
-    while (others := numbers >= objects).any():
-        numbers[others] = above[numbers[others]]
-    return numbers[node]
+    for _ in range(MOST_DEPTH):  # -1 wraps to the last; what is no tree is refused by whoever reads it
+        numbers = np.where(numbers >= objects, above.take(numbers, mode="wrap"), numbers)
+    return numbers.take(node, mode="wrap")
 
 
 def tensors_of(lift: Lift) -> dict[str, Tensor]:
