@@ -13,7 +13,7 @@ from liftcore.features.prompts import Unannotated, prompt_views
 from liftcore.io.files import check_output, whole_file, writing
 from liftcore.io.photos import orientation_warnings
 from liftcore.io.safetensors_file import with_metadata
-from liftcore.runtime.arguments import as_path, check_choice, check_text, one_of
+from liftcore.runtime.arguments import as_path, check_choice, one_of
 from liftcore.runtime.progress import Progress, shown_progress
 from liftcore.text import OWN_WORDS
 from liftcore.values.fit import FITS
@@ -118,7 +118,12 @@ def _check_options(kind: str, options: Mapping[str, Any], names: Mapping[str, st
             )
         if name == "normalised":
             raise InvalidInput(name, expected="True, False or None", got=repr(value)[:80])
-        check_text("encoder_name" if name == "encoder" else name, value)
+        _check_text("encoder_name" if name == "encoder" else name, value)
+
+
+def _check_text(argument: str, value: object) -> None:
+    if not isinstance(value, str) or not value.strip():
+        raise InvalidInput(argument, expected="a non-empty text", got=repr(value)[:80])
 
 
 def _encoded_masks(
@@ -157,7 +162,7 @@ def retag_pack(pack: Path | str, out: Path | str, names: Mapping[str, str]) -> N
         )
     for name, value in names.items():
         check_choice("names", name, NAMES)
-        check_text(name, value)
+        _check_text(name, value)
     pack = as_path(pack, "pack")
     check_output(out, [pack], "pack")
     read_features(pack)  # so that an invalid pack is an error before a file is created

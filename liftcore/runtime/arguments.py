@@ -47,12 +47,6 @@ def as_paths(paths: Any, argument: str = "path") -> list[Path]:
     return [as_path(path, argument) for path in as_list(paths)]
 
 
-def check_text(argument: str, value: object) -> None:
-    """Refuse a value that is no text, or an empty one."""
-    if not isinstance(value, str) or not value.strip():
-        raise InvalidInput(argument, expected="a non-empty text", got=repr(value)[:80])
-
-
 def as_list(values: Any) -> list[Any]:
     """Return several values as a list; a single text, path or other value as a list of one."""
     return list(values) if isinstance(values, Iterable) and not isinstance(values, str | PathLike) else [values]

@@ -11,11 +11,7 @@ INSTALL = "the package 'service' has it: pip install 'splatlift[service]', or ru
 
 
 def load_command(name: str) -> ModuleType:
-    """Import the module of a command of the service.
-
-    Raises:
-        Unavailable: the service, or a package that it needs, is not installed.
-    """
+    """Import the module of a command of the service, where that is installed."""
     try:
         return import_module(f"service.commands.{name}")
     except ModuleNotFoundError as error:

@@ -5,10 +5,7 @@ import sys
 
 
 def cores() -> int:
-    """Return the number of cores that this process may use, at least 1.
-
-    On Linux those of its affinity; on macOS and Windows those of the machine.
-    """
+    """Return the number of cores that this process may use, at least 1: off Linux, all of the machine."""
     if sys.platform == "linux":
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

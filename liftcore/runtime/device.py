@@ -30,12 +30,9 @@ MEMORY_SIGNS = ("out of memory", "alloc_failed", "memoryallocation")  # of CUDA'
 
 @dataclass(frozen=True)
 class Device:
-    """The device of rasterization and solve.
+    """The device of rasterization and solve."""
 
-    ``kind`` is cuda with ``place`` on the CPU in Triton's interpreter, in which tests run the kernels.
-    """
-
-    kind: Literal["cpu", "cuda"]
+    kind: Literal["cpu", "cuda"]  # cuda on the CPU in Triton's interpreter, in which tests run the kernels
     place: torch.device  # of its tensors
 
     @property
@@ -65,13 +62,9 @@ CPU = Device("cpu", torch.device("cpu"))
 
 
 def out_of_memory(error: BaseException) -> bool:
-    """Return True if the error is out of memory on the device: of torch, of the driver through Triton, or of a
-    library.
-    """
-    if isinstance(error, torch.OutOfMemoryError):
-        return True
-    message = str(error).lower()
-    return isinstance(error, RuntimeError) and any(sign in message for sign in MEMORY_SIGNS)
+    """Return True if memory of the device ends: by torch, by the driver through Triton, or by a library."""
+    has_sign = any(sign in str(error).lower() for sign in MEMORY_SIGNS)
+    return isinstance(error, torch.OutOfMemoryError) or (isinstance(error, RuntimeError) and has_sign)
 
 
 @contextmanager
@@ -90,31 +83,15 @@ def within_memory(device: Device) -> Iterator[None]:
 
 
 def give_back_memory() -> None:
-    """Return free memory of the allocator to the system, where it has such a call (glibc).
-
-    Views leave hundreds of megabytes in fragments, none of which fits the large arrays of the solve.
-    """
+    """Return free memory of the allocator to the system, where it has such a call (glibc)."""
+    # Views leave hundreds of megabytes in fragments, none of which fits the large arrays of the solve.
     trim = None if sys.platform == "win32" else getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)
 
 
-def indexed(place: torch.device) -> torch.device:
-    """Return the place with an index, as tensors have it: ``cuda`` becomes the current GPU."""
-    if place.type == "cuda" and place.index is None:
-        return torch.device("cuda", torch.cuda.current_device())
-    return place
-
-
 def choose_device(name: str | torch.device) -> Device:
-    """Return the device for ``auto``, ``cpu`` or ``cuda``; ``auto`` uses a GPU if one is available.
-
-    The current GPU may also be given by its number, ``cuda:0``.
-
-    Raises:
-        InvalidSettings: any other name.
-        Unavailable: ``cuda`` was requested and is not available.
-    """
+    """Return the device for ``auto`` (a GPU if one is available), ``cpu`` or ``cuda``, as `device_name` has it."""
     requested = device_name(name)
     if requested not in ("auto", "cpu", "cuda"):
         raise InvalidSettings("device", expected="'auto', 'cpu' or 'cuda'", got=repr(requested)[:80])
@@ -123,11 +100,11 @@ def choose_device(name: str | torch.device) -> Device:
     missing = _missing()
     if missing is None:
         return Device("cuda", torch.device("cuda", torch.cuda.current_device()))
-    if requested == "cuda":
-        got, hint = missing
-        expected = "a GPU that torch and Triton can use"
-        raise Unavailable("device", expected=expected, got=got, hint=f"{hint}, or use device=cpu")
-    return CPU
+    if requested == "auto":
+        return CPU
+    got, hint = missing
+    expected = "a GPU that torch and Triton can use"
+    raise Unavailable("device", expected=expected, got=got, hint=f"{hint}, or use device=cpu")
 
 
 def _missing() -> tuple[str, str] | None:

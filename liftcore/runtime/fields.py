@@ -3,18 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from typing import Any, ClassVar
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    ModelWrapValidatorHandler,
-    ValidationError,
-    ValidatorFunctionWrapHandler,
-    WrapValidator,
-    model_validator,
-)
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, WrapValidator, model_validator
 from pydantic_core import PydanticCustomError
 
 from liftcore.errors import SplatliftError
@@ -28,7 +20,7 @@ NEAREST = 3  # fields that are named where one is unknown
 def takes(expected: str) -> WrapValidator:
     """Return a validator of a union with one error, in place of one error a branch."""
 
-    def check(value: Any, branches: ValidatorFunctionWrapHandler) -> Any:
+    def check(value: Any, branches: Callable[[Any], Any]) -> Any:
         try:
             return branches(value)
         except ValidationError:
@@ -78,29 +70,27 @@ class Body(PlainModel):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _in_words(cls, values: Any, handler: ModelWrapValidatorHandler[Any]) -> Any:
-        if cls.error_type is None:
-            return handler(values)
+    def _in_words(cls, values: Any, handler: Callable[[Any], Any]) -> Any:
         try:
             return handler(values)
         except ValidationError as error:
-            raise _error_of(cls, error, cls.error_type, cls.noun) from None
+            if cls.error_type is None:
+                raise
+            raise _error_of(cls, error, cls.error_type) from None
 
 
-def _error_of(
-    model: type[BaseModel], error: ValidationError, error_type: type[SplatliftError], noun: str
-) -> SplatliftError:
+def _error_of(model: type[Body], error: ValidationError, error_type: type[SplatliftError]) -> SplatliftError:
     """Return the error of the first invalid field, with the values that it may have."""
     first = error.errors(include_url=False)[0]
-    context, place = first.get("ctx", {}), [str(part) for part in first["loc"]]
-    place = [context["field"]] if first["type"] == "unknown_field" else place
+    context, kind, place = first.get("ctx", {}), first["type"], [str(part) for part in first["loc"]]
     got, hint = repr(first["input"])[:NAME_CHARACTERS], ""
-    if first["type"] == "unknown_field":
-        got, hint = f"an unknown {noun}", nearest(place[0], model.model_fields, NEAREST)
     expected = context.get("expected") or re.sub(r"^\w+ should (be|have) ", "", first["msg"])
-    if first["type"] == "literal_error":
+    if kind == "unknown_field":
+        place = [context["field"]]
+        got, hint = f"an unknown {model.noun}", nearest(place[0], model.model_fields, NEAREST)
+    elif kind == "literal_error":
         expected = one_of(re.findall(r"'([^']*)'", expected))
-    elif place and place[0] in model.model_fields and first["type"] in ("greater_than_equal", "less_than_equal"):
+    elif place and place[0] in model.model_fields and kind in ("greater_than_equal", "less_than_equal"):
         schema = model.model_json_schema()["properties"][place[0]]
         parts = [schema, *schema.get("anyOf", ())]
         low, high = (next((part[name] for part in parts if name in part), None) for name in ("minimum", "maximum"))

@@ -16,14 +16,8 @@ def cache_folder(name: str) -> Path:
 
 @contextmanager
 def scratch_folder(prefix: str, parent: Path | None = None) -> Iterator[Path]:
-    """Create a folder, and remove it with its content afterwards.
-
-    Windows keeps files that arrays still map; these are removed when the process ends.
-
-    Args:
-        parent: folder to create it in; None: the system's temporary folder.
-    """
+    """Create a folder in ``parent`` or the system's temporary folder, and remove it with its content afterwards."""
     with tempfile.TemporaryDirectory(dir=parent, prefix=prefix, ignore_cleanup_errors=True) as folder:
         yield Path(folder)
-    if os.path.exists(folder):
+    if os.path.exists(folder):  # Windows keeps files that arrays still map
         atexit.register(shutil.rmtree, folder, ignore_errors=True)

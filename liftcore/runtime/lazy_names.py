@@ -3,6 +3,7 @@
 import re
 import sys
 from collections.abc import Callable
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 
@@ -10,18 +11,13 @@ from pathlib import Path
 def lazy_names(package: str, file: str) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
     """Return ``__getattr__`` and ``__dir__`` of a module with a stub (``.pyi``) of imports beside its file.
 
-    Args:
-        package: the module's name. file: its file.
-
-    The stub is read at the first access. ``__all__`` is its names, sorted, without ``__version__``.
+    ``__all__`` is the stub's names, sorted, without ``__version__``.
     """
-    modules: dict[str, str] = {}
 
+    @cache
     def read_stub() -> dict[str, str]:
-        if not modules:
-            stub = Path(file).with_suffix(".pyi").read_text(encoding="utf-8")
-            modules.update((name, module) for module, name in re.findall(r"(?m)^from (\S+) import (\w+)", stub))
-        return modules
+        stub = Path(file).with_suffix(".pyi").read_text(encoding="utf-8")
+        return {name: module for module, name in re.findall(r"(?m)^from (\S+) import (\w+)", stub)}
 
     def get(name: str) -> object:
         homes = read_stub()

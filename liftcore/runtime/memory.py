@@ -21,24 +21,17 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-MOUNTS = Path("/proc/self/mounts")
-IN_MEMORY = ("tmpfs", "ramfs")
 CONTROL_GROUP = Path("/sys/fs/cgroup")  # of version 2
 
 
 def zeros(shape: tuple[int, ...], dtype: torch.dtype, *, name: str, in_file: bool = False) -> Tensor:
-    """Return zeros on the CPU, whose pages are allocated when they are first written.
-
-    Args:
-        name: of the array, for errors. in_file: map a file in the temporary folder that is removed with the tensor;
-            on Windows, which cannot delete mapped files, the page file serves.
-    """
+    """Return zeros on the CPU, of pages that are allocated when first written, or ``in_file`` of an unlinked file."""
     import torch
 
     size = prod(shape) * dtype.itemsize
     if not size:
         return torch.zeros(shape, dtype=dtype)
-    if not in_file or sys.platform == "win32":
+    if not in_file or sys.platform == "win32":  # which cannot delete mapped files: there the page file serves
         # Not numpy.zeros, which requests large pages: clearing them took longer than the solve. Not torch.zeros,
         # which writes all zeros in one thread.
         return torch.frombuffer(map_anonymous(size), dtype=torch.uint8).view(dtype).view(shape)
@@ -64,29 +57,24 @@ def map_anonymous(size: int, flags: int = 0) -> mmap.mmap:
 
 def check_disk(size: int, name: str) -> None:
     """Check early that the disk has ``size`` free bytes."""
-    got = lack_of_disk(size)
-    if got:
+    if got := lack_of_disk(size):
         raise _no_disk(size, name, got)
 
 
 def lack_of_disk(size: int, folder: Path | None = None) -> str:
-    """Describe what a folder has instead of ``size`` free bytes on a disk; empty if they are free.
-
-    Args:
-        folder: None: the temporary folder, which may lie in memory.
-    """
+    """Describe what a folder, or the temporary one, has instead of ``size`` free bytes on a disk; empty if free."""
     place = folder or Path(tempfile.gettempdir())
-    if folder is None and file_system(place) in IN_MEMORY:
+    if folder is None and _file_system(place) in ("tmpfs", "ramfs"):
         return "a temporary folder in memory"
     free = shutil.disk_usage(place).free
     return "" if free >= size else f"{free / 2**30:.1f} GiB of disk"
 
 
-def file_system(folder: Path) -> str:
+def _file_system(folder: Path) -> str:
     """Return the type of a folder's file system as Linux names it; empty if it is unknown."""
     kinds: dict[Path, str] = {}
     with suppress(OSError):
-        for line in MOUNTS.read_text(encoding="utf-8", errors="replace").splitlines():
+        for line in Path("/proc/self/mounts").read_text(encoding="utf-8", errors="replace").splitlines():
             _, place, kind, *_ = line.split(" ")
             kinds[Path(place)] = kind  # the last mount at a place hides earlier ones
     path = folder.resolve()

@@ -18,11 +18,6 @@ def join_names(names: Sequence[str], limit: int | None) -> str:
     return ", ".join(names[:limit]) + (", ..." if limit is not None and len(names) > limit else "")
 
 
-def point_text(point: Sequence[float]) -> str:
-    """Return coordinates to three digits."""
-    return f"({', '.join(f'{value:.3g}' for value in point)})"
-
-
 def value_text(value: Any) -> str:
     """Return a field as text: a number to three digits, a short value, or the length of a long list."""
     if isinstance(value, float):

@@ -36,11 +36,9 @@ class _Counts:
 
 
 def _set_threads(library: Any, number: int) -> None:
-    """Set a library's thread count from any thread.
-
-    From threadpoolctl 3.7 on, OpenBLAS accepts counts only from the thread that set it last, and silently ignores
-    others; but the first thread to enter `one_thread` may be the first to leave.
-    """
+    """Set a library's thread count from any thread."""
+    # From threadpoolctl 3.7 on, OpenBLAS accepts counts only from the thread that set it last, and silently ignores
+    # others; but the first thread to enter `one_thread` may be the first to leave.
     clear = getattr(library, "clear_controlling_thread", lambda *, force: None)
     clear(force=True)
     library.set_num_threads(number)
@@ -52,10 +50,7 @@ _lock = Lock()
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Run torch and linear algebra in the calling thread alone.
-
-    Threads that start within also have one torch thread, for their lifetime.
-    """
+    """Run torch and linear algebra in the calling thread, and all their life in each thread that starts within."""
     # Queries do without torch, which takes a second to load. Where another thread is loading it, this waits for that.
     torch = import_module("torch") if "torch" in sys.modules else None
     with _lock:

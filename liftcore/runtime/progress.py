@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import Any, Protocol
 
 from liftcore.errors import InvalidSettings
@@ -62,28 +62,18 @@ class Timings:
 def shown_progress(progress: Progress | bool | None) -> Iterator[Progress]:
     """Yield the function that reports the progress of work to a caller.
 
-    Args:
-        progress: a function that is called as work advances; True for bars on a terminal and lines elsewhere; False
-            for nothing; None for bars on a terminal and nothing elsewhere.
+    That is the caller's own; for True bars on a terminal and lines elsewhere, for None bars on a terminal alone.
     """
-    on_terminal = not callable(progress) and sys.stderr is not None and sys.stderr.isatty()
-    if progress is None:
-        progress = on_terminal
     if callable(progress):
         yield progress
-    elif progress is True and on_terminal:
-        bars = _Bars()
-        try:
-            yield bars
-        finally:
-            bars.close()
-    elif progress is False:
-        yield silent
-    elif progress is True:
-        yield _Lines()
-    else:
+    elif progress is not None and not isinstance(progress, bool):
         expected = "a function of (stage, completed, total, unit), True, False or None"
         raise InvalidSettings("progress", expected=expected, got=repr(progress)[:80])
+    elif progress is not False and sys.stderr is not None and sys.stderr.isatty():
+        with closing(_Bars()) as bars:
+            yield bars
+    else:
+        yield _Lines() if progress else silent
 
 
 class _Lines:
@@ -101,9 +91,8 @@ class _Lines:
 class _Bars:
     """Progress as one bar of tqdm a stage."""
 
-    def __init__(self) -> None:
-        self.stage = ""
-        self.bar: Any = None
+    stage = ""
+    bar: Any = None
 
     def __call__(self, stage: str, completed: int, total: int, unit: str) -> None:
         if self.bar is None or stage != self.stage:

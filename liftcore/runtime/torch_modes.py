@@ -9,24 +9,23 @@ from __future__ import annotations
 
 from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, NamedTuple
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+
+def _autocast(device: str, dtype: torch.dtype | None) -> torch.autocast:
+    return torch.autocast(device, dtype, enabled=dtype is not None)
+
+
 CASTING = ("cpu", "cuda")  # devices whose products autocast may change
-
-
-class _Modes(NamedTuple):
-    device: torch.device
-    inference: bool
-    casts: tuple[torch.dtype | None, ...]  # dtype of autocast on each of CASTING; None: off
-
-
-_DEFAULT = _Modes(torch.device("cpu"), False, (None,) * len(CASTING))
-_callers: ContextVar[_Modes] = ContextVar("callers")
+_SETTERS: Any = (torch.inference_mode, torch.device, *(partial(_autocast, name) for name in CASTING))
+_DEFAULT = (False, torch.device("cpu"), None, None)  # of each setter
+_callers: ContextVar[tuple[Any, ...]] = ContextVar("callers")
 
 
 @contextmanager
@@ -40,31 +39,24 @@ def default_modes() -> Iterator[None]:
         _callers.reset(token)
 
 
-@contextmanager
-def callers_modes() -> Iterator[None]:
+def callers_modes() -> ExitStack:
     """Within `default_modes`, restore the caller's modes for the caller's code, such as an iterator that encodes.
 
     Threads that run such code need the context of the thread that entered (``contextvars.copy_context``).
     """
-    with _set(_callers.get(_modes())):
-        yield
+    return _set(_callers.get(_modes()))
 
 
-def _modes() -> _Modes:
+def _modes() -> tuple[Any, ...]:
+    """Return the thread's modes, one of each setter; of autocast the dtype, None where it is off."""
     casts = (torch.get_autocast_dtype(name) if torch.is_autocast_enabled(name) else None for name in CASTING)
-    return _Modes(torch.get_default_device(), torch.is_inference_mode_enabled(), tuple(casts))
+    return (torch.is_inference_mode_enabled(), torch.get_default_device(), *casts)
 
 
-@contextmanager
-def _set(modes: _Modes) -> Iterator[None]:
+def _set(modes: tuple[Any, ...]) -> ExitStack:
     """Set all modes of the thread; modes that are set already cost nothing."""
-    now = _modes()
     with ExitStack() as stack:
-        if modes.inference != now.inference:
-            stack.enter_context(torch.inference_mode(modes.inference))
-        if modes.device != now.device:
-            stack.enter_context(modes.device)
-        for name, cast, before in zip(CASTING, modes.casts, now.casts, strict=True):
-            if cast != before:
-                stack.enter_context(torch.autocast(name, cast, enabled=cast is not None))
-        yield
+        for setter, mode, before in zip(_SETTERS, modes, _modes(), strict=True):
+            if mode != before:
+                stack.enter_context(setter(mode))
+        return stack.pop_all()

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from liftcore.errors import InvalidInput, InvalidSplats, reading
-from liftcore.runtime.one_line import one_line, point_text
+from liftcore.runtime.one_line import one_line
 from liftcore.scene.harmonics import SH_C0, band_rotation
 from liftcore.scene.kernel import DARK_LOBE, LOBE_COLOURS, NORMALS, Kernel, kernel_named, scale_count
 from liftcore.scene.origin import FILE_ORIGIN, Origin, extent_of_most, float32_step, local_origin, usual_size
@@ -217,7 +217,8 @@ class Splats:
 
     def __repr__(self) -> str:
         colour = "no colour" if self.sh is None else f"sh degree {self.sh_degree}"
-        about = [] if self.origin == FILE_ORIGIN else [f"about {point_text(self.origin)}"]
+        origin = ", ".join(f"{value:.3g}" for value in self.origin)
+        about = [] if self.origin == FILE_ORIGIN else [f"about ({origin})"]
         return one_line(self, f"{self.count} of {self.kernel}", colour, *about, f"on {self.means.device}")
 
     def __len__(self) -> int:

@@ -23,7 +23,6 @@ from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.gpu.launching import check_device
 from liftcore.raster.gpu.tiles import Frame, frame_of
 from liftcore.raster.gpu.weights import DeviceReading, region_weights
-from liftcore.runtime.device import indexed
 from liftcore.scene.compositing import CompositingParams, Weighting, check_weighting
 from liftcore.values.views import NO_LABEL, Regions
 
@@ -64,7 +63,7 @@ class GpuRaster(CpuRaster):
     def __init__(self, splats: Splats, device: torch.device, threads: int | None = None) -> None:
         check_device(device)
         super().__init__(splats, threads)
-        self.device = indexed(device)
+        self.device = torch.empty(0, device=device).device  # with an index, as tensors have it
         self._last_frame: tuple[tuple[Camera, CompositingParams], Frame] | None = None
 
     def region_weights(
