@@ -19,12 +19,9 @@ Every error names the argument, the expected value and the actual one, and has a
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
 
 __all__ = [
     "InvalidCameras", "InvalidFeatures", "InvalidInput", "InvalidLift", "InvalidMasks", "InvalidPhotos",

@@ -160,7 +160,7 @@ class ListSettings(argparse.Action):
         from liftcore import LiftSettings
 
         defaults = LiftSettings.of().model_dump(mode="json")
-        for group, names in LiftSettings.groups().items():
+        for group, names in LiftSettings.groups.items():
             print(group)
             for name in names:
                 meaning = (LiftSettings.model_fields[name].description or "").replace("`", "")

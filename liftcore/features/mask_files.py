@@ -12,7 +12,6 @@ Readers raise ``ValueError`` (`liftcore.errors.reading`).
 """
 
 import json
-import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,8 +20,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
+from liftcore.io.photos import open_image
 from liftcore.scene.compositing import MAX_SIDE
 
 LABELS = "a PNG of one channel, 8 or 16 bits of grey or a palette"
@@ -77,15 +77,9 @@ def _open_png(path: Path) -> Iterator[tuple[Image.Image, int, int]]:
     if len(header) < PNG_HEADER_BYTES or not header.startswith(PNG_SIGNATURE):
         raise ValueError("a PNG, got a file that is not a PNG")
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # Pillow raises at twice the limit
-            with Image.open(path, formats=["PNG"]) as image:
-                image.load()
-                yield image, header[24], header[25]
-    except Image.DecompressionBombError:
-        raise ValueError(f"at most {2 * (Image.MAX_IMAGE_PIXELS or 0)} pixels, got a larger picture") from None
-    except UnidentifiedImageError:
-        raise ValueError("a PNG, got one that Pillow cannot identify") from None
+        with open_image(path, "PNG") as image:
+            image.load()
+            yield image, header[24], header[25]
     except OSError as error:  # also of truncated or broken files
         raise ValueError(f"a PNG, got one that does not open ({error}); write it again") from None
 

@@ -108,11 +108,7 @@ def _by_view(folder: Path, arrays: list[Path]) -> dict[str, Path]:
 
 
 def _labels(path: Path, rows: int | None, unlabelled: int) -> tuple[np.ndarray, int]:
-    """Read labels [L, h, w] of a view's masks, which are rows of its vectors, and the number of masks.
-
-    Args:
-        rows: number of vectors. Masks and vectors can be matched only if there are equally many. None: not known.
-    """
+    """Read labels [L, h, w] of a view's masks, rows of its vectors, and their number: ``rows`` if that is known."""
     if path.suffix.lower() == PICTURE:
         return _picture_labels(path, rows, unlabelled)
     if path.suffix.lower() == RUNS:
@@ -138,10 +134,7 @@ def _check_count(count: int, rows: int | None) -> None:
 
 
 def _picture_labels(path: Path, rows: int | None, unlabelled: int) -> tuple[np.ndarray, int]:
-    """Read labels [1, h, w] i32 of a label picture, -1 for none, and the number of masks.
-
-    With 0 for unlabelled, the largest value is the number of vectors.
-    """
+    """Read labels [1, h, w] i32 of a label picture, -1 for none, and the number of masks (see the module)."""
     values = label_png(path)[0]
     labelled = values != unlabelled
     high = int(values.max(initial=0, where=labelled))

@@ -18,9 +18,7 @@ SAMPLED_VIEWS = 4  # views whose grids are checked; fewer grids are not
 
 
 def smoothness(grids: Sequence[np.ndarray]) -> dict[str, float]:
-    """Return medians over maps [h, w, F] f32 of mean cosines of neighbouring cells and of any two cells, and of
-    neighbours where the bytes are read in another order of axes, by READINGS.
-    """
+    """Return medians over maps [h, w, F] f32 of mean cosines of neighbours, of any two cells, and by READINGS."""
     rows = []
     for grid in grids:
         sides = np.array(grid.shape)

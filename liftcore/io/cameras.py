@@ -76,7 +76,15 @@ class CameraSource:
         else:
             assert self.file is not None
             source, document = str(self.file), read_json(self.file)
-            cameras = self._parse(document, source)
+            photos = PhotosBeside(self.photos or Path(os.path.abspath(self.file)).parent)
+            with naming(source):
+                if is_export(document):
+                    data = read_json(self.data) if self.data else None
+                    cameras = parse_export(document, source, data, photos)
+                elif isinstance(document, list):
+                    cameras = _parse_inria(document, source)
+                else:
+                    cameras = parse_transforms(document, source, photos)
         if self.frame is not None and not is_export(document):  # an export is in the frame of the splats
             if isinstance(document, list):
                 expected, got = "cameras in another frame", "Inria's, which are in the frame of their splats"
@@ -87,16 +95,6 @@ class CameraSource:
                 cameras = cameras_in_frame(cameras, matrix)
         cameras.warnings += self.warnings
         return cameras
-
-    def _parse(self, document: object, source: str) -> Cameras:
-        assert self.file is not None
-        photos = PhotosBeside(self.photos or Path(os.path.abspath(self.file)).parent)
-        with naming(source):
-            if is_export(document):
-                return parse_export(document, source, read_json(self.data) if self.data else None, photos)
-            if isinstance(document, list):
-                return _parse_inria(document, source)
-            return parse_transforms(document, source, photos)
 
 
 def read_cameras(path: Path | str) -> Cameras:
@@ -245,7 +243,7 @@ def _parse_inria(document: list[Any], source: str) -> Cameras:
             raise ValueError(f"{JSON_FORMATS}, got a list with {repr(foreign[0])[:60]}; {hint}")
         names = view_names([str(record["img_name"]) for record in document])
 
-    def cameras(name: str, record: dict[str, Any]) -> list[Camera]:
+    def camera(name: str, record: dict[str, Any]) -> Camera:
         with reading(f"{source} camera {name!r}", InvalidCameras, "a camera"):
             width, height = (pixels(record[key], key) for key in ("width", "height"))
             fx, fy = (number(record[key], key) for key in ("fx", "fy"))
@@ -253,9 +251,9 @@ def _parse_inria(document: list[Any], source: str) -> Cameras:
             rotation = matrix(record["rotation"], (3,), 3, "rotation")
             (position,) = matrix([record["position"]], (1,), 3, "position")
         pose = viewmat_of(rotation, position)
-        return [Camera.pinhole(name, width, height, fx, fy, width / 2, height / 2, viewmat=pose)]
+        return Camera.pinhole(name, width, height, fx, fy, width / 2, height / 2, viewmat=pose)
 
-    views, warnings = read_views(zip(names, document, strict=True), cameras)
+    views, warnings = read_views(zip(names, document, strict=True), camera)
     return Cameras(views, warnings=warnings)
 
 

@@ -126,7 +126,7 @@ def read_colmap(folder: Path) -> Cameras:
         names = view_names([image.name for image in images])
         files = camera_file, image_file
         pairs = zip(names, images, strict=True)
-        cameras, warnings = read_views(pairs, lambda name, image: _cameras(name, image, sensors, files))
+        cameras, warnings = read_views(pairs, lambda name, image: _camera(name, image, sensors, files))
         broken = [name for name in names if REPLACED in name]
         if broken:
             advice = "views pair with none of them: rename the photos, and their names in the model"
@@ -155,7 +155,7 @@ def _reading(path: Path) -> Iterator[None]:
             raise ValueError(f"a whole file, got one that ends after {path.stat().st_size} bytes") from None
 
 
-def _cameras(name: str, image: _Image, sensors: Mapping[int, _Sensor], files: tuple[Path, Path]) -> list[Camera]:
+def _camera(name: str, image: _Image, sensors: Mapping[int, _Sensor], files: tuple[Path, Path]) -> Camera:
     """Return the view of an image; cameras that no image uses may be of any model."""
     sensor, source = sensors.get(image.camera), str(files[1])
     if sensor is None:
@@ -169,7 +169,7 @@ def _cameras(name: str, image: _Image, sensors: Mapping[int, _Sensor], files: tu
     with reading(f"{files[0]} camera {image.camera}", InvalidCameras, f"a camera of {READ_MODELS}"):
         intrinsics, distortion = calibration(sensor.model, sensor.parameters)
     camera = Camera.pinhole(name, sensor.width, sensor.height, *intrinsics, viewmat=pose)
-    return [camera if distortion is None else behind_lens(camera, distortion)]
+    return behind_lens(camera, distortion)
 
 
 def _mapped(path: Path) -> Any:

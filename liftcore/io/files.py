@@ -19,10 +19,7 @@ from liftcore.runtime.arguments import as_list, as_path, check_choice
 
 LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 # Errors that zipfile and its decompressors raise for a damaged file.
-BROKEN_ZIP = (
-    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError),
-    *(NotImplementedError, OSError, RuntimeError, ValueError),
-)
+BROKEN_ZIP = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, OSError, RuntimeError, ValueError)
 # Files of Windows, macOS and Synology, in lower case; their other files begin with a dot.
 SYSTEM_FILES = frozenset((
     "thumbs.db", "ehthumbs.db", "desktop.ini", "__macosx", "@eadir", "$recycle.bin", "#recycle", "@recycle",
@@ -49,10 +46,7 @@ def first_bytes(head: bytes) -> str:
 
 
 def is_system_file(path: PurePath) -> bool:
-    """Return True if a path, relative to a folder, or a folder on the way is hidden or of the operating system.
-
-    Examples are ``._IMG.png`` and ``__MACOSX/IMG.png``.
-    """
+    """Return True if a relative path, or a folder in it, is hidden or of the system, such as ``__MACOSX/IMG.png``."""
     inner = (part for part in path.parts if part not in (".", ".."))
     return any(part.startswith((".", "~$")) or part.lower() in SYSTEM_FILES for part in inner)
 
@@ -73,15 +67,12 @@ def refuse_pointer(source: str, head: bytes) -> None:
 
 def open_regular(path: Path) -> BufferedReader:
     """Open a regular file to read: devices may have no end, and pipes may block forever."""
-    handle = open(path, "rb", opener=_open_without_waiting)  # noqa: SIM115 - the caller closes it
+    waiting = getattr(os, "O_NONBLOCK", 0)  # Windows has no such pipes
+    handle = open(path, "rb", opener=lambda name, flags: os.open(name, flags | waiting))  # noqa: SIM115 - its caller's
     if stat.S_ISREG(os.fstat(handle.fileno()).st_mode):
         return handle
     handle.close()
     raise OSError(errno.EINVAL, "no regular file", str(path))
-
-
-def _open_without_waiting(path: str, flags: int) -> int:
-    return os.open(path, flags | (0 if sys.platform == "win32" else os.O_NONBLOCK))
 
 
 def is_zip(path: Path) -> bool:
@@ -99,10 +90,7 @@ def open_zip(path: Path) -> zipfile.ZipFile:
 
 
 def files_in_zip(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    """Return the files of a zip by their names with slashes: some programs write backslashes or ``./``.
-
-    Those of the operating system are left out, as in folders.
-    """
+    """Return the files of a zip but the system's by names with slashes: some programs write backslashes or ``./``."""
     files = {}
     for member in archive.infolist():
         parts = PurePosixPath(member.filename.replace("\\", "/")).parts
@@ -149,8 +137,7 @@ def check_output(path: Path | str, inputs: Path | str | Iterable[Path | str], ki
     """Check that an output can be written, and is no folder, none of the inputs and no file of another kind.
 
     Args:
-        path: as the user gave it. inputs: files, and folders of cameras, that are read for it. kind: what goes there,
-            one of OUTPUT_TYPES.
+        inputs: files, and folders of cameras, that are read for it. kind: one of OUTPUT_TYPES.
     """
     from liftcore.io.formats import WRITERS
     from liftcore.io.kinds import identify

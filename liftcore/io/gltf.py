@@ -81,10 +81,7 @@ def read_gltf(path: Path, *, colour: bool = True) -> Fields:
 
 
 def _join_primitives(parts: Sequence[Fields]) -> Fields:
-    """Concatenate the splats of several primitives, in the render mode of the first.
-
-    Harmonics have the largest degree, and further columns are 0 where a primitive has none.
-    """
+    """Concatenate splats of primitives: the first's render mode, the largest degree, and 0 in missing columns."""
     warnings = dict.fromkeys(text for part in parts for text in part["warnings"])
     fields: Fields = {"render_mode": parts[0]["render_mode"], "warnings": tuple(warnings), "extras": {}}
     for name in dict.fromkeys(name for part in parts for name in part["extras"]):

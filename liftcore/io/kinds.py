@@ -32,6 +32,7 @@ from liftcore.io.files import (
     open_zip,
 )
 from liftcore.io.formats import HTTP_SUFFIXES, SplatFormat
+from liftcore.io.json_file import MAX_JSON_BYTES
 from liftcore.io.ply import EXPORT_PLY, MAX_HEADER_BYTES, TRAINED, cloud_without_splats
 from liftcore.io.sog import META, is_sog_document, sog_folder
 from liftcore.io.splat import looks_like_splat
@@ -45,7 +46,6 @@ PARTS = {"labels", "codebook", "grid"}  # of a feature pack's views
 CAMERA_FILES = re.compile(
     r"(^|/)((cameras|images|frames|rigs)\.(bin|txt)|(dataparser_)?transforms[^/]*\.json|cameras\.json)$"
 )
-MAX_JSON_BYTES = 64 << 20  # of a document that is parsed
 HEAD_BYTES = 4096  # of files recognised by their beginning
 DEPTH = 5  # folders down
 MAX_FOLDERS = 2_000
@@ -200,8 +200,7 @@ def wrong_kind(
 
 def identify(path: Path | str) -> FileKind:
     """Identify a file or folder, without an error: one that does not open has a name that says so."""
-    as_path(path)
-    path = Path(path)
+    path = as_path(path)
     try:
         mode = path.stat().st_mode
         if stat.S_ISDIR(mode):
@@ -236,9 +235,10 @@ def _file(path: Path) -> FileKind:  # noqa: PLR0911 - a rule each
         return _zip(path)
     if head[:4] == b"PK\3\4":
         return FileKind(None, "a zip that is cut short or damaged", "copy or download it again")
-    if suffix == ".safetensors" or _is_safetensors(head, size):
+    if suffix == ".safetensors" or (head[8:9] == b"{" and int.from_bytes(head[:8], "little") < size):
         return _safetensors(path)
-    by_content = _by_magic(head) or (_by_text(path, head, size) if _is_text(head) else None)
+    is_text = not any(byte < 9 or 13 < byte < 32 for byte in head[:HEAD_BYTES])
+    by_content = _by_magic(head) or (_by_text(path, head, size) if is_text else None)
     is_unknown = by_content is None and suffix not in _BY_SUFFIX
     if suffix == ".splat" or (is_unknown and looks_like_splat(head, size)):
         return _splats_as(SplatFormat.SPLAT)
@@ -258,10 +258,6 @@ def _ply(head: bytes) -> FileKind:
     first = next((line.split()[1:2] for line in lines if line.startswith("element ")), [])
     splat_format = SplatFormat.COMPRESSED_PLY if first == ["chunk"] else SplatFormat.PLY
     return FileKind("splats", "splats", format=splat_format)
-
-
-def _is_safetensors(head: bytes, size: int) -> bool:
-    return head[8:9] == b"{" and int.from_bytes(head[:8], "little") < size
 
 
 def _safetensors(path: Path) -> FileKind:
@@ -308,10 +304,6 @@ def _by_text(path: Path, head: bytes, size: int) -> FileKind | None:
 def _colmap_part(path: Path) -> FileKind:
     is_model = path.name in MODEL_FILES
     return FileKind("cameras" if is_model else None, "a part of a COLMAP model", "give the folder that it lies in")
-
-
-def _is_text(head: bytes) -> bool:
-    return not any(byte < 9 or 13 < byte < 32 for byte in head[:HEAD_BYTES])
 
 
 def _json(path: Path, size: int) -> FileKind:

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 # Version 3 is for structured arrays only.
 READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-# Errors of NumPy for a header that is no Python literal, besides its own ValueError.
-PARSE_ERRORS = (ValueError, TypeError, SyntaxError, EOFError, RecursionError, MemoryError, TokenError)
+# Errors of NumPy for a header that is no Python literal, besides those of zips.
+PARSE_ERRORS = (TypeError, SyntaxError, MemoryError, TokenError)
 NUMBERS = "fiu"  # kinds of NumPy: floats, integers, unsigned integers
 BFLOAT16 = np.dtype("V2")  # NumPy has no bfloat16, and reads it as this
 MOST_UNZIPPED_BYTES = 1 << 32  # of the array of a .npz
@@ -27,10 +27,7 @@ Values = TypeVar("Values", np.ndarray, "Tensor")
 
 
 def open_array(path: Path, kinds: str = NUMBERS) -> np.ndarray:
-    """Open the array of a ``.npy`` file, the only one of a ``.npz``, or the tensor of a ``.pt`` or ``.pth`` file.
-
-    Its dtype is one of ``kinds``, in NumPy's letters. A ``.npy`` file is mapped.
-    """
+    """Open the only array of a ``.npy`` (mapped), ``.npz``, ``.pt`` or ``.pth``; ``kinds`` are NumPy's letters."""
     suffix = path.suffix.lower()
     read = _tensor if suffix in TENSORS else _zipped if suffix == ".npz" else _mapped
     with reading(path, InvalidFeatures, "an array of numbers", TENSOR_HINT if suffix in TENSORS else HINT):
@@ -101,9 +98,7 @@ def _tensor(path: Path, kinds: str) -> np.ndarray:
 
 
 def load_tensors(path: Path, hint: str = "save its tensors by torch.save") -> Any:
-    """Load a file of torch for weights alone, which builds tensors and runs no code of the file; an error ends by the
-    hint.
-    """
+    """Load a file of torch for weights alone, which runs no code of the file; an error ends by the hint."""
     import torch
 
     open_regular(path).close()

@@ -14,7 +14,7 @@ from typing import Any
 
 from liftcore.errors import InvalidCameras, InvalidPhotos, NotFound
 from liftcore.io.files import BROKEN_ZIP, files_in_zip, open_zip
-from liftcore.io.photos import UPRIGHT, read_header
+from liftcore.io.photos import UPRIGHT, open_image, read_header
 from liftcore.scene.views import cameras_of_views, view_names
 
 MAX_PHOTOS = 10_000  # photos
@@ -72,16 +72,14 @@ def _require_bounds(count: int, members: Mapping[str, zipfile.ZipInfo], size: in
 
 
 def _require_photo(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> None:
-    from PIL import Image, UnidentifiedImageError  # in the check of an upload alone
-
     kind, label = FORMATS[_media_type(member.filename)], member.filename[:80]
     if member.flag_bits & ENCRYPTED:
         raise InvalidPhotos(label, expected="a photo that is not encrypted", got="one that is")
     content = archive.read(member)  # all of it, so that its checksum is looked at
     try:
-        with Image.open(io.BytesIO(content), formats=[kind]) as photo:
+        with open_image(io.BytesIO(content), kind) as photo:
             width, height = photo.size
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError):
+    except (OSError, SyntaxError, ValueError):
         raise InvalidPhotos(
             label, expected=f"a {kind} file, as its name says", got="another, or a damaged one"
         ) from None

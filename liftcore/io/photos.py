@@ -88,17 +88,24 @@ def orientation_warnings(readings: Mapping[str, Reading], counterparts: str) -> 
 @contextmanager
 def open_photo(photo: Path | IO[bytes], name: str = "") -> Iterator[Image.Image]:
     """Open a photo with Pillow, which decodes no pixel yet; errors name the file."""
-    from PIL import Image, UnidentifiedImageError
-
     source = name or str(photo)
     hint = UNREAD.get(PurePosixPath(source).suffix.lower(), "")
-    with reading(source, InvalidInput, "a complete image", hint), warnings.catch_warnings():
+    with reading(source, InvalidInput, "a complete image", hint), open_image(photo) as image:
+        yield image
+
+
+@contextmanager
+def open_image(picture: Path | IO[bytes], kind: str = "") -> Iterator[Image.Image]:
+    """Open a picture of Pillow's format ``kind`` or any, without its pixels; a ValueError says that it is none."""
+    from PIL import Image, UnidentifiedImageError
+
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about large images, and odd EXIF
         try:
-            with Image.open(photo) as image:
+            with Image.open(picture, formats=[kind] if kind else None) as image:
                 yield image
         except UnidentifiedImageError:
-            raise ValueError("a file that Pillow cannot identify") from None
+            raise ValueError(f"a file that Pillow cannot identify{kind and f' as {kind}'}") from None
         except Image.DecompressionBombError:
             limit = 2 * (Image.MAX_IMAGE_PIXELS or 0)
             raise ValueError(f"an image of at most {limit} pixels, got a larger one") from None
@@ -123,11 +130,8 @@ def header_of(image: Image.Image) -> PhotoHeader:
 class PhotosBeside:
     """Photos in the folder of a camera file, or in its parent, by the paths that the file has.
 
-    Nothing outside these two folders is read: of a path that leads elsewhere, such as to another machine's disk, the
-    last parts are searched in them.
-
-    Args:
-        folder: of the camera file, on the disk or in a zip.
+    Nothing outside these two folders, on the disk or in a zip, is read: of a path that leads elsewhere, such as to
+    another machine's disk, the last parts are searched in them.
     """
 
     def __init__(self, folder: Path | zipfile.Path) -> None:

@@ -170,7 +170,7 @@ def rewritten(
     """Yield a PLY with other columns and fewer rows, a block at a time; all else stays byte for byte.
 
     Args:
-        path: the file, which is read and not mapped, to bound memory. count: P that it must have.
+        path: of a file of ``count`` splats, which is read and not mapped, to bound memory.
         columns: name -> [P]. One that the file has stays in its place, a new one comes behind.
         mask: [P] bool, the rows to keep; None: all.
     """
@@ -200,11 +200,7 @@ def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
     """Yield a PLY whose splats have one colour each, independent of the view; all else is unchanged byte for byte.
 
     Higher harmonics become zero. The lobes of DBS become dark and not zero: a lobe of zeros shines. Of files without
-    harmonics, red, green and blue are changed, in their type and unit.
-
-    Args:
-        path: the file.
-        colours: [P, 3] f32, the constant terms of the spherical harmonics (``f_dc_*``, or ``sh0_*`` of DBS).
+    harmonics, red, green and blue are changed, in their type and unit. ``colours`` [P, 3] f32 are constant terms.
     """
     header, columns = read_header(path), dict[str, np.ndarray]()
     for name, slot in model_slots(header.names, recognise_kernel(header.names)).items():

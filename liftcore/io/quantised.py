@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liftcore.scene.harmonics import SH_C0, band_rotation, constant_terms
+from liftcore.scene.origin import LARGEST_SCALE
 from liftcore.scene.quaternions import product_matrix
 
 if TYPE_CHECKING:
@@ -26,18 +27,12 @@ GREY = 0.6  # of splats that have no colours
 THIN = 0.01  # of a disc's smaller scale: the thickness that it is shown with
 REST_INDICES = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # indices of a quaternion without each one
 MOST_SH_ROWS = 16  # of what other formats hold: degree 3
-LARGEST_SCALE = 80.0  # log: its exponential is a float32
 
 Fields = dict[str, Any]  # arguments of `Splats` by their names
 
 
 def decoded(count: int, shapes: Mapping[str, tuple[int, ...]], decode: Callable[[slice], Fields]) -> Fields:
-    """Decode the fields of ``count`` splats a block of rows at a time, so that memory stays near their size.
-
-    Args:
-        count: P. shapes: field -> its shape behind P.
-        decode: rows -> those fields of these rows.
-    """
+    """Decode fields of such shapes behind P = ``count`` a block of rows at a time: memory stays near their size."""
     fields: Fields = {}
     with np.errstate(over="ignore", invalid="ignore"):  # values beyond float32 are infinite, and refused as such
         for first in range(0, count, BLOCK_ROWS):
@@ -63,11 +58,7 @@ def logits(alpha: np.ndarray) -> np.ndarray:
 
 
 def smallest_three(parts: np.ndarray, largest: np.ndarray) -> np.ndarray:
-    """Complete unit quaternions [n, 4] from three of their parts, in order, and the index of the largest one.
-
-    Args:
-        parts: [n, 3]. largest: [n] of 0..3, the index of the missing part, which is not negative.
-    """
+    """Complete unit quaternions [n, 4] from parts [n, 3], in order, and the index [n] of the largest, positive."""
     places = REST_INDICES[largest]
     quats = np.empty((len(parts), 4))
     np.put_along_axis(quats, places, parts, axis=1)
@@ -124,8 +115,7 @@ def gaussian_rows(splats: Splats) -> Iterator[GaussianRows]:
 def gaussians_in(splats: Splats, axes: np.ndarray) -> GaussianRows:
     """Return all splats as 3D Gaussians in another frame, with x y z w and harmonics of degree 0 to 3 in ``sh``.
 
-    Args:
-        axes: [3, 3] f64, 1 and -1 on its diagonal: from the frame of PLYs and cameras to that one.
+    ``axes`` [3, 3] f64, 1 and -1 on its diagonal, lead from the frame of PLYs and cameras to that one.
     """
     blocks = list(gaussian_rows(splats))
     means, scales, quats, opacities, colours = (

@@ -10,7 +10,6 @@ ours are the file's.
 
 import io
 import json
-import warnings
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
@@ -19,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from liftcore.io.files import BROKEN_ZIP, open_regular, open_zip
+from liftcore.io.photos import open_image
 from liftcore.io.quantised import MOST_GROWTH, Fields, decoded, field_shapes, logits, smallest_three
 from liftcore.scene.render_mode import mode_of_word
 
@@ -94,11 +94,7 @@ def _meta_of(path: Path) -> Path:
 
 
 class _Pictures:
-    """Decoder of a folder, on the disk or in an open zip.
-
-    Args:
-        folder: of the pictures. meta: the name of their description. size: bytes of all of them as they are stored.
-    """
+    """Decoder of pictures in a folder, on the disk or in an open zip, by ``meta``; they have ``size`` bytes."""
 
     def __init__(self, folder: Path | zipfile.Path, meta: str, size: int) -> None:
         self.folder, self.size = folder, size
@@ -178,18 +174,14 @@ class _Pictures:
 
     def _picture(self, part: str, index: int, least: int) -> np.ndarray:
         """Read a picture [h, w, 4] u8 of at least ``least`` pixels and not many more."""
-        from PIL import Image, UnidentifiedImageError
-
         name = self.meta[part]["files"][index]
         content = self._member(name, self.size)
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-                with Image.open(io.BytesIO(content), formats=["WEBP"]) as picture:
-                    pixels = picture.width * picture.height
-                    if least <= pixels <= 2 * least + (1 << 16):
-                        return np.asarray(picture.convert("RGBA"))
-        except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
+            with open_image(io.BytesIO(content), "WEBP") as picture:
+                pixels = picture.width * picture.height
+                if least <= pixels <= 2 * least + (1 << 16):
+                    return np.asarray(picture.convert("RGBA"))
+        except (OSError, ValueError, SyntaxError) as error:
             raise _broken(f"a WebP picture as {name!r}", str(error)[:120]) from None
         raise _broken(f"{least} pixels in {name!r}", f"{pixels}")
 

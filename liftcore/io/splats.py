@@ -93,8 +93,7 @@ def write_splats(path: Path | str, splats: Splats, columns: Mapping[str, Any] | 
     if not isinstance(splats, Splats):
         got = f"{type(splats).__name__} {splats!r}"[:80]
         raise InvalidSplats("splats", expected="Splats, behind the path", got=got, hint="write_splats(path, splats)")
-    suffix = Path(str(path)).suffix.lower()
-    suffix = suffix or ".ply"
+    suffix = Path(str(path)).suffix.lower() or ".ply"
     write = _writer_of(suffix, "path")
     if columns and suffix not in WITH_COLUMNS:
         expected = f"a path that ends in {' or '.join(WITH_COLUMNS)}, which hold columns"
@@ -212,8 +211,7 @@ def some_rows(path: Path, mask: np.ndarray, suffix: str = ".ply", world: WorldFr
     Rows of a PLY stay byte for byte (`liftcore.io.ply.rewritten`); another format becomes a PLY of 3DGS.
 
     Args:
-        path: the file. mask: [P] bool, the rows to keep. suffix: of the output.
-        world: of its splats; None: the file's.
+        mask: [P] bool, the rows to keep. suffix: of the output. world: of its splats; None: the file's.
     """
     write = _writer_of(suffix, "suffix")
     if suffix == ".ply" and format_of(path) is SplatFormat.PLY:
@@ -229,8 +227,7 @@ def labelled(path: Path, labels: Labels, suffix: str = ".ply", mask: np.ndarray 
     From a PLY to a PLY all else stays byte for byte; from another format the PLY has the layout of its kernel.
 
     Args:
-        path: the file. labels: of its splats; columns that it has are replaced. suffix: of what is written.
-            The document's ``world`` is that of the splats.
+        labels: of its splats, with their ``world``; columns that the file has are replaced. suffix: of the output.
         mask: [P] bool, the rows to keep; None: all.
     """
     write = _writer_of(suffix, "suffix")
@@ -252,10 +249,8 @@ def labelled(path: Path, labels: Labels, suffix: str = ".ply", mask: np.ndarray 
 def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
     """Yield a file with one view-independent colour of each splat, as the bytes of a PLY in blocks.
 
-    All else of a PLY stays byte for byte (`liftcore.io.ply.recoloured`); another format becomes a PLY of 3DGS.
-
-    Args:
-        path: the file. colours: [P, 3] u8 sRGB.
+    All else of a PLY stays byte for byte (`liftcore.io.ply.recoloured`); another format becomes a PLY of 3DGS. The
+    ``colours`` are [P, 3] u8 sRGB.
     """
     terms = constant_terms(colours / 255).astype(np.float32)
     if format_of(path) is SplatFormat.PLY:

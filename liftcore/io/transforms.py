@@ -70,17 +70,13 @@ FOCALS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 def parse_transforms(document: Any, source: str, photos: PhotosBeside) -> Cameras:
     """Return the cameras of a transforms.json document, in the frame that its poses are in.
 
-    A frame's own intrinsics come before the shared ones. A scene trained in another frame (nerfstudio
-    normalises poses by default) must be exported together with its cameras.
-
-    Args:
-        document: as JSON has it. source: its file, for errors.
-        photos: source of sizes that the document does not have.
+    A frame's own intrinsics come before the shared ones, and ``photos`` have missing sizes. A scene trained in
+    another frame (nerfstudio normalises poses by default) must be exported together with its cameras.
     """
     with reading(source, InvalidCameras, FORMATS):
         names, frames = _named_frames(document["frames"])
     views = zip(names, [ChainMap(frame, document) for frame in frames], strict=True)
-    cameras, warnings = read_views(views, lambda name, keys: _cameras(name, keys, source, photos))
+    cameras, warnings = read_views(views, lambda name, keys: _camera(name, keys, source, photos))
     of_nerfstudio = any(key in document for key in OF_NERFSTUDIO)
     warnings += [OWN_FRAME] if of_nerfstudio else []
     world = nerfstudio_world(cameras) if of_nerfstudio else UNKNOWN
@@ -113,7 +109,7 @@ def parse_export(records: Any, source: str, data: Any, photos: PhotosBeside) -> 
                 raise ValueError(f"intrinsics in the file or beside it, got {got}; {hint}")
             scoped.append(keys)
     views = zip(names, scoped, strict=True)
-    cameras, warnings = read_views(views, lambda name, keys: _cameras(name, keys, source, photos))
+    cameras, warnings = read_views(views, lambda name, keys: _camera(name, keys, source, photos))
     return Cameras(cameras, world=nerfstudio_world(cameras), warnings=warnings)
 
 
@@ -149,7 +145,7 @@ def transforms_of(cameras: Mapping[str, Camera]) -> dict[str, Any]:
     return {"frames": frames}
 
 
-def _cameras(name: str, keys: ChainMap[str, Any], source: str, photos: PhotosBeside) -> list[Camera]:
+def _camera(name: str, keys: ChainMap[str, Any], source: str, photos: PhotosBeside) -> Camera:
     """Return the view of a frame."""
     location = f"{source} frame {name!r}"
     with reading(location, InvalidCameras, "a camera"):
@@ -163,7 +159,7 @@ def _cameras(name: str, keys: ChainMap[str, Any], source: str, photos: PhotosBes
             raise ValueError(f"0 0 0 1 as the last row of transform_matrix, got {got}")
     pose = viewmat_of(rows[:3, :3] * CAMERA_AXES["opengl"], rows[:3, 3])
     camera = Camera.pinhole(name, width, height, *intrinsics, viewmat=pose)
-    return [camera if distortion is None else behind_lens(camera, distortion)]
+    return behind_lens(camera, distortion)
 
 
 def _size(keys: Mapping[str, Any], photos: PhotosBeside) -> tuple[int, int]:
@@ -224,7 +220,8 @@ def _distortion(keys: ChainMap[str, Any]) -> Distortion | None:
     fisheye = model == FISHEYE or bool(keys.get("is_fisheye"))
     sets = [values for scope in keys.maps for values in _coefficients(scope)]
     if any(values != sets[0] for values in sets):  # programs differ in which of them counts
-        alternatives = " and ".join(map(_format_coefficients, sets))
+        texts = (", ".join(f"{key} = {value:g}" for key, value in values.items()) or "none" for values in sets)
+        alternatives = " and ".join(texts)
         raise ValueError(f"the same distortion wherever it is given, got {alternatives}")
     values = sets[0] if sets else {}
     unread = next((key for key in values if key not in SUPPORTED_COEFFICIENTS[fisheye]), None)
@@ -246,10 +243,6 @@ def _coefficients(scope: Mapping[str, Any]) -> list[dict[str, float]]:
     return [{key: x for key in values if (x := number(values[key], key)) != 0} for values in sets if values]
 
 
-def _format_coefficients(values: Mapping[str, float]) -> str:
-    return ", ".join(f"{key} = {value:g}" for key, value in values.items()) or "none"
-
-
 def cameras_in_frame(cameras: Cameras, matrix: np.ndarray) -> Cameras:
     """Return the cameras in the frame of the splats, of `read_frame`."""
     views = [camera.transformed(matrix) for camera in cameras.values()]
@@ -265,8 +258,7 @@ def read_frame(path: Path, applied: Mapping[str, Any], source: str) -> np.ndarra
     ``applied_scale`` a. The rest is ``(s / a) T A^-1``, as in nerfstudio's data parser.
 
     Args:
-        path: a ``FRAME_FILE``. applied: the transforms.json that the cameras are of; empty of a COLMAP model.
-        source: the name of that file.
+        applied: the transforms.json ``source`` that the cameras are of; empty of a COLMAP model.
     """
     document = read_json(path)
     with reading(path, InvalidCameras, "the frame of a run"):

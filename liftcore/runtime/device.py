@@ -8,20 +8,18 @@ import os
 import platform
 import shutil
 import sys
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import torch
 
 from liftcore.errors import InvalidSettings, Unavailable
-from liftcore.runtime.arguments import device_name
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
+from liftcore.runtime.arguments import check_choice, device_name
 
 OLDEST_CAPABILITY = (7, 5)  # compute capability that Triton and current builds of torch support
 COMPILERS = ("gcc", "clang", "cc")
@@ -93,8 +91,7 @@ def give_back_memory() -> None:
 def choose_device(name: str | torch.device) -> Device:
     """Return the device for ``auto`` (a GPU if one is available), ``cpu`` or ``cuda``, as `device_name` has it."""
     requested = device_name(name)
-    if requested not in ("auto", "cpu", "cuda"):
-        raise InvalidSettings("device", expected="'auto', 'cpu' or 'cuda'", got=repr(requested)[:80])
+    check_choice("device", requested, ("auto", "cpu", "cuda"), InvalidSettings)
     if requested == "cpu":
         return CPU
     missing = _missing()

@@ -7,15 +7,13 @@ thread. The default dtype belongs to the process and is not changed: every tenso
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 
 def _autocast(device: str, dtype: torch.dtype | None) -> torch.autocast:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 
 from liftcore.errors import InvalidCameras, NotFound, reading
-from liftcore.runtime.arguments import nearest
+from liftcore.runtime.arguments import check_choice, nearest
 from liftcore.runtime.one_line import join_names, one_line
 from liftcore.scene.compositing import MAX_SIDE
 from liftcore.scene.distortion import Distortion, Lens, Rectangle, shared_lens
@@ -95,9 +95,8 @@ class Camera:
         if lens is not None and not isinstance(lens, Lens):
             hint = "read_cameras reads lenses of COLMAP and nerfstudio; undistorted photos need none"
             raise InvalidCameras(f"camera {name!r} lens", expected="a Lens, or None", got=repr(lens)[:80], hint=hint)
-        fields = {"viewmat": _matrix(viewmat), "K": _matrix(K), "width": _pixels(width), "height": _pixels(height)}
-        for field, value in {**fields, "lens": lens, "name": composed(name)}.items():
-            object.__setattr__(self, field, value)
+        vars(self).update(viewmat=_matrix(viewmat), K=_matrix(K), width=_pixels(width), height=_pixels(height))
+        vars(self).update(lens=lens, name=composed(name))
         label = f"camera {self.name!r}"
         with reading(f"{label} size", InvalidCameras, f"width and height, whole numbers in 1..{MAX_SIDE}"):
             if not (0 < self.width <= MAX_SIDE and 0 < self.height <= MAX_SIDE):
@@ -148,9 +147,7 @@ class Camera:
         Raises:
             InvalidCameras: an unknown convention, or as the constructor has it.
         """
-        if not isinstance(convention, str) or convention not in CAMERA_AXES:
-            expected, got = " or ".join(map(repr, CAMERA_AXES)), repr(convention)[:80]
-            raise InvalidCameras(f"camera {name!r} convention", expected=expected, got=got)
+        check_choice(f"camera {name!r} convention", convention, CAMERA_AXES, InvalidCameras)
         pose_matrix = _matrix(pose)
         if pose_matrix.shape not in ((4, 4), (3, 4)):
             expected, got = "a finite 4x4 or 3x4 matrix", f"shape {list(pose_matrix.shape)}"
@@ -407,14 +404,14 @@ def viewmat_of(camera_to_world: np.ndarray, centre: np.ndarray) -> np.ndarray:
 
 
 def read_views(
-    views: Iterable[tuple[str, R]], cameras_of: Callable[[str, R], list[Camera]]
+    views: Iterable[tuple[str, R]], camera_of: Callable[[str, R], Camera]
 ) -> tuple[list[Camera], list[str]]:
     """Return the cameras of a file's views, and a warning that names those that were skipped for a broken pose."""
     cameras: list[Camera] = []
     broken: dict[str, InvalidPose] = {}
     for name, record in views:
         try:
-            cameras += cameras_of(name, record)
+            cameras.append(camera_of(name, record))
         except InvalidPose as error:
             broken[name] = error
     if not broken:
@@ -427,18 +424,15 @@ def read_views(
     return cameras, [f"{count}: {listing}, the first with {first.got} in place of {first.expected}"]
 
 
-def behind_lens(camera: Camera, distortion: Distortion) -> Camera:
-    """Return the camera of a distorted photo, from a camera with the photo's size and intrinsics."""
+def behind_lens(camera: Camera, distortion: Distortion | None) -> Camera:
+    """Return the camera of a photo, perhaps distorted, from a camera with the photo's size and intrinsics."""
+    if distortion is None:
+        return camera
     photo = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
     lens = shared_lens(Lens(*photo, distortion))
     hint = "calibrate the camera again, or undistort the photos, and train and lift on them"
     with reading(f"camera {camera.name!r} distortion", InvalidCameras, "one that a lens may have", hint):
         return _pinhole(camera, lens, lens.inner)
-
-
-def photo_sizes(photos: Collection[str], cameras: Cameras) -> dict[str, tuple[int, int]]:
-    """Return photo's name -> width and height in pixels, from its camera."""
-    return {photo: cameras[name].photo_size for photo, name in cameras_of_views(photos, cameras).items()}
 
 
 def drawn_by(camera: Camera) -> Camera:

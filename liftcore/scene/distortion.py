@@ -235,10 +235,8 @@ class Lens:
         """Return the extremes of the photo's left, top, right and bottom side, in pixels of the pinhole, x or y.
 
         A side is curved, and where the principal point is off the centre its extreme lies between evenly spaced
-        samples: the interval about it is sampled again, NARROWINGS times.
-
-        Args:
-            towards: [4], 1 or -1 of each side: the extreme is the largest or the smallest x or y.
+        samples: the interval about it is sampled again, NARROWINGS times. It is the largest or smallest x or y of a
+        side, as ``towards`` [4] is 1 or -1.
         """
         sides, low, high = np.arange(4), np.zeros((4, 1)), np.ones((4, 1))
         positions, extreme = np.zeros((4, 1)), np.zeros(4, np.int64)

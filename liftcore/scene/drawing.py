@@ -14,14 +14,10 @@ BAND_PIXELS = 1 << 20  # of a distorted photo, carried at a time
 
 
 def in_photo(camera: Camera, draw: Callable[[Camera], Tensor]) -> Tensor:
-    """Resample the rendering of a pinhole to the pixels of a camera's photo, through its lens.
+    """Resample the picture [H, W, ..] that ``draw`` makes of a pinhole to pixels of a camera's photo, by its lens.
 
-    Args:
-        camera: of the photo. draw: makes a picture [H, W, ..] of a pinhole.
-
-    Returns:
-        [H, W, ..] of the photo. Where there is no lens it is as drawn; else floats are interpolated between four
-        pixels, and others are the nearest one's. Zero at the rim of a fisheye's photo that no pinhole sees.
+    Without a lens it is as drawn; else floats are interpolated between four pixels, and others are the nearest one's.
+    It is zero at the rim of a fisheye's photo that no pinhole sees.
     """
     image = draw(drawn_by(camera))
     if camera.lens is None:

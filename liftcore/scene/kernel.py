@@ -5,6 +5,7 @@ from __future__ import annotations
 from enum import StrEnum
 
 from liftcore.errors import InvalidSplats
+from liftcore.runtime.arguments import check_choice
 
 LOBE_COLOURS = 3  # r g b, the first of the six numbers of a spherical beta lobe
 NORMALS = ("nx", "ny", "nz")  # columns of files, which no kernel reads
@@ -21,10 +22,8 @@ class Kernel(StrEnum):
 
 def kernel_named(name: Kernel | str) -> Kernel:
     """Return the kernel of a name."""
-    try:
-        return Kernel(name)
-    except ValueError:
-        raise InvalidSplats("kernel", expected=" or ".join(Kernel), got=repr(name)[:60]) from None
+    check_choice("kernel", name, Kernel, InvalidSplats)
+    return Kernel(name)
 
 
 def scale_count(kernel: Kernel) -> int:

@@ -83,11 +83,7 @@ class SplatGraph:
 
     @classmethod
     def of(cls, splats: Splats, threads: int | None = None) -> Self:
-        """Find the neighbours of all splats.
-
-        Args:
-            threads: None uses the cores of this process. The result is bitwise identical for any number.
-        """
+        """Find the neighbours of all splats; the result is bitwise identical for any number of threads."""
         from scipy.sparse import csr_array
 
         means, colours = splats.means.cpu().numpy().astype(np.float64), base_colours(splats)

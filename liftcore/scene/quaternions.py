@@ -4,14 +4,7 @@ import numpy as np
 
 
 def rotation_matrices(quats: np.ndarray) -> np.ndarray:
-    """The rotations of quaternions of any length; zero counts as identity.
-
-    Args:
-        quats: [..., 4], w x y z.
-
-    Returns:
-        [..., 3, 3] f64; its columns are the turned axes.
-    """
+    """Rotations [..., 3, 3] f64, whose columns are turned axes, of w x y z [..., 4] of any length; 0: identity."""
     quats = np.asarray(quats, np.float64)
     largest = np.abs(quats).max(axis=-1, keepdims=True)  # first by this: squares of the largest would overflow
     quats = np.where(largest > 0, quats / np.where(largest > 0, largest, 1.0), [1.0, 0.0, 0.0, 0.0])

@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
 from liftcore.errors import InvalidSplats
+from liftcore.runtime.arguments import check_choice
 from liftcore.scene.kernel import Kernel
 
 BY_HAND = "set by hand"  # of `rendering_reason`: the setting was not auto
@@ -33,7 +35,7 @@ class RenderMode:
     """A render mode, and its source."""
 
     model: RenderModel
-    source: str  # its source, as the subject of a sentence; "" of values in memory
+    source: str  # its source, as the subject of a sentence
 
 
 _BY_NAME = {  # as comments and ``meta.json`` spell them
@@ -58,9 +60,8 @@ def render_mode_of(mode: RenderMode | str | None) -> RenderMode | None:
     """Return the mode of a name: ``classic``, ``antialiased`` or ``2dgs``; None stays None."""
     if mode is None or isinstance(mode, RenderMode):
         return mode
-    if not isinstance(mode, str) or mode not in set(RenderModel):
-        raise InvalidSplats("render_mode", expected=" or ".join(RenderModel), got=repr(mode)[:_MAX_TEXT])
-    return RenderMode(RenderModel(mode), "")
+    check_choice("render_mode", mode, RenderModel, InvalidSplats)
+    return RenderMode(RenderModel(mode), f"render_mode={str(mode)!r}")
 
 
 def kernel_of_mode(mode: RenderMode | None) -> Kernel:
@@ -85,12 +86,8 @@ def mode_of_comments(lines: Iterable[str]) -> tuple[RenderMode | None, tuple[str
         if match is None:
             continue
         source = f"the comment {line.strip()[8:].strip()[:_MAX_TEXT]!r}"
-        word = (
-            match["mode"]
-            if match["mode"] is not None
-            else ("mip" if match["flag"].lower() in ("1", "true") else "default")
-        )
-        mode, mode_warnings = mode_of_word(word, source)
+        flag = "mip" if (match["flag"] or "").lower() in ("1", "true") else "default"
+        mode, mode_warnings = mode_of_word(flag if match["mode"] is None else match["mode"], source)
         modes += [mode] if mode else []
         warnings += mode_warnings
     if len({mode.model for mode in modes}) > 1:
@@ -102,22 +99,17 @@ def mode_of_comments(lines: Iterable[str]) -> tuple[RenderMode | None, tuple[str
 def mode_beside(path: Path) -> RenderMode | None:
     """Return the mode of gsplat's or nerfstudio's configuration, in the folder of a trained file or its parent."""
     folder = path.resolve().parent
-    for place in (folder, folder.parent):
-        for name in CONFIGS:
-            config = place / name
-            if not config.is_file():
-                continue
-            try:
+    for config in (place / name for place in (folder, folder.parent) for name in CONFIGS):
+        text, is_gsplat = "", config.name == CONFIGS[0]
+        with suppress(OSError):
+            if config.is_file():
                 with config.open("rb") as handle:
                     text = handle.read(MAX_CONFIG_BYTES).decode("latin-1").replace("\r\n", "\n")
-            except OSError:
-                continue
-            if name == "cfg.yml" and _GSPLAT_DISCS.search(text):
-                return RenderMode(RenderModel.DISCS, f"'model_type: 2dgs' in {name}")
-            match = (_OF_GSPLAT if name == "cfg.yml" else _OF_NERFSTUDIO).search(text)
-            if match:
-                model = RenderModel.ANTIALIASED if match[1] in ("true", "antialiased") else RenderModel.CLASSIC
-                return RenderMode(model, f"{match[0].strip()!r} in {name}")
+        if is_gsplat and _GSPLAT_DISCS.search(text):
+            return RenderMode(RenderModel.DISCS, f"'model_type: 2dgs' in {config.name}")
+        if match := (_OF_GSPLAT if is_gsplat else _OF_NERFSTUDIO).search(text):
+            model = RenderModel.ANTIALIASED if match[1] in ("true", "antialiased") else RenderModel.CLASSIC
+            return RenderMode(model, f"{match[0].strip()!r} in {config.name}")
     return None
 
 
@@ -125,10 +117,9 @@ def rendering_reason(mode: RenderMode | None, antialiased: bool) -> str:
     """Describe the reason of a render mode; ``antialiased`` is the value in use."""
     if mode is None:
         return BY_HAND if antialiased else "nothing says otherwise"
-    source = mode.source or "render_mode of the splats"
     if (mode.model is RenderModel.ANTIALIASED) is antialiased:
-        return f"{source} says so"
-    return f"{BY_HAND}, against {source}"
+        return f"{mode.source} says so"
+    return f"{BY_HAND}, against {mode.source}"
 
 
 def rendering_warnings(mode: RenderMode | None, antialiased: bool, kernel: Kernel) -> list[str]:
@@ -137,5 +128,4 @@ def rendering_warnings(mode: RenderMode | None, antialiased: bool, kernel: Kerne
         return []
     if (mode.model is RenderModel.ANTIALIASED) is antialiased:
         return []
-    source = mode.source or "render_mode of the splats"
-    return [f"antialiased={str(antialiased).lower()} is set by hand, and {source} says {mode.model}"]
+    return [f"antialiased={str(antialiased).lower()} is set by hand, and {mode.source} says {mode.model}"]

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from liftcore.errors import InvalidInput, InvalidSplats, reading
 from liftcore.runtime.one_line import one_line
@@ -26,15 +28,9 @@ from liftcore.scene.similarity import Similarity
 from liftcore.scene.world import UNKNOWN, WorldFrame
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from torch import Tensor
-
     from liftcore.scene.similarity import Numbers
 
-    Array = Tensor | np.ndarray
-
-
+Array = Tensor | np.ndarray
 Rows = Any  # a boolean mask [P], a slice, or whole numbers [n]; of numpy, torch on any device, or a list
 SH_ROWS = (1, 4, 9, 16, 25)  # (degree + 1)^2
 _BEYOND = {"opacity_logits": (True, True), "log_scales": (True, False)}  # True if -inf and +inf have a meaning
@@ -147,8 +143,7 @@ class Splats:
         doubts = [*_kernel_warnings(mode, kernel), *_activation_warnings(columns)]
         all_warnings = tuple(dict.fromkeys((*warnings, *repairs, *doubts, *rounding)))
         fields |= {"render_mode": mode, "origin": origin, "world": world, "warnings": all_warnings}
-        for name, value in fields.items():
-            object.__setattr__(self, name, value)
+        vars(self).update(fields)
         if self.sh is not None and self.sh.shape[1] not in SH_ROWS:
             raise InvalidSplats("sh", expected=f"{SH_ROWS} rows (degree 0..4)", got=str(self.sh.shape[1]))
         if (kernel is Kernel.BETA) != (beta is not None):
@@ -406,8 +401,7 @@ def _kernel_warnings(mode: RenderMode | None, kernel: Kernel) -> list[str]:
     if mode is None or mode.model is RenderModel.CLASSIC:
         return []
     expected = Kernel.GAUSSIAN_2D if mode.model is RenderModel.DISCS else Kernel.GAUSSIAN_3D
-    source = mode.source or f"render_mode={str(mode.model)!r}"
-    return [] if expected is kernel else [f"{source} says {mode.model}, but the splats are taken for {kernel}"]
+    return [] if expected is kernel else [f"{mode.source} says {mode.model}, but the splats are taken for {kernel}"]
 
 
 def shared_tensor(values: object) -> Tensor:
@@ -505,10 +499,9 @@ def _meaningful(name: str, values: Tensor) -> Tensor:
 
 
 def chosen_rows(keep: Rows, count: int) -> Tensor:
-    """Return the numbers [n] i64, on the CPU, of the selected rows, in the order of the selection.
+    """Return the numbers [n] i64, on the CPU, of the selected of P = ``count`` rows, in the order of the selection.
 
-    Args:
-        keep: booleans [P], a slice, or whole numbers [n], of which negative ones count from the end. count: P.
+    Rows are booleans [P], a slice, or whole numbers [n], of which negative ones count from the end.
     """
     expected = f"booleans [{count}], a slice, or row numbers in 0..{count - 1}"
     selection = keep.detach().cpu().numpy() if isinstance(keep, torch.Tensor) else keep

@@ -21,13 +21,8 @@ def touching(splats: Splats, rows: np.ndarray) -> np.ndarray:
 
     Two splats touch where ``|m_j - m_k| <= 2 (s_j + s_k)``, with s the standard deviation of each along the line
     between their centres, ``sqrt(d^T Sigma d)``: a rule without a length of its own, as scenes have no common unit.
-    Each looks at its 16 nearest among the rows.
-
-    Args:
-        splats: the scene. rows: [n] i64, the splats to group; the others do not connect.
-
-    Returns:
-        [n] i32, the number of each row's group, from 0 in the order of their first rows.
+    Each looks at its 16 nearest among the rows [n] i64; other splats do not connect. Returned are the numbers [n] i32
+    of the rows' groups, from 0 in the order of their first rows.
     """
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components

@@ -109,12 +109,9 @@ def open_encoder(spec: str | Path) -> TextEncoder:
 
 
 def encoder_of_space(text_space: str, hint: str = "", *, stand_in: bool = False) -> TextEncoder:
-    """Open the encoder of a lift's text space.
+    """Open the encoder of a lift's text space; ``hint`` is the advice of an error.
 
-    Args:
-        hint: the advice of an error.
-        stand_in: if the weights are not available, use the shipped table of this encoder, which encodes only its
-            own words.
+    A ``stand_in`` for weights that are not available is the shipped table of this encoder, which has its own words.
     """
     if text_space in ("", NO_WORDS):
         space = f"is {NO_WORDS!r}: its features share no space with words" if text_space else "is not recorded"

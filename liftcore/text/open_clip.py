@@ -75,16 +75,14 @@ def tokenizer_of(model_name: str) -> Callable[[list[str]], Any]:
             ) from None
 
 
-def library() -> Any:
-    """Import and return the module open_clip."""
+def library(name: str = "open_clip") -> Any:
+    """Import and return the module of encoders of this name."""
     try:
         import_torchvision()
-        import open_clip
+        return importlib.import_module(name)
     except ImportError as error:
-        hint = "pip install 'splatlift[encoders]'"
-        expected = "the package open_clip_torch"
-        raise Unavailable("encoder open_clip", expected=expected, got=str(error), hint=hint) from None
-    return open_clip
+        expected, hint = f"the package {name}", "pip install 'splatlift[encoders]'"
+        raise Unavailable(f"encoder {name}", expected=expected, got=str(error), hint=hint) from None
 
 
 def _from_tag(label: str, kind: str, model_name: str, tag: str) -> Any:
@@ -136,10 +134,7 @@ def _quiet() -> Iterator[None]:
 
 
 class OpenClipEncoder:
-    """Encoder of texts into the space that a CLIP model shares with its images.
-
-    Create it with `open`.
-    """
+    """Encoder of texts into the space that a CLIP model shares with its images (`open`)."""
 
     def __init__(self, name: str, model: Any, tokenizer: Callable[[list[str]], Any], templates: int = 1) -> None:
         self.name = name if templates == 1 else f"{name}#{templates}"
@@ -150,12 +145,11 @@ class OpenClipEncoder:
 
     @classmethod
     def open(cls, spec: str, templates: int = 1) -> Self:
-        """Load ``MODEL/PRETRAINED_TAG`` (cached or downloaded by open_clip) or ``MODEL@WEIGHTS_FILE``.
-
-        Local files are read with ``weights_only``: a pickle that contains more than tensors is an error.
-        """
-        model = open_model("open_clip", spec)
-        return cls(model.name, _without_images(model.model), tokenizer_of(model.model_name), templates)
+        """Load ``MODEL/PRETRAINED_TAG`` or ``MODEL@WEIGHTS_FILE`` (`open_model`)."""
+        clip_model = open_model("open_clip", spec)
+        if hasattr(clip_model.model, "visual"):  # the image tower takes most of the memory and is not used for texts
+            clip_model.model.visual = None
+        return cls(clip_model.name, clip_model.model, tokenizer_of(clip_model.model_name), templates)
 
     def encode(self, texts: Sequence[str]) -> np.ndarray:
         """Encode n texts as [n, F] f32 unit rows."""
@@ -180,13 +174,6 @@ def _templates(count: int) -> Sequence[Callable[[str], str]]:
 
     templates = {7: zero_shot_metadata.SIMPLE_IMAGENET_TEMPLATES, 80: zero_shot_metadata.OPENAI_IMAGENET_TEMPLATES}
     return templates.get(count, ())
-
-
-def _without_images(model: Any) -> Any:
-    # The image tower takes most of the memory and is not used for texts.
-    if hasattr(model, "visual"):
-        model.visual = None
-    return model
 
 
 # ---- weights by name, from the cache of their library or else from the network, in one attempt: the libraries

@@ -51,23 +51,16 @@ def window_of(fit: str, cells: tuple[int, int], photo: tuple[int, int]) -> Windo
 
 
 def _span(cells: int, side: int, pixels: float, before: float) -> tuple[slice, float, float]:
-    """Return the cells of an axis that lie within the photo, and the first and last pixels' edges under them.
-
-    Args:
-        before: share of a bar, or of what was cut off, that lies before the photo.
-    """
-    start = before * (side - cells * pixels)  # of the first cell, in pixels of the photo
+    """Return the cells of an axis that lie within the photo, and the first and last pixels' edges under them."""
+    # Of the first cell, in pixels of the photo; a share of a bar, or of what was cut off, lies before it.
+    start = before * (side - cells * pixels)
     first, last = math.ceil(-start / pixels - ROUNDING), math.floor((side - start) / pixels + ROUNDING)
     first, last = max(first, 0), min(last, cells)
     return slice(first, last), start + first * pixels, start + last * pixels
 
 
 def camera_of(window: Window | None, camera: Camera) -> Camera:
-    """Return the camera of the part of a photo that a map shows, its focal lengths to the nearest whole pixel.
-
-    Raises:
-        InvalidFeatures: the photo is distorted, or the map shows less than a pixel of it.
-    """
+    """Return the camera of the part of a photo that a map shows, its focal lengths to the nearest whole pixel."""
     if window is None:
         return camera
     if camera.lens is not None:

@@ -64,7 +64,7 @@ class LiftViews:
             encoder=self.features.encoder,
             text_space=self.features.text_space,
             words=table.words if table else (),
-            views=tuple(self.names),
+            views=self.names,
             poses=poses_of(self.lifted),
             origin=splats.origin,
             world=splats.world.known_or(self.cameras.world),

@@ -169,9 +169,6 @@ def as_views(views: Mapping[str, ViewFeatures] | Iterable[tuple[str, ViewFeature
 
     An iterator is consumed once, a view at a time: each is written to a file that has no name any more once this
     returns, so a lift that reads views again never holds all of them.
-
-    Args:
-        views: `Views`, a mapping of names, which may read its values lazily, or pairs of a name and a value.
     """
     if isinstance(views, Views):
         return views
@@ -238,15 +235,11 @@ def write_pack(
 ) -> None:
     """Write views as a feature pack, whole or not at all.
 
-    ``views`` may read its views lazily: each is read twice, once for its shape and once for
-    its bytes, and not kept in between. Labels are stored as int16 where the codebook allows.
+    ``views`` may read its views lazily: each is read twice, for its shape and for its bytes, and not kept in between.
+    Labels are stored as int16 where the codebook allows.
 
     Args:
-        path: the file to write.
-        views: view name -> what it observes.
-        metadata: ``encoder``, ``text_space``, ``normalised`` ("true" or "false") and what else to
-            keep.
-        progress: called in the stages "check" and "pack", in views.
+        metadata: ``encoder``, ``text_space``, ``normalised`` ("true" or "false") and what else to keep.
         table: words of the pack's own, of as many channels.
     """
     if not views:

@@ -116,7 +116,12 @@ class RegionWeights:
 
     def take(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Return the starts [B + 1] i64 of rows [B] i64 among their entries, and their indices in W [nnz'] i64."""
-        return row_entries(self.indptr, rows)
+        begins = self.indptr[rows]
+        lengths = self.indptr[rows + 1] - begins
+        starts = torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
+        entries = torch.repeat_interleave(begins - starts[:-1], lengths, output_size=int(starts[-1]))
+        entries += torch.arange(len(entries), device=entries.device)
+        return starts, entries
 
     def runs(self, starts: Tensor, region: Tensor) -> tuple[Tensor, Tensor]:
         """Return the runs of some rows, a run being the entries of one view in a row.
@@ -201,27 +206,9 @@ def row_blocks(lengths: np.ndarray, rows: int, entries: int) -> list[tuple[int, 
 
 
 def run_each(work: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], threads: int | None) -> None:
-    """Do the work for each tuple of arguments, by so many threads; None takes the cores that this process may use.
-
-    What several of them write must not overlap. The first error of any is raised.
-    """
+    """Do work for tuples of arguments, whose writes do not overlap, by so many threads; None: all cores."""
     with ThreadPoolExecutor(threads or cores()) as pool:
         list(pool.map(lambda call: work(*call), arguments))
-
-
-def row_entries(indptr: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the starts [B + 1] i64 of rows [B] i64 among their entries, and the indices of these [nnz'] i64."""
-    begins = indptr[rows]
-    starts = from_zero(indptr[rows + 1] - begins)
-    total = int(starts[-1])
-    entries = torch.repeat_interleave(begins - starts[:-1], starts.diff(), output_size=total)
-    entries += torch.arange(total, device=entries.device)
-    return starts, entries
-
-
-def from_zero(lengths: Tensor) -> Tensor:
-    """Return [n] -> [n + 1], their sums from the left, from nought."""
-    return torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
 
 
 def segment_sums(values: Tensor, starts: Tensor) -> Tensor:

@@ -44,7 +44,7 @@ class Preset(StrEnum):
     TOP_K = "top-k"  # the 40 largest w of a ray (Dr. Splat's paper)
 
 
-_PRESETS: dict[Preset, dict[str, Any]] = {
+_PRESETS: dict[str, dict[str, Any]] = {
     Preset.DEFAULT: {"robust": True},
     Preset.ROW_SUM: {},
     Preset.TIKHONOV: {"power": 2, "gain": TIKHONOV_GAIN},
@@ -62,7 +62,7 @@ class Quality(StrEnum):
     DRAFT = "draft"
 
 
-_LEVELS: dict[Quality, dict[str, Any]] = {
+_LEVELS: dict[str, dict[str, Any]] = {
     Quality.EXACT: {},
     Quality.BALANCED: {"stride": 2, "diagnostic_rays": 2_000},
     Quality.FAST: {
@@ -88,24 +88,22 @@ _LEVELS: dict[Quality, dict[str, Any]] = {
 MOST_DIAGNOSTIC_RAYS = 1_000_000  # 10 million rays of one view took 8 GB
 
 
-GROUPS = {  # of the settings, for people who read all of them
-    "a choice of many": ("preset", "quality"),
-    "weights of a ray that count": ("top_k", "power"),
-    "pixels, views and levels": ("stride", "view_stride", "coverage", "view_cosine", "levels"),
-    "the rasterizer": ("kernel", "antialiased", "gain", "alpha_cap", "transmittance_stop"),
-    "wrong masks": ("robust", "robust_directions"),
-    "objects and clusters": ("objects", "aggregation", "aggregation_iou", "aggregation_cluster_size"),
-    "neighbours": ("smoothness",),
-    "the result, and where it is made": ("dtype", "codes", "diagnostic_rays", "reference_channels", "seed", "device"),
-}  # fmt: skip
-
-
 class LiftSettings(Body):
     """All that decides the result of a lift, and where it runs. Knobs left out take the preset's values."""
 
     model_config = ConfigDict(frozen=True)
     error_type: ClassVar = InvalidSettings
     noun: ClassVar = "setting"
+    groups: ClassVar = {  # of the settings, for people who read all of them
+        "a choice of many": ("preset", "quality"),
+        "weights of a ray that count": ("top_k", "power"),
+        "pixels, views and levels": ("stride", "view_stride", "coverage", "view_cosine", "levels"),
+        "the rasterizer": ("kernel", "antialiased", "gain", "alpha_cap", "transmittance_stop"),
+        "wrong masks": ("robust", "robust_directions"),
+        "objects and clusters": ("objects", "aggregation", "aggregation_iou", "aggregation_cluster_size"),
+        "neighbours": ("smoothness",),
+        "the result, and where it is made": ("dtype", "codes", "diagnostic_rays", "reference_channels", "seed", "device"),
+    }  # fmt: skip
 
     preset: Preset = Field(
         Preset.DEFAULT,
@@ -245,8 +243,8 @@ class LiftSettings(Body):
         if "device" in values:
             values = values | {"device": device_name(values["device"])}
         preset, quality = values.get("preset", Preset.DEFAULT), values.get("quality", Quality.EXACT)
-        weights = _PRESETS[Preset(preset)] if isinstance(preset, str) and preset in set(Preset) else {}
-        level = _LEVELS[Quality(quality)] if isinstance(quality, str) and quality in set(Quality) else {}
+        weights = _PRESETS.get(preset, {}) if isinstance(preset, str) else {}
+        level = _LEVELS.get(quality, {}) if isinstance(quality, str) else {}
         settings = handler({**weights, **level, **values})
         settings.model_fields_set.intersection_update(values)  # set by the caller; they stay when the preset changes
         return settings
@@ -287,11 +285,6 @@ class LiftSettings(Body):
             expected = "views with masks: objects are what masks of several views keep together"
             raise InvalidSettings("objects", expected=expected, got=NO_MASKS, hint="take auto")
         return masks and bool(self.objects)
-
-    @staticmethod
-    def groups() -> Mapping[str, tuple[str, ...]]:
-        """Return the names of all settings by what they are about, as the command line's help lists them."""
-        return GROUPS
 
     @classmethod
     def of(cls, /, **values: Any) -> Self:
@@ -339,12 +332,11 @@ class LiftSettings(Body):
         Raises:
             InvalidSettings: an unknown name, or a value of another type or out of range.
         """
-        normalised = {name: int(value) if _is_whole(value) else value for name, value in values.items()}
+        # Some write a whole number as 2.0.
+        normalised = {
+            name: int(value) if isinstance(value, float) and value.is_integer() else value
+            for name, value in values.items()
+        }
         # A lone surrogate cannot be encoded: it becomes "?", which is refused as an unknown value.
         text = json.dumps(normalised, ensure_ascii=False).encode("utf-8", "replace")
         return cls.model_validate_json(text, strict=True)
-
-
-def _is_whole(value: Any) -> bool:
-    """Return True if JSON means a whole number, which some write as 2.0."""
-    return isinstance(value, float) and value.is_integer()

@@ -16,7 +16,7 @@ from liftcore.errors import InvalidFeatures, reading
 from liftcore.io.npy import without_unit_axes
 from liftcore.runtime.arguments import check_choice
 from liftcore.runtime.one_line import one_line
-from liftcore.scene.splats import shared_tensor
+from liftcore.scene.splats import Array, shared_tensor
 from liftcore.values.fit import FITS, Fit
 
 NO_LABEL = -1  # a pixel that a level leaves unlabelled
@@ -28,7 +28,6 @@ MAX_LEVELS = 32  # a hierarchy of four partitions, with masks 1 to 4 pixels over
 MOST_LEVELS = 127  # of label maps; a level's number takes a byte
 INTEGERS = (torch.int32, torch.int16, torch.int64, torch.int8, torch.uint8)
 WIDENED = (torch.uint16, torch.uint32)  # of pictures of 16 bits; torch does hardly anything with these
-Array = Tensor | np.ndarray
 FLOATS = (torch.float16, torch.float32, torch.float64, torch.bfloat16)
 Numbers = TypeVar("Numbers", np.ndarray, Tensor)
 
@@ -64,9 +63,9 @@ class Regions:
 
     def __init__(self, labels: Array, codebook: Array, *, context: str = "") -> None:
         with reading(f"{context} codebook".strip(), InvalidFeatures, "floats [M, F]"):
-            object.__setattr__(self, "codebook", _features(codebook, "M, F"))
+            vars(self).update(codebook=_features(codebook, "M, F"))
         with reading(f"{context} labels".strip(), InvalidFeatures, "integers [L, h, w]"):
-            object.__setattr__(self, "labels", _labels(labels, len(self.codebook)))
+            vars(self).update(labels=_labels(labels, len(self.codebook)))
 
     @classmethod
     def from_masks(
@@ -113,8 +112,7 @@ class Regions:
     def unchecked(cls, labels: Tensor, codebook: Tensor) -> Self:
         """Return regions of tensors that are valid by construction."""
         instance = object.__new__(cls)
-        object.__setattr__(instance, "labels", labels)
-        object.__setattr__(instance, "codebook", codebook)
+        vars(instance).update(labels=labels, codebook=codebook)
         return instance
 
 
@@ -143,10 +141,9 @@ class FeatureGrid:
 
     def __init__(self, grid: Array, *, fit: Fit | Literal[""] = "", context: str = "") -> None:
         with reading(f"{context} grid".strip(), InvalidFeatures, "floats [h, w, F]"):
-            object.__setattr__(self, "grid", _features(grid, "h, w, F"))
+            vars(self).update(grid=_features(grid, "h, w, F"), fit=fit)
         if fit:
             check_choice(f"{context} fit".strip(), fit, FITS, InvalidFeatures)
-        object.__setattr__(self, "fit", fit)
 
     def __repr__(self) -> str:
         dtype = _dtype_name(self.grid)
@@ -160,8 +157,7 @@ class FeatureGrid:
     def unchecked(cls, grid: Tensor, fit: Fit | Literal[""] = "") -> Self:
         """Return a grid of a tensor that is right by how it was made."""
         instance = object.__new__(cls)
-        object.__setattr__(instance, "grid", grid)
-        object.__setattr__(instance, "fit", fit)
+        vars(instance).update(grid=grid, fit=fit)
         return instance
 
     @property

@@ -30,7 +30,8 @@ class ClipImageEncoder:
         self._tower = clip_model.model.visual.to(device).float().eval()
         self._device = device
         self._dense = _dense(clip_model.model_name, self._tower)
-        self.pixels = _pixels(clip_model.model, self._tower)
+        patch = getattr(self._tower, "patch_size", (RESNET_PATCH, RESNET_PATCH))[0]
+        self.pixels = Pixels(int(patch), *training_pixels(clip_model.model, self._tower))
         with torch.inference_mode():
             probe = self._dense(self._tower, torch.zeros(1, 3, self.pixels.patch, self.pixels.patch, device=device))
         self.channels = int(probe.shape[-1])
@@ -83,23 +84,11 @@ def training_pixels(model: Any, tower: Any) -> tuple[int, tuple[float, ...], tup
     return int(shorter), tuple(settings["mean"]), tuple(settings["std"]), settings["interpolation"] or "bicubic"
 
 
-def _pixels(model: Any, tower: Any) -> Pixels:
-    patch = getattr(tower, "patch_size", (RESNET_PATCH, RESNET_PATCH))
-    return Pixels(int(patch[0]), *training_pixels(model, tower))
-
-
 def vit_values(tower: Any, images: Tensor) -> Tensor:
     """MaskCLIP on open_clip's ViT: ``proj(ln_post(W_o (W_v ln_1(x) + b_v) + b_o))`` of the last block's input x.
 
-    The last block's residual and MLP are omitted with its attention: they were trained on the class token, and only
-    the values are local.
-
-    Args:
-        tower: open_clip's VisionTransformer of standard blocks, without an attention pooler.
-        images: [n, 3, h p, w p] f32.
-
-    Returns:
-        [n, h, w, F] f32.
+    Images [n, 3, h p, w p] become [n, h, w, F], both f32. The last block's residual and MLP are omitted with its
+    attention: they were trained on the class token, and only the values are local.
     """
     tokens = _embed(tower, images)
     *blocks, last = tower.transformer.resblocks
@@ -109,7 +98,11 @@ def vit_values(tower: Any, images: Tensor) -> Tensor:
     values = functional.linear(
         last.ln_1(tokens), last.attn.in_proj_weight[2 * width :], last.attn.in_proj_bias[2 * width :]
     )
-    return _project(tower, last.attn.out_proj(values), images)
+    features = tower.ln_post(last.attn.out_proj(values)[:, 1:])
+    if tower.proj is not None:
+        features = features @ tower.proj
+    rows, columns = (side // patch for side, patch in zip(images.shape[-2:], tower.patch_size, strict=True))
+    return features.unflatten(1, (rows, columns))
 
 
 def resnet_values(tower: Any, images: Tensor) -> Tensor:
@@ -141,11 +134,3 @@ def _positions(tower: Any, rows: int, columns: int) -> Tensor:
     grid = stored[1:].T.reshape(1, -1, *tower.grid_size)
     grid = functional.interpolate(grid, (rows, columns), mode="bicubic", antialias=True, align_corners=False)
     return torch.cat([stored[:1], grid[0].flatten(1).T])
-
-
-def _project(tower: Any, tokens: Tensor, images: Tensor) -> Tensor:
-    features = tower.ln_post(tokens[:, 1:])
-    if tower.proj is not None:
-        features = features @ tower.proj
-    rows, columns = (side // patch for side, patch in zip(images.shape[-2:], tower.patch_size, strict=True))
-    return features.unflatten(1, (rows, columns))

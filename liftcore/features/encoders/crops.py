@@ -69,7 +69,7 @@ def crop_vectors(
 
     Args:
         masks: view -> file, from `liftcore.features.masks.mask_files`. photos: view -> image.
-        unlabelled: value of pixels without a mask in label pictures. progress: called for "encode", in views.
+        unlabelled: value of pixels without a mask in label pictures.
     """
     missing_photos = [view for view in masks if view not in photos]
     if missing_photos:

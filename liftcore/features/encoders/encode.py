@@ -21,8 +21,8 @@ from liftcore.io.photos import ORIENTATION, UPRIGHT, PhotoHeader, Reading, heade
 from liftcore.runtime.arguments import as_path, as_paths
 from liftcore.runtime.folders import scratch_folder
 from liftcore.runtime.progress import Progress, shown_progress
-from liftcore.scene.cameras import Cameras, photo_sizes
-from liftcore.scene.views import IMAGE_SUFFIXES, require_name, without_image_suffix
+from liftcore.scene.cameras import Cameras
+from liftcore.scene.views import IMAGE_SUFFIXES, cameras_of_views, require_name, without_image_suffix
 from liftcore.values.pack import write_pack
 from liftcore.values.views import check_finite
 
@@ -76,7 +76,8 @@ def encode_images(
         raise InvalidInput("size", expected=expected, got=f"{size} pixels")
     if isinstance(cameras, Path | str):
         cameras = read_cameras(cameras)
-    sizes = {} if cameras is None else photo_sizes(photos, cameras)
+    pairs = cameras_of_views(photos, cameras or ())
+    sizes = {photo: cameras[name].photo_size for photo, name in pairs.items()} if cameras else {}
     file, readings, wide = as_path(out, "output"), dict[str, Reading](), list[str]()
     with shown_progress(progress) as reporter, writing(file):
         file.parent.mkdir(parents=True, exist_ok=True)

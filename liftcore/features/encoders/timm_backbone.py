@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from liftcore.errors import InvalidInput, Unavailable
 from liftcore.features.encoders import Pixels
 from liftcore.runtime.arguments import nearest
-from liftcore.text.open_clip import fetch_weights, import_torchvision, require_weights
+from liftcore.text.open_clip import fetch_weights, library, require_weights
 
 # Tensors of checkpoints besides the backbone, needed in training only.
 _LEFT_OVER = ("mask_token",)
@@ -37,7 +37,10 @@ class TimmEncoder:
         """Load ``NAME`` (cached or downloaded by timm) or ``NAME@WEIGHTS_FILE`` (tensors only)."""
         name, at, file = spec.partition("@")
         label = f"encoder timm:{spec}"
-        _check_name(label, name)
+        timm = library("timm")
+        if not timm.is_model(name):
+            hint = nearest(name, timm.list_models(), 3)
+            raise InvalidInput(label, expected="a model of timm", got=repr(name), hint=hint)
         model = _from_file(label, name, Path(file)) if at else _by_name(label, name)
         return cls(name, model, device)
 
@@ -47,18 +50,13 @@ class TimmEncoder:
             images = images.to(self._device)
             if self._shift == 0:
                 return self._cells(images)
-            return self._shifted_cells(images)
-
-    def _shifted_cells(self, images: Tensor) -> Tensor:
-        """Encode images padded with their border's colours, without the row and column of cells outside of them.
-
-        The padding shifts the cells onto their patches (`cell_shift`).
-        """
-        patch = self.pixels.patch
-        before = round(-self._shift) % patch
-        wider = nn.functional.pad(images, (before, patch - before, before, patch - before), mode="replicate")
-        cells = self._cells(wider)
-        return (cells[:, 1:, 1:] if self._shift > 0 else cells[:, :-1, :-1]).contiguous()
+            # A padding with the border's colours shifts the cells onto their patches (`cell_shift`); the row and the
+            # column of cells outside of the images go.
+            patch = self.pixels.patch
+            before = round(-self._shift) % patch
+            wider = nn.functional.pad(images, (before, patch - before, before, patch - before), mode="replicate")
+            cells = self._cells(wider)
+            return (cells[:, 1:, 1:] if self._shift > 0 else cells[:, :-1, :-1]).contiguous()
 
     def _cells(self, images: Tensor) -> Tensor:
         (cells,) = self._model.forward_intermediates(images, indices=1, norm=True, intermediates_only=True)
@@ -85,15 +83,8 @@ class TimmEncoder:
         )
 
 
-def _check_name(label: str, name: str) -> None:
-    timm = _library()
-    if not timm.is_model(name):
-        hint = nearest(name, timm.list_models(), 3)
-        raise InvalidInput(label, expected="a model of timm", got=repr(name), hint=hint)
-
-
 def _by_name(label: str, name: str) -> Any:
-    config = _library().models.get_pretrained_cfg(name, allow_unregistered=False)
+    config = library("timm").models.get_pretrained_cfg(name, allow_unregistered=False)
     if config is None or not config.has_weights:
         raise Unavailable(
             label, expected="weights: a name with weights in timm, or a file", got="none", hint=f"timm:{name}@FILE"
@@ -109,7 +100,7 @@ def _from_file(label: str, name: str, path: Path) -> Any:
     require_weights(label, path)
     model = _create(name, pretrained=False)
     try:
-        stored = _library().models.load_state_dict(str(path), device="cpu", weights_only=True)
+        stored = library("timm").models.load_state_dict(str(path), device="cpu", weights_only=True)
         if not isinstance(stored, dict) or not all(isinstance(value, Tensor) for value in stored.values()):
             raise ValueError("not a mapping of names to tensors")
         # Modules of timm translate the names of the authors' checkpoints.
@@ -140,7 +131,7 @@ def _unexplained(model: Any, keys: Iterable[str]) -> list[str]:
 
 
 def _create(name: str, *, pretrained: bool) -> Any:
-    timm = _library()
+    timm = library("timm")
     try:
         # With this option vision transformers resample their positions to the images' grid.
         return timm.create_model(name, pretrained=pretrained, num_classes=0, dynamic_img_size=True)
@@ -159,16 +150,6 @@ def _pixels(model: Any) -> Pixels:
         std=tuple(settings["std"]),
         interpolation=settings["interpolation"],
     )
-
-
-def _library() -> Any:
-    try:
-        import_torchvision()
-        import timm
-    except ImportError as error:
-        hint = "pip install 'splatlift[encoders]'"
-        raise Unavailable("encoder timm", expected="the package timm", got=str(error), hint=hint) from None
-    return timm
 
 
 def cell_shift(model: nn.Module, images: Tensor) -> float:
