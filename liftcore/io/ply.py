@@ -275,8 +275,8 @@ def _default_layout(splats: Splats) -> tuple[str, ...]:
     """Return the column order of the kernel's own trainer, and the further columns behind it."""
     sh_rows = 0 if splats.sh is None else splats.sh.shape[1]
     lobes = 0 if splats.sb_params is None else splats.sb_params.shape[1]
-    first, *remaining = _columns(splats.kernel, sh_rows, lobes, beta_names=splats.kernel is Kernel.BETA)
-    layout = (first, *remaining[:2], *NORMALS, *remaining[2:])
+    names = [*_columns(splats.kernel, sh_rows, lobes, beta_names=splats.kernel is Kernel.BETA)]
+    layout = (*names[:3], *NORMALS, *names[3:])
     return (*layout, *(name for name in splats.extras if name not in layout))
 
 

@@ -7,12 +7,11 @@ from types import ModuleType
 
 from liftcore.errors import Unavailable
 
-INSTALL = "the package 'service' has it: pip install 'splatlift[service]', or run make setup in a checkout"
-
 
 def load_command(name: str) -> ModuleType:
     """Import the module of a command of the service, where that is installed."""
     try:
         return import_module(f"service.commands.{name}")
     except ModuleNotFoundError as error:
-        raise Unavailable(repr(name), expected=f"the package {error.name}", got="none", hint=INSTALL) from error
+        hint = "the package 'service' has it: pip install 'splatlift[service]', or run make setup in a checkout"
+        raise Unavailable(repr(name), expected=f"the package {error.name}", got="none", hint=hint) from error

@@ -42,8 +42,8 @@ class Device:
 
     def facts(self) -> dict[str, Any]:
         """Return kind, name and versions of the libraries in use, for the diagnostics."""
-        packages = ("torch", "numba", "numpy") if self.kind == "cpu" else ("torch", "triton", "numpy")
-        versions = {"torch": torch.__version__} | {name: version(name) for name in packages[1:]}
+        compiler = "numba" if self.kind == "cpu" else "triton"
+        versions = {"torch": torch.__version__} | {name: version(name) for name in (compiler, "numpy")}
         if self.place.type == "cuda":
             versions |= {"cuda": str(torch.version.cuda)}
         return {"kind": self.kind, "name": self.name, "versions": versions}

@@ -18,7 +18,6 @@ class Progress(Protocol):
 
     def __call__(self, stage: str, completed: int, total: int, unit: str, /) -> None:
         """Report that ``completed`` of ``total`` units of ``stage`` are complete."""
-        ...
 
 
 def silent(stage: str, completed: int, total: int, unit: str) -> None:
