@@ -26,7 +26,6 @@ from liftcore.io.photos import open_image
 from liftcore.scene.compositing import MAX_SIDE
 
 LABELS = "a PNG of one channel, 8 or 16 bits of grey or a palette"
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_HEADER_BYTES = 26  # up to the bit depth and the colour type
 GREY, PALETTE = 0, 3  # colour types of a PNG
 MAX_JSON_BYTES = 1 << 28  # of a file: some thousand masks of a large photo as plain numbers
@@ -48,7 +47,7 @@ def label_png(path: Path) -> tuple[np.ndarray, dict[str, str]]:
         return np.asarray(image).astype(np.int32), texts
 
 
-def binary_picture(path: Path, unlabelled: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+def binary_picture(path: Path, unlabelled: int | None) -> tuple[np.ndarray, np.ndarray]:
     """Read a picture of one value besides black: [h, w] bool, where it has this value, and where ``unlabelled``."""
     with _open_png(path) as (image, _, _):
         if image.mode in ("RGBA", "LA") and image.getchannel("A").getextrema()[0] != 255:
@@ -74,8 +73,6 @@ def _open_png(path: Path) -> Iterator[tuple[Image.Image, int, int]]:
     """Open a PNG with Pillow, with its bit depth and colour type."""
     with path.open("rb") as handle:
         header = handle.read(PNG_HEADER_BYTES)
-    if len(header) < PNG_HEADER_BYTES or not header.startswith(PNG_SIGNATURE):
-        raise ValueError("a PNG, got a file that is not a PNG")
     try:
         with open_image(path, "PNG") as image:
             image.load()

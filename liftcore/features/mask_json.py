@@ -67,7 +67,7 @@ class MaskDocument:
     beyond: int = 0  # polygons that extend beyond their image
 
 
-def read_mask_document(path: Path, *, unannotated_negative: bool = False) -> MaskDocument:
+def read_mask_document(path: Path, *, unannotated_negative: bool) -> MaskDocument:
     """Read a JSON document of masks by phrase."""
     document = MaskDocument(path, [])
     with reading(path, InvalidFeatures, "COCO's JSON, or records with masks and phrases", AS_COCO):

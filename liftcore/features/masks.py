@@ -47,7 +47,7 @@ def mask_files(folder: Path) -> dict[str, Path]:
     return by_view
 
 
-def labels_alone(path: Path, unlabelled: int = 0) -> tuple[np.ndarray, int]:
+def labels_alone(path: Path, unlabelled: int) -> tuple[np.ndarray, int]:
     """Read labels [L, h, w] i32 of a view's masks without vectors, -1 for none, and the number of masks."""
     with reading(path, InvalidFeatures, "masks"):
         labels, rows = _labels(path, None, unlabelled)

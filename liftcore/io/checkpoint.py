@@ -38,7 +38,7 @@ def _require_whole(path: Path) -> None:
         raise ValueError(f"a checkpoint of the complete scene, got {got}; {hint}")
 
 
-def read_checkpoint(path: Path, *, colour: bool = True) -> Fields:
+def read_checkpoint(path: Path, *, colour: bool) -> Fields:
     """Read the fields of a checkpoint's splats, in the frame of their training."""
     import torch
 

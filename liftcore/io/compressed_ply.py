@@ -21,7 +21,7 @@ SH_COLUMNS = (9, 24, 45)  # of degree 1 to 3
 SH_RANGE = 8.0  # of a higher harmonic, from -4 to 4
 
 
-def read_compressed_ply(path: Path, *, colour: bool = True) -> Fields:
+def read_compressed_ply(path: Path, *, colour: bool) -> Fields:
     """Read the fields of a compressed PLY."""
     head, size = read_head(path)
     lines, elements, offset = parse_elements(head)

@@ -66,7 +66,7 @@ CODES = {np.dtype(code): number for number, code in COMPONENTS.items()}
 NEAREST = "{kernel} splats as the nearest Gaussians: the format has the kernel 'ellipse' alone"
 
 
-def read_gltf(path: Path, *, colour: bool = True) -> Fields:
+def read_gltf(path: Path, *, colour: bool) -> Fields:
     """Read the fields of all splats in a ``.glb``, node by node, in the frame of PLYs and cameras.
 
     Feature ids come as ``instance_id`` and ``class_id`` with 0 for none, other attributes with an underscore by their

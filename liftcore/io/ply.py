@@ -80,7 +80,7 @@ _ELEMENT = re.compile(r"(element \S+) ([0-9]{1,18})")
 # ---- splats
 
 
-def read_ply(path: Path, kernel: Kernel | str = "auto", *, colour: bool = True) -> Splats:
+def read_ply(path: Path, kernel: Kernel | str, *, colour: bool) -> Splats:
     """Read trained splats from a binary little-endian PLY of any dialect.
 
     With the kernel ``auto`` it is recognised from the properties, and where these leave it open from what the file
@@ -551,8 +551,6 @@ def header_bytes(lines: Sequence[str]) -> bytes:
 
 def _header_lines(head: bytes) -> tuple[tuple[str, ...], int]:
     """Return the lines of a header without their line feeds, and its length in bytes."""
-    if head[:4] not in (b"ply\n", b"ply\r"):
-        raise ValueError(f"a PLY file (first line 'ply'), got {head[:8]!r}; {EXPORT}")
     end = _END.search(head)
     if end is None:
         limit = f"'end_header' within the first {MAX_HEADER_BYTES} bytes"
@@ -564,9 +562,6 @@ def _header_lines(head: bytes) -> tuple[tuple[str, ...], int]:
     if len(lines) > MAX_HEADER_LINES:
         limit, hint = f"at most {MAX_HEADER_LINES} header lines", "leave out properties that are no splat's"
         raise ValueError(f"{limit}, got {len(lines)}; {hint}")
-    if cloud := cloud_without_splats(lines):
-        expected = "splats (properties such as 'opacity', 'scale_0', 'rot_0')"
-        raise ValueError(f"{expected}, got {cloud[0]} without any of them; {cloud[1]}")
     return lines, end.end()
 
 

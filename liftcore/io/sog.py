@@ -32,7 +32,7 @@ MAX_TERM = 1e6  # of a codebook's or bound's numbers: exp of log scales apart, n
 HINT = "export it again with SuperSplat or splat-transform, or as PLY"
 
 
-def read_sog(path: Path, *, colour: bool = True) -> Fields:
+def read_sog(path: Path, *, colour: bool) -> Fields:
     """Read the fields of a ``.sog`` file, of an unpacked folder, or of the ``meta.json`` in one."""
     try:
         if not is_bundled(path):

@@ -35,7 +35,7 @@ def looks_like_splat(head: bytes, size: int) -> bool:
     return bool(near and np.mean((lengths > QUAT_LENGTHS[0]) & (lengths < QUAT_LENGTHS[1])) > 0.9)
 
 
-def read_splat(path: Path, *, colour: bool = True) -> Fields:
+def read_splat(path: Path, *, colour: bool) -> Fields:
     """Read the fields of a ``.splat`` file."""
     size = path.stat().st_size
     if not size or size % ROW.itemsize:

@@ -76,7 +76,7 @@ def begins_like_spz(head: bytes) -> bool:
         return False
 
 
-def read_spz(path: Path, *, colour: bool = True) -> Fields:
+def read_spz(path: Path, *, colour: bool) -> Fields:
     """Return the fields of an ``.spz`` file, in the frame of PLYs and cameras."""
     content = path.read_bytes()
     is_plain, unpacking = content[:4] == MAGIC, zlib.decompressobj(31)

@@ -47,11 +47,11 @@ def open_library() -> Any:
     return modules
 
 
-def usd_blocks(splats: Splats, document: Mapping[str, Any] | None = None, suffix: str = ".usdc") -> Iterator[bytes]:
+def usd_blocks(splats: Splats, document: Mapping[str, Any] | None, suffix: str = ".usdc") -> Iterator[bytes]:
     """Yield the bytes of a USD file of any splats (`gaussian_rows`), with their extras and the labels' document."""
     pxr, columns = open_library(), stored_columns(splats)
     with scratch_folder("splatlift-") as folder:
-        path = folder / f"scene{'.usdc' if suffix == '.usdz' else suffix}"
+        path = folder / "scene.usdc"  # which a .usdz packs
         stage = pxr.Usd.Stage.CreateNew(str(path))
         pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.y)
         world = splats.world

@@ -42,7 +42,7 @@ def as_path(path: object, argument: str = "path") -> Path:
     return Path(path)
 
 
-def as_paths(paths: Any, argument: str = "path") -> list[Path]:
+def as_paths(paths: Any, argument: str) -> list[Path]:
     """Return several paths as a list; a single one as a list of one."""
     return [as_path(path, argument) for path in as_list(paths)]
 

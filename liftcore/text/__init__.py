@@ -108,7 +108,7 @@ def open_encoder(spec: str | Path) -> TextEncoder:
     raise InvalidQuery("encoder", expected=f"one of {', '.join(ENCODER_SPECS)}", got=repr(spec))
 
 
-def encoder_of_space(text_space: str, hint: str = "", *, stand_in: bool = False) -> TextEncoder:
+def encoder_of_space(text_space: str, hint: str, *, stand_in: bool) -> TextEncoder:
     """Open the encoder of a lift's text space; ``hint`` is the advice of an error.
 
     A ``stand_in`` for weights that are not available is the shipped table of this encoder, which has its own words.

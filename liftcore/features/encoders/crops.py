@@ -24,7 +24,7 @@ from liftcore.features.encoders.clip import space_of, training_pixels
 from liftcore.features.encoders.encode import prepare, read_image
 from liftcore.features.masks import labels_alone
 from liftcore.io.photos import Reading
-from liftcore.runtime.progress import Progress, silent
+from liftcore.runtime.progress import Progress
 from liftcore.text.open_clip import OpenedModel, open_model
 from liftcore.values.views import check_finite
 
@@ -62,8 +62,8 @@ def crop_vectors(
     masks: Mapping[str, Path],
     photos: Mapping[str, Path],
     encoder: CropEncoder,
-    unlabelled: int = 0,
-    progress: Progress = silent,
+    unlabelled: int,
+    progress: Progress,
 ) -> tuple[dict[str, np.ndarray], dict[str, Reading]]:
     """Encode the crops of masks: view -> unit vectors [M, F] f16; and view -> the orientation its photo was read in.
 

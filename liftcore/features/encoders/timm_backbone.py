@@ -1,7 +1,6 @@
 """Backbones of timm (DINO, DINOv2, ViT, ResNet and others), whose features have no text space."""
 
 import sys
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Self
 
@@ -111,7 +110,10 @@ def _from_file(label: str, name: str, path: Path) -> Any:
         missing, unexpected = model.load_state_dict(state, strict=False)
     except Exception as error:  # readers of pickles and state dicts raise many types for files of other content
         raise _not_weights(label, name, path, str(error)) from None
-    unexpected = _unexplained(model, unexpected)
+    heads = model.pretrained_cfg.get("classifier") or ()
+    heads = (heads,) if isinstance(heads, str) else tuple(heads)
+    explained_prefixes = (*_LEFT_OVER, *(f"{head}." for head in heads), "fc_norm.")
+    unexpected = [key for key in unexpected if not key.startswith(explained_prefixes)]
     if missing or unexpected:
         part = ", ".join([*(f"no {key}" for key in missing[:2]), *(f"an unexpected {key}" for key in unexpected[:2])])
         raise _not_weights(label, name, path, part)
@@ -121,13 +123,6 @@ def _from_file(label: str, name: str, path: Path) -> Any:
 def _not_weights(label: str, name: str, path: Path, got: str) -> InvalidInput:
     hint = "save the state_dict() of timm's model alone, as safetensors"
     return InvalidInput(label, expected=f"only tensors of {name} in {path.name}", got=got[:200], hint=hint)
-
-
-def _unexplained(model: Any, keys: Iterable[str]) -> list[str]:
-    heads = model.pretrained_cfg.get("classifier") or ()
-    heads = (heads,) if isinstance(heads, str) else tuple(heads)
-    expected_prefixes = (*_LEFT_OVER, *(f"{head}." for head in heads), "fc_norm.")
-    return [key for key in keys if not key.startswith(expected_prefixes)]
 
 
 def _create(name: str, *, pretrained: bool) -> Any:
@@ -169,7 +164,8 @@ def cell_shift(model: nn.Module, images: Tensor) -> float:
     at_scale: dict[int, list[float]] = {}  # input pixels a cell -> shifts of the strided layers there, in cells
 
     def note(module: Any, inputs: tuple[Tensor, ...], _: object) -> None:
-        kernel, stride, padding = (_first(part) for part in (module.kernel_size, module.stride, module.padding))
+        sizes = (module.kernel_size, module.stride, module.padding)
+        kernel, stride, padding = (int(size if isinstance(size, int) else size[0]) for size in sizes)
         if type(module).__name__.endswith("Same"):  # TensorFlow's padding, which timm adds in the layer's call
             padding = max(kernel - stride, 0) // 2
         if stride > 1:
@@ -184,7 +180,3 @@ def cell_shift(model: nn.Module, images: Tensor) -> float:
         for hook in hooks:
             hook.remove()
     return sum(scale * sum(shifts) / len(shifts) for scale, shifts in at_scale.items())
-
-
-def _first(size: Any) -> int:
-    return int(size if isinstance(size, int) else size[0])
