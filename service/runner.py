@@ -126,9 +126,10 @@ class Runner:
             "task": job.kind, "kind": job.kind, "scratch": str(scratch), "output": str(draft), "work": work,
             "parameters": job.parameters, "threads": settings.job_threads,
         }  # fmt: skip
-        last, reason, was_killed = self._children.run(order, settings.job_seconds, take, why_end)
-        if was_killed and not messages:  # it died as a spare, with the child before it: that is no attempt
-            last, reason, _ = self._children.run(order, settings.job_seconds, take, why_end)
+        ending = self._children.run(order, settings.job_seconds, take, why_end)
+        if ending.was_killed and not messages:  # it died as a spare, with the child before it: that is no attempt
+            ending = self._children.run(order, settings.job_seconds, take, why_end)
+        last = ending.last
         if last is not None and "result" in last:
             return lambda: store.finish(job, last["result"], draft)
         if last is not None:
@@ -136,10 +137,10 @@ class Runner:
             return lambda: store.end(job, None if last["fault"]["status"] == NoSpace.status else last["fault"])
         if self._children.stopping.is_set():
             return lambda: store.end(job)
-        log.warning("job %s, attempt %d: %s", job.id, job.attempt, reason)
+        log.warning("job %s, attempt %d: %s", job.id, job.attempt, ending.reason)
         crash = ProcessDied(
             "job", expected="an answer from the job's process",
-            got=f"none in {MAX_ATTEMPTS} attempts; last: {reason}",
+            got=f"none in {MAX_ATTEMPTS} attempts; last: {ending.reason}",
             hint="signal 9 is mostly a lack of memory; the server's log has what the process printed",
         )  # fmt: skip
         return lambda: store.end(job, fault_of(crash), retries=True)
