@@ -38,7 +38,7 @@ from liftcore.query.question import (
     Threshold,
     WordMatch,
 )
-from liftcore.query.scene import Scene, as_numpy
+from liftcore.query.scene import AnyEncoder, Scene, as_numpy
 from liftcore.query.scores import LEAST_LIKENESS, LOWEST_COSINE, combine, cosines, cosines_about, spaced
 from liftcore.query.selection import (
     LEAST_FIRST,
@@ -55,7 +55,7 @@ from liftcore.query.selection import (
 from liftcore.query.terms import Vector
 from liftcore.query.threshold import explain_no_selection, find_threshold, has_one_mode
 from liftcore.runtime.one_thread import one_thread
-from liftcore.text import TextEncoder
+from liftcore.text import TextEncoder, check_texts
 from liftcore.text.phrases import PartPhrase
 from liftcore.text.wording import SUGGESTED, Wording, base_of, members_of, normalize_text
 
@@ -80,7 +80,6 @@ class ResolvedQuery:
     asked_as: Mapping[int, Wording]  # of the texts, by their indices among the terms
     small_table: np.ndarray | None = None  # [n, F] f32, unit: all words of a table that has too few to be references
     candidates: tuple[Candidate, ...] = ()  # nodes that clicks among the terms may mean
-    part: PartQuery | None = None  # of a phrase that names a part of an object
     unknown_part: PartPhrase | None = None  # a part for which there is no word, so that the object is selected
 
     @property
@@ -93,12 +92,14 @@ class ResolvedQuery:
 class PartQuery:
     """Queries for a phrase that names a part of an object."""
 
+    query: Query  # of the phrase
     phrase: PartPhrase
-    whole_query: ResolvedQuery
+    object: ResolvedQuery
     part: ResolvedQuery
+    whole: ResolvedQuery | None  # the phrase as a whole, if it may not mean a part
 
 
-def ask(scene: Scene, query: Query | str, encoder: TextEncoder | None = None) -> Answer:
+def ask(scene: Scene, query: Query | str, encoder: AnyEncoder = None) -> Answer:
     """Score every splat for a query and select those that answer it.
 
     The threshold `auto` comes from a histogram of scores, in which each splat counts by its total weight, as splats
@@ -110,13 +111,16 @@ def ask(scene: Scene, query: Query | str, encoder: TextEncoder | None = None) ->
 
     Args:
         scene: an opened lift. query: words and examples, or one text alone.
-        encoder: the text encoder of the lifted features' space; examples and the lift's own words need none.
+        encoder: as `Scene.encoder` opens it, of the lifted features' space; examples need none.
 
     Raises:
         InvalidQuery, NotFound, InvalidLift: as `Scene.ask`.
     """
     query = Query.of(query) if isinstance(query, str) else query
-    return answer_of(scene, resolve_query(scene, query, encoder))
+    check_texts(query.texts)  # before an encoder is opened
+    # The table is in the metadata, which are checked so: a lift of other rows than its splats answers nothing.
+    reader = scene.encoder(encoder) if query.texts or encoder is not None else scene.table
+    return answer_of(scene, resolve_query(scene, query, reader))
 
 
 def ask_vectors(scene: Scene, positives: Any, negatives: Any = (), **fields: Any) -> Answer:
@@ -139,9 +143,8 @@ def _vectors(values: Any) -> tuple[Vector, ...]:
     return tuple(Vector(tuple(row.tolist())) for row in np.atleast_2d(rows)) if rows.size else ()
 
 
-def resolve_query(scene: Scene, query: Query, encoder: TextEncoder | None) -> ResolvedQuery:
+def resolve_query(scene: Scene, query: Query, encoder: TextEncoder | None) -> ResolvedQuery | PartQuery:
     """Resolve the terms of a query to directions; all errors of its terms are raised here (see `ask`)."""
-    encoder = encoder or scene.table
     query, phrases = read_query(query, encoder)
     text = query.text[0] if query.text and len(query.positives) == 1 else ""  # that may name a part
     phrase = part_phrase(text, encoder) if text and encoder is not None else None
@@ -153,8 +156,8 @@ def resolve_query(scene: Scene, query: Query, encoder: TextEncoder | None) -> Re
         missing = source.vocabulary.unknown_part(text) if text and source is not None else None
         return replace(request, asked_as={**request.asked_as, **as_typed}, unknown_part=missing)
     object_query = _resolve(scene, Query(text=[phrase.object_phrase], absent=query.absent), encoder)
-    request = _resolve(scene, query, encoder) if not phrase.sure else replace(object_query, query=query)
-    return replace(request, part=PartQuery(phrase, object_query, _resolve(scene, query, encoder, phrase)))
+    whole = None if phrase.sure else _resolve(scene, query, encoder)
+    return PartQuery(query, phrase, object_query, _resolve(scene, query, encoder, phrase), whole)
 
 
 def _resolve(
@@ -183,23 +186,22 @@ def _resolve(
 
 
 @one_thread()
-def answer_of(scene: Scene, request: ResolvedQuery) -> Answer:
+def answer_of(scene: Scene, request: ResolvedQuery | PartQuery) -> Answer:
     """Answer a resolved query."""
-    return _part_answer(scene, request) if request.part else _answer(scene, request, _similarities(scene, request))
+    return _part_answer(scene, request) if isinstance(request, PartQuery) else _answer(scene, request)
 
 
-def _part_answer(scene: Scene, request: ResolvedQuery) -> Answer:
+def _part_answer(scene: Scene, request: PartQuery) -> Answer:
     """Answer a query for a part of an object: the object first, then the part among its splats and nodes alone.
 
     A phrase that may not mean a part (`PartPhrase`) is answered as a whole unless most of such a part, and a share of
     what the whole scene has of the word, is in both answers: "boat cat" is no part of the boat.
     """
-    assert request.part is not None
-    phrase, part = request.part.phrase.object_phrase, request.part.part
-    object_answer = answer_of(scene, request.part.whole_query)
+    phrase, part = request.phrase.object_phrase, request.part
+    object_answer = _answer(scene, request.object)
     if object_answer.count:
         inside = add_objects(scene, object_answer.selected)
-        answer = answer_of(scene.within(inside), part)
+        answer = _answer(scene.within(inside), part)
         note = "" if answer.count or answer.present is False else " Nothing stands out there."
         reason = f"{phrase!r} has {object_answer.count:,} splats. Within it: {answer.reason}{note}"
         if answer.count >= WHOLE_SHARE * inside.sum() and request.query.absent == "drop":
@@ -208,8 +210,8 @@ def _part_answer(scene: Scene, request: ResolvedQuery) -> Answer:
     else:
         answer, note = object_answer, "it" if object_answer.present is False else f"{phrase!r} is not found, and"
         reason = f"{object_answer.reason} So {note} has no parts."
-    if not request.part.phrase.sure:
-        whole = answer_of(scene, replace(request, part=None))
+    if request.whole is not None:
+        whole = _answer(scene, request.whole)
         shared = int((answer.selected & whole.selected).sum())
         if shared <= max(answer.count / 2, LEAST_OF_WHOLE * whole.count):
             return whole
@@ -228,10 +230,11 @@ def _similarities(scene: Scene, request: ResolvedQuery) -> np.ndarray:
     return similar.T
 
 
-def _answer(scene: Scene, request: ResolvedQuery, similarities: np.ndarray) -> Answer:
+def _answer(scene: Scene, request: ResolvedQuery) -> Answer:
     query, has_feature, rows = request.query, scene.has_feature, scene.distinct
     if query.sets:
         return _set_answer(scene, query)
+    similarities = _similarities(scene, request)
     presence, mask = _presence(rows, request, similarities)
     scores = combine(similarities if mask.all() else similarities[:, mask], int(mask[: len(query.positives)].sum()))
     scores = np.where(rows.has_feature, scores, np.float32(LOWEST_COSINE))

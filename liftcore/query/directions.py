@@ -154,11 +154,8 @@ def _encode(
     texts = {place: term for place, term in enumerate(query.terms) if isinstance(term, str)}
     if not texts:
         return {}
+    assert encoder is not None  # `ask` opens one for texts
     space = scene.metadata.text_space or "not named"
-    if encoder is None:
-        expected = f"a text encoder (the lift's text space: {space})"
-        hint = "name a text encoder of the lift's space, or ask by example"
-        raise InvalidQuery("encoder", expected=expected, got="no encoder", hint=hint)
     if encoder.channels != scene.channels:
         expected = f"{scene.channels} channels as the lift has (its text space: {space})"
         hint = "query with the text encoder that belongs to the features' image encoder"

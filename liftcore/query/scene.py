@@ -157,13 +157,8 @@ class Scene:
             Unavailable: the encoder's weights are not on this machine.
         """
         from liftcore.query.ask import ask
-        from liftcore.query.question import Query
-        from liftcore.text import check_texts
 
-        query = Query.of(query) if isinstance(query, str) else query
-        check_texts(query.texts)  # before an encoder is opened
-        needs_encoder = bool(query.texts) or encoder is not None
-        answer = ask(self, query, self.encoder(encoder) if needs_encoder else None)
+        answer = ask(self, query, encoder)
         if places is False:
             return answer
         with nullcontext() if places else suppress(InvalidLift):

@@ -161,7 +161,7 @@ def test_threshold_of_examples_is_above_a_least_likeness(scene: Scene) -> None:
         (parse_example(f"middle:box:0,0,{WIDTH + 1},2"), InvalidQuery, f"x1 <= {WIDTH}"),
         (parse_example("middle:stroke:0,0,1,1"), InvalidQuery, "an area that shows the scene"),
         (Vector((1.0,) * 7), InvalidQuery, "8 channels"),
-        ("apple", InvalidQuery, "ask by example"),
+        ("apple", InvalidQuery, "give encoder=, or vectors"),
     ],
 )
 def test_term_without_a_feature_says_why_under_its_name(
