@@ -10,6 +10,7 @@ from liftcore.errors import InvalidSplats as InvalidSplats
 from liftcore.errors import NotFound as NotFound
 from liftcore.errors import SplatliftError as SplatliftError
 from liftcore.errors import Unavailable as Unavailable
+from liftcore.features.encoders import ImageEncoder as ImageEncoder
 from liftcore.features.encoders.encode import encode_images as encode_images
 from liftcore.features.packing import pack_folder as pack_folder
 from liftcore.features.packing import retag_pack as retag_pack

@@ -42,7 +42,7 @@ class ImageEncoder(Protocol):
 
     @property
     def pixels(self) -> Pixels:
-        """Preprocessing of images."""
+        """Preprocessing of images: an object with the attributes of `Pixels`, ``patch`` to ``interpolation``."""
         ...
 
     @property
