@@ -117,7 +117,7 @@ class LiftInputs(Body):
         examples=[{"preset": "default", "quality": "balanced"}],
     )
 
-    def order(self, kind: str, parameters: dict[str, Any], settings: dict[str, Any]) -> dict[str, Any]:
+    def columns(self, kind: str, parameters: dict[str, Any], settings: dict[str, Any]) -> dict[str, Any]:
         """Return the columns of the job."""
         packs = list(dict.fromkeys(self.features))
         inputs = {"splats": self.splats, "cameras": self.cameras, "features": packs}
@@ -134,7 +134,7 @@ class LiftRequest(LiftInputs):
     def job(self) -> dict[str, Any]:
         """Return the columns of the job."""
         settings = LiftSettings.of_json(self.settings).model_dump(mode="json")
-        return self.order("lift", {} if self.table is None else {"table": self.table}, settings)
+        return self.columns("lift", {} if self.table is None else {"table": self.table}, settings)
 
 
 class Labels(Body):
@@ -164,7 +164,7 @@ class TradeoffRequest(LiftInputs):
             raise InvalidSettings("quality", expected=expected, got=got)
         LiftSettings.of_json(self.settings)
         parameters = self.model_dump(mode="json", include={"budget_s", "labels"}, exclude_none=True)
-        return self.order("tradeoff", parameters, self.settings)
+        return self.columns("tradeoff", parameters, self.settings)
 
 
 class Progress(BaseModel):

@@ -42,14 +42,16 @@ def add_lift(store: Store, owner: Owner, draft: Path, content: dict[str, Any], c
     metadata = content["metadata"]
     files = (metadata["splats"], metadata["cameras"], *metadata["features"])
     splats_id, own_cameras, *packs = [f"sha256:{file['sha256']}" for file in files]
-    order = {"kind": "lift", "splats": splats_id, "cameras": cameras or own_cameras, "settings": metadata["settings"],
-             "features": [pack for pack in packs if store.find_asset(owner, pack)], "parameters": {}}  # fmt: skip
+    fields = {
+        "kind": "lift", "splats": splats_id, "cameras": cameras or own_cameras, "settings": metadata["settings"],
+        "features": [pack for pack in packs if store.find_asset(owner, pack)], "parameters": {},
+    }  # fmt: skip
     splats = store.asset(owner, splats_id, "splats")
     if splats.counts["splats"] != content["count"]:
         got = f"{content['count']} for {splats.counts['splats']} splats"
         raise InvalidLift("lift", expected="a row for each splat", got=got)
     try:
-        seen_views = store.asset(owner, order["cameras"], "cameras").counts.get("names")
+        seen_views = store.asset(owner, fields["cameras"], "cameras").counts.get("names")
     except NotFound as error:
         hint = "PUT its file of cameras first; in place of a folder a zip of it, named here as ?cameras=ID"
         raise NotFound(error.argument, expected=error.expected, got=error.got, hint=hint) from None
@@ -58,10 +60,10 @@ def add_lift(store: Store, owner: Owner, draft: Path, content: dict[str, Any], c
     sync(draft)
     now = time.time()
     with store.write():
-        for asset in (order["splats"], order["cameras"], *order["features"]):
+        for asset in (fields["splats"], fields["cameras"], *fields["features"]):
             store.asset(owner, asset)
             store.own_asset(owner.owner, asset)
-        job = store.insert_job(owner.owner, order, state="succeeded", attempt=1, started=now)
+        job = store.insert_job(owner.owner, fields, state="succeeded", attempt=1, started=now)
         store.insert_lift(job, content, draft, store.root / "lifts" / f"{job}.safetensors")
     return store.lift(owner, job)
 

@@ -116,7 +116,7 @@ class Runner:
                 return ""
 
         try:
-            order = work_of(dict(job), store, SERVICE, self._settings)
+            order = order_of(dict(job), store, SERVICE, self._settings)
         except SplatliftError as error:
             fault = fault_of(error)
             return lambda: store.end(job, fault)
@@ -156,16 +156,16 @@ class Runner:
                     return None
 
 
-def work_of(order: dict[str, Any], store: Store, owner: Owner, settings: ServiceSettings) -> dict[str, Any]:
-    """Return what a child needs of an order: its files, and what clients call them."""
-    records = [store.asset(owner, *asset) for asset in assets_of(order)]
-    end = 2 + len(order["features"])
+def order_of(fields: dict[str, Any], store: Store, owner: Owner, settings: ServiceSettings) -> dict[str, Any]:
+    """Return a child's order by the fields of a job: its files, and what clients call them."""
+    records = [store.asset(owner, *asset) for asset in assets_of(fields)]
+    end = 2 + len(fields["features"])
     splats, cameras, *packs = records[:end]
     return {
-        "splats": str(splats.file), "kernel": splats.kernel(order["settings"]), "cameras": str(cameras.file),
+        "splats": str(splats.file), "kernel": splats.kernel(fields["settings"]), "cameras": str(cameras.file),
         "features": [str(pack.file) for pack in packs],
         "labels": {item.kind: str(item.file) for item in records[end:]},
-        "settings": order["settings"], "engine": settings.engine,
+        "settings": fields["settings"], "engine": settings.engine,
         "file_names": {str(item.file): item.download_name for item in records[:end]},
         "names": {str(item.file): item.client_name for item in records},
     }  # fmt: skip

@@ -328,14 +328,14 @@ class Store:
     # Jobs
 
     def submit(
-        self, owner: Owner, order: dict[str, Any], key: str | None = None, max_queued: int = 1_000_000
+        self, owner: Owner, fields: dict[str, Any], key: str | None = None, max_queued: int = 1_000_000
     ) -> tuple[Job, bool]:
-        """Queue a job; it is on the disk when this returns. The same Idempotency-Key and order are the same job.
+        """Queue a job; it is on the disk when this returns. The same Idempotency-Key and fields are the same job.
 
         Returns:
             The job, and True if it is new.
         """
-        digest = hashlib.sha256(json.dumps(order, sort_keys=True).encode()).hexdigest()
+        digest = hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()
         with self.write():
             same = "SELECT * FROM jobs WHERE owner = :owner AND idempotency_key = :key"
             if key is not None and (earlier := self.rows(same, owner=owner.owner, key=key)):
@@ -348,14 +348,14 @@ class Store:
             queued = self.rows("SELECT count(*) AS count FROM jobs WHERE state = 'queued'")[0]["count"]
             if queued >= max_queued:
                 expected = f"fewer than {max_queued} jobs in line"
-                raise Busy(order["kind"], expected=expected, got=str(queued), hint="try again later")
-            for asset, kind in assets_of(order):
+                raise Busy(fields["kind"], expected=expected, got=str(queued), hint="try again later")
+            for asset, kind in assets_of(fields):
                 self.asset(owner, asset, kind)
                 self.own_asset(owner.owner, asset)
-            job = self.insert_job(owner.owner, order, idempotency_key=key, digest=digest, state="queued")
+            job = self.insert_job(owner.owner, fields, idempotency_key=key, digest=digest, state="queued")
         return self.job(owner, job), True
 
-    def insert_job(self, owner: str, order: dict[str, Any], **columns: Any) -> str:
+    def insert_job(self, owner: str, fields: dict[str, Any], **columns: Any) -> str:
         """Add the row of a job within a transaction; return its id."""
         columns |= {
             "id": secrets.token_hex(16),
@@ -363,7 +363,7 @@ class Store:
             "request_id": REQUEST_ID.get(),
             "created": time.time(),
         }
-        columns |= {name: value if isinstance(value, str) else json.dumps(value) for name, value in order.items()}
+        columns |= {name: value if isinstance(value, str) else json.dumps(value) for name, value in fields.items()}
         names, places = ", ".join(columns), ", ".join(f":{name}" for name in columns)
         self._writer.execute(f"INSERT INTO jobs ({names}) VALUES ({places})", columns)
         self._move(columns["id"], columns["state"])
@@ -526,11 +526,11 @@ class Store:
         raise NotFound("lift", expected=expected, got=(lift or "none")[:80], hint=hint)
 
 
-def assets_of(order: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return the ids of the assets that an order needs, with the kind that each must have."""
-    inputs = [(order["splats"], "splats"), (order["cameras"], "cameras")]
-    inputs += [(pack, "features") for pack in order["features"]]
-    parameters = order["parameters"]
+def assets_of(fields: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return the ids of the assets that a job needs, with the kind that each must have."""
+    inputs = [(fields["splats"], "splats"), (fields["cameras"], "cameras")]
+    inputs += [(pack, "features") for pack in fields["features"]]
+    parameters = fields["parameters"]
     if labels := parameters.get("labels"):
         inputs += [(labels["masks"], "masks"), (labels["table"], "table")]
     return inputs + ([(parameters["table"], "table")] if "table" in parameters else [])

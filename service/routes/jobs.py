@@ -12,13 +12,13 @@ from fastapi.sse import EventSourceResponse, format_sse_event
 from liftcore.errors import SplatliftError
 from service.models import FINAL_STATES, Job, LiftRequest, Plan, TradeoffRequest
 from service.routes import Caller, Deps, Parts, add_list
-from service.runner import work_of
+from service.runner import order_of
 from service.store import Owner
 
 POLL_SECONDS = 0.25  # between polls for new events
 QUIET_POLLS = 60  # then a comment keeps the connection open
 STREAMS = anyio.CapacityLimiter(2)  # threads for polls of all streams, so that these do not starve other routes
-Key = Annotated[
+IdempotencyKey = Annotated[
     str | None,
     Header(
         alias="Idempotency-Key", min_length=1, max_length=255, pattern=r"^[\x20-\x7e]+$",
@@ -43,20 +43,22 @@ add_list(router, "jobs", Job, Job.model_validate)
 
 
 @router.post("/lift", status_code=202, responses=REPEATED)
-def order_lift(order: LiftRequest, response: Response, deps: Deps, owner: Caller, key: Key = None) -> Job:
+def order_lift(lift: LiftRequest, response: Response, deps: Deps, owner: Caller, key: IdempotencyKey = None) -> Job:
     """Lift features onto splats. The job is on the disk before the reply."""
-    return _submit(order.job(), response, deps, owner, key)
+    return _submit(lift.job(), response, deps, owner, key)
 
 
 @router.post("/tradeoff", status_code=202, responses=REPEATED, tags=["trade-offs"])
-def order_tradeoff(order: TradeoffRequest, response: Response, deps: Deps, owner: Caller, key: Key = None) -> Job:
+def order_tradeoff(
+    tradeoff: TradeoffRequest, response: Response, deps: Deps, owner: Caller, key: IdempotencyKey = None
+) -> Job:
     """Compare quality levels and presets on a scene within a budget. The job is on the disk before the reply."""
-    return _submit(order.job(), response, deps, owner, key)
+    return _submit(tradeoff.job(), response, deps, owner, key)
 
 
-def _submit(order: dict[str, Any], response: Response, deps: Parts, owner: Owner, key: str | None) -> Job:
+def _submit(fields: dict[str, Any], response: Response, deps: Parts, owner: Owner, key: str | None) -> Job:
     deps.store.require_room()
-    job, is_new = deps.store.submit(owner, order, key, deps.settings.max_queued)
+    job, is_new = deps.store.submit(owner, fields, key, deps.settings.max_queued)
     if is_new:
         deps.runner.wake()
     response.status_code = 202 if is_new else 200
@@ -65,16 +67,16 @@ def _submit(order: dict[str, Any], response: Response, deps: Parts, owner: Owner
 
 
 @router.post("/lift/plan")
-async def plan_lift(order: LiftRequest, deps: Deps, owner: Caller) -> Plan:
+async def plan_lift(lift: LiftRequest, deps: Deps, owner: Caller) -> Plan:
     """Plan a lift without running it: the views that it would use, and the memory."""
-    return Plan.model_validate(await anyio.to_thread.run_sync(_plan, order.job(), deps, owner, limiter=deps.checks))
+    return Plan.model_validate(await anyio.to_thread.run_sync(_plan, lift.job(), deps, owner, limiter=deps.checks))
 
 
-def _plan(order: dict[str, Any], deps: Parts, owner: Owner) -> dict[str, Any]:
-    work = work_of(order, deps.store, owner, deps.settings)
+def _plan(fields: dict[str, Any], deps: Parts, owner: Owner) -> dict[str, Any]:
+    order = order_of(fields, deps.store, owner, deps.settings)
     with deps.store.scratch() as scratch:
-        work |= {"task": "plan", "kind": "plan", "scratch": str(scratch), "memory": deps.settings.check_memory_bytes}
-        return deps.children.result_of(work, deps.settings.check_seconds, "plan")
+        order |= {"task": "plan", "kind": "plan", "scratch": str(scratch), "memory": deps.settings.check_memory_bytes}
+        return deps.children.result_of(order, deps.settings.check_seconds, "plan")
 
 
 @router.get("/jobs/{job}")

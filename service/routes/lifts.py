@@ -158,8 +158,8 @@ def get_photo(lift: str, view: View, request: Request, deps: Deps, owner: Caller
     """
 
     def camera_size() -> tuple[int, int] | None:
-        work = scene_request("views", record, deps) | {"view": view, "range": (0, 0)}
-        views = deps.queries.call(work)["views"]
+        order = scene_request("views", record, deps) | {"view": view, "range": (0, 0)}
+        views = deps.queries.call(order)["views"]
         return (views[0]["width"], views[0]["height"]) if views else None
 
     record = deps.store.lift(owner, lift)
@@ -194,8 +194,8 @@ def list_objects(
 ) -> Response:
     """List the objects of the scene, found by masks when it was lifted; a vocabulary names them."""
     record = deps.store.lift(owner, lift)
-    work = _nodes("scene_objects", record, deps, owner, options) | {"object_labels": labels_of(record, deps)}
-    return respond(request, deps, work)
+    order = _nodes("scene_objects", record, deps, owner, options) | {"object_labels": labels_of(record, deps)}
+    return respond(request, deps, order)
 
 
 @router.get("/lifts/{lift}/tree", response_model=models.LiftTree)
@@ -207,12 +207,12 @@ def get_tree(
 
 
 def _nodes(operation: str, lift: Lift, deps: Parts, owner: Owner, options: models.NodesRequest) -> dict[str, Any]:
-    work: dict[str, Any] = scene_request(operation, lift, deps) | NO_ENCODER
+    order: dict[str, Any] = scene_request(operation, lift, deps) | NO_ENCODER
     if options.table is not None or options.encoder is not None:
-        work = with_encoder(work, options, lift, deps, owner)
-    encoder = None if work["encoder"] is None else encoder_label(work["encoder"])
+        order = with_encoder(order, options, lift, deps, owner)
+    encoder = None if order["encoder"] is None else encoder_label(order["encoder"])
     head = {"lift": lift.id, "encoder": encoder}
-    return work | {"first": options.cursor, "count": options.limit, "head": head}
+    return order | {"first": options.cursor, "count": options.limit, "head": head}
 
 
 register_url_convertor("file", OneOf("splats", "colours"))
@@ -232,8 +232,8 @@ def get_viewer_file(
     if file == "splats":
         headers = request.headers
         compressed = "zstd" in headers.get("accept-encoding", "") and "range" not in headers
-        work = scene_request("scene", record, deps) | {"compressed": compressed}
-        answer = respond(request, deps, work, BINARY, f"scene-{record.id}.splat")
+        order = scene_request("scene", record, deps) | {"compressed": compressed}
+        answer = respond(request, deps, order, BINARY, f"scene-{record.id}.splat")
         answer.headers.update({"Vary": "Accept-Encoding"} | ({"Content-Encoding": "zstd"} if compressed else {}))
         return answer
     return respond(request, deps, scene_request("colours", record, deps) | {"layer": layer}, NPY)

@@ -90,7 +90,7 @@ router = APIRouter(tags=["queries"])
 
 
 def respond(
-    request: Request, deps: Parts, work: dict[str, Any], media_type: str = JSON, filename: str | None = None
+    request: Request, deps: Parts, order: dict[str, Any], media_type: str = JSON, filename: str | None = None
 ) -> Response:
     """Send a request to the query process; return its answer: a document, or a file that the client may have already.
 
@@ -98,14 +98,14 @@ def respond(
     """
     headers = {"Cache-Control": "private, no-cache"}
     if request.method == "GET" and media_type != JSON:
-        decides = {name: value for name, value in work.items() if name != "names"} | {"version": __version__}
+        decides = {name: value for name, value in order.items() if name != "names"} | {"version": __version__}
         headers = cache_headers(f'"{hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()}"')
         if answer := unchanged(request, headers["ETag"], exists=False):  # whether the view exists is not known yet
             return answer
     draft = deps.store.root / "tmp" / f"{secrets.token_hex(16)}{Path(filename or '').suffix}"
     deps.store.make_folders()
     try:
-        answer = deps.queries.call(work | {"draft": str(draft)})
+        answer = deps.queries.call(order | {"draft": str(draft)})
     except BaseException:
         draft.unlink(missing_ok=True)
         raise
@@ -147,11 +147,11 @@ def scene_request(operation: str, lift: models.Lift, deps: Parts) -> dict[str, A
 
 def query_request(operation: str, question: Question, lift: models.Lift, deps: Parts, owner: Owner) -> dict[str, Any]:
     """Return the request of a question: with the encoder of its texts, and its selections."""
-    work = scene_request(operation, lift, deps)
+    order = scene_request(operation, lift, deps)
     examples = [str(item) for item in (*question.sets, *question.like, *question.unlike)]
-    work |= with_selections(examples, lift, deps)
-    work = with_encoder(work, question, lift, deps, owner) if question.texts else work | NO_ENCODER
-    return work | {"query": question.model_dump(mode="json", include=set(Query.deciding()))}
+    order |= with_selections(examples, lift, deps)
+    order = with_encoder(order, question, lift, deps, owner) if question.texts else order | NO_ENCODER
+    return order | {"query": question.model_dump(mode="json", include=set(Query.deciding()))}
 
 
 def with_selections(sets: list[str], lift: models.Lift, deps: Parts) -> dict[str, Any]:
@@ -174,10 +174,10 @@ def seen_from(view: models.Viewpoint) -> dict[str, Any]:
 
 
 def with_encoder(
-    work: dict[str, Any], words: LiftQuestion | models.NodesRequest, lift: models.Lift, deps: Parts, owner: Owner
+    order: dict[str, Any], words: LiftQuestion | models.NodesRequest, lift: models.Lift, deps: Parts, owner: Owner
 ) -> dict[str, Any]:
     """Return the request with the encoder of its words: an uploaded table, the lift's, or one of the operator."""
-    names, table_id = dict(work["names"]), words.table
+    names, table_id = dict(order["names"]), words.table
     if words.table is not None and words.encoder is not None:
         raise InvalidRequest("table", expected="table or encoder", got="both", hint="leave one of them out")
     if table_id is None and words.encoder in (None, lift.text_space):  # the words that came with the lift
@@ -193,14 +193,14 @@ def with_encoder(
             raise InvalidRequest("table", expected="the id of an uploaded text table", got=got)
         spec = f"table:{table.file}"
         names |= {str(table.file): table.client_name, f"text table {table.file.name}": table.client_name}
-    return work | {"encoder": spec, "encoder_version": encoder_version(spec), "names": names}
+    return order | {"encoder": spec, "encoder_version": encoder_version(spec), "names": names}
 
 
 def word_request(operation: str, words: Words, lift: models.Lift, deps: Parts, owner: Owner) -> dict[str, Any]:
     """Return the request of many words."""
-    work = with_encoder(scene_request(operation, lift, deps), words, lift, deps, owner)
-    head = {"lift": lift.id, "encoder": encoder_label(work["encoder"])}
-    return work | {"words": words.words, "head": head}
+    order = with_encoder(scene_request(operation, lift, deps), words, lift, deps, owner)
+    head = {"lift": lift.id, "encoder": encoder_label(order["encoder"])}
+    return order | {"words": words.words, "head": head}
 
 
 # The routes
@@ -213,10 +213,10 @@ def query(question: Question, request: Request, deps: Deps, owner: Caller) -> Re
     In a body examples may be vectors; POST the same body to the outputs of /query/{output}.
     """
     lift = deps.store.lift(owner, question.lift)
-    work = query_request("query", question, lift, deps, owner) | {"view": question.view, "top": question.top}
-    encoder = None if work["encoder"] is None else encoder_label(work["encoder"])
-    work["head"] = {"lift": lift.id, "text_space": lift.text_space, "encoder": encoder}
-    return respond(request, deps, work | {"links": _links(question, lift.id)})
+    order = query_request("query", question, lift, deps, owner) | {"view": question.view, "top": question.top}
+    encoder = None if order["encoder"] is None else encoder_label(order["encoder"])
+    order["head"] = {"lift": lift.id, "text_space": lift.text_space, "encoder": encoder}
+    return respond(request, deps, order | {"links": _links(question, lift.id)})
 
 
 def _links(question: Question, lift: str) -> dict[str, str]:
@@ -237,8 +237,8 @@ def suggested_words(
 ) -> Response:
     """List words: completions of a text, and words for the objects of the scene."""
     lift = deps.store.lift(owner, words.lift)
-    work = with_encoder(scene_request("suggested_words", lift, deps), words, lift, deps, owner)
-    return respond(request, deps, work | {"text": words.text, "limit": words.limit, "head": {"lift": lift.id}})
+    order = with_encoder(scene_request("suggested_words", lift, deps), words, lift, deps, owner)
+    return respond(request, deps, order | {"text": words.text, "limit": words.limit, "head": {"lift": lift.id}})
 
 
 @router.post("/query/segment", response_model=SegmentAnswer)
@@ -255,8 +255,8 @@ def segment(words: SegmentRequest, request: Request, deps: Deps, owner: Caller) 
 def segment_output(form: WordOutput, words: SegmentRequest, request: Request, deps: Deps, owner: Caller) -> Response:
     """Return splats or a view by their words."""
     lift = deps.store.lift(owner, words.lift)
-    work = word_request(form, words, lift, deps, owner) | (seen_from(words) if form in PICTURES else {})
-    return respond(request, deps, work, WORD_OUTPUTS[form][0])
+    order = word_request(form, words, lift, deps, owner) | (seen_from(words) if form in PICTURES else {})
+    return respond(request, deps, order, WORD_OUTPUTS[form][0])
 
 
 @router.post(
@@ -267,7 +267,7 @@ def segment_output(form: WordOutput, words: SegmentRequest, request: Request, de
 def export(parameters: ExportRequest, request: Request, deps: Deps, owner: Caller) -> Response:
     """Export objects, words or questions as a file with labels."""
     lift = deps.store.lift(owner, parameters.lift)
-    work: dict[str, Any] = scene_request("export", lift, deps) | NO_ENCODER
+    order: dict[str, Any] = scene_request("export", lift, deps) | NO_ENCODER
     title = [parameters.of]
     if parameters.of == "questions":
         if not parameters.questions or any(question.lift not in (None, lift.id) for question in parameters.questions):
@@ -277,14 +277,14 @@ def export(parameters: ExportRequest, request: Request, deps: Deps, owner: Calle
             {"name": name, "request": query_request("query", question, lift, deps, owner)}
             for name, question in by_name.items()
         ]
-        work, title = work | {"parts": parts}, list(by_name)
+        order, title = order | {"parts": parts}, list(by_name)
     elif parameters.of == "words" or parameters.encoder is not None or parameters.table is not None:
-        work = word_request("export", parameters, lift, deps, owner)
+        order = word_request("export", parameters, lift, deps, owner)
     name = "-".join(re.findall(r"[A-Za-z0-9]+", " ".join(title)))[:80] or "splats"
     content, suffix, media_type, _ = EXPORTS[parameters.format]
-    work |= {"of": parameters.of, "of_view": parameters.view, "object_labels": labels_of(lift, deps)}
-    work |= {"content": content, "suffix": suffix}
-    return respond(request, deps, work, media_type, f"{name}-{lift.id}{suffix}")
+    order |= {"of": parameters.of, "of_view": parameters.view, "object_labels": labels_of(lift, deps)}
+    order |= {"content": content, "suffix": suffix}
+    return respond(request, deps, order, media_type, f"{name}-{lift.id}{suffix}")
 
 
 def labels_of(lift: models.Lift, deps: Parts) -> dict[str, tuple[str | None, bool]]:
@@ -315,9 +315,9 @@ def example_text(example: str | tuple[float, ...]) -> str:
 def nearest_words(words: NearestWordsRequest, request: Request, deps: Deps, owner: Caller) -> Response:
     """List the words nearest to a pixel, a splat or a vector."""
     lift = deps.store.lift(owner, words.lift)
-    work = word_request("nearest_words", words, lift, deps, owner) | {"example": words.example, "top": words.top}
-    work["head"] |= {"example": example_text(words.example)}
-    return respond(request, deps, work)
+    order = word_request("nearest_words", words, lift, deps, owner) | {"example": words.example, "top": words.top}
+    order["head"] |= {"example": example_text(words.example)}
+    return respond(request, deps, order)
 
 
 @get_and_post(
@@ -330,11 +330,11 @@ def query_output(
 ) -> Response:
     """Return an output of a question."""
     lift = deps.store.lift(owner, question.lift)
-    work = query_request(output, question, lift, deps, owner) | {"head": {"lift": lift.id}}
+    order = query_request(output, question, lift, deps, owner) | {"head": {"lift": lift.id}}
     if output in PICTURES:
-        work |= seen_from(question)
+        order |= seen_from(question)
     media_type = OUTPUTS[output][0]
-    return respond(request, deps, work, media_type, f"{output}-{lift.id}.ply" if media_type == BINARY else None)
+    return respond(request, deps, order, media_type, f"{output}-{lift.id}.ply" if media_type == BINARY else None)
 
 
 @get_and_post(
@@ -349,9 +349,9 @@ def render(question: RenderRequest, request: Request, deps: Deps, owner: Caller)
     splat. A body may have a camera in place of the view.
     """
     lift = deps.store.lift(owner, question.lift)
-    work = scene_request("render", lift, deps) | seen_from(question) | {"channel": question.channel}
+    order = scene_request("render", lift, deps) | seen_from(question) | {"channel": question.channel}
     hide = question.hide and [item for item in question.hide if item]  # `hide=` of an address: none
     if hide is None:
         hide = [f"object:{label.id}" for label in object_labels(deps.store, lift.id) if label.hidden]
-    work |= {"hide": hide} | with_selections(hide, lift, deps)
-    return respond(request, deps, work, PNG)
+    order |= {"hide": hide} | with_selections(hide, lift, deps)
+    return respond(request, deps, order, PNG)

@@ -106,14 +106,14 @@ def _edit(edit: models.EditRequest | None, lift: Lift, deps: Parts, owner: Owner
     if edit is None:
         return SplatSet(0, None, zlib.compress(before))
     if edit.query is None:
-        work = scene_request("edit", lift, deps) | NO_ENCODER
+        order = scene_request("edit", lift, deps) | NO_ENCODER
     elif edit.query.lift not in (None, lift.id):
         raise InvalidRequest("query.lift", expected="the lift of the selection", got=str(edit.query.lift))
     else:
-        work = query_request("edit", edit.query, lift, deps, owner)
+        order = query_request("edit", edit.query, lift, deps, owner)
     document: dict[str, Any] = edit.model_dump(mode="json", exclude={"query"}, exclude_none=True)
-    document |= {"query": work["query"]} if "query" in work else {}
-    value = deps.queries.call(work | {"edit": document, "before": bits_text(before)})
+    document |= {"query": order["query"]} if "query" in order else {}
+    value = deps.queries.call(order | {"edit": document, "before": bits_text(before)})
     return SplatSet(value["count"], value["box"], zlib.compress(bytes.fromhex(value["bits"])))
 
 

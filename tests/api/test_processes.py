@@ -97,19 +97,12 @@ def test_children_that_are_killed_or_stopped_are_replaced(children: Children, tm
 
 def test_reason_ends_an_order_with_its_group(children: Children, tmp_path: Path) -> None:
     until(children.is_ready)
-    order = check_of(tmp_path, "cameras", cameras_json()) | {"task": "no such task"}
+    order = check_of(tmp_path, "cameras", cameras_json())
     began = time.monotonic()
-    ending = children.run(order | {"task": "check"}, 600, why_end=lambda: "it is canceled")
+    ending = children.run(order, 600, why_end=lambda: "it is canceled")
     if ending.last is None:  # the check may have been faster than the first look
         assert ending.reason == "it is canceled"
     assert time.monotonic() - began < 300 and children.count() == 0
-
-
-def test_stopped_children_take_no_order(tmp_path: Path) -> None:
-    children = Children()
-    children.stop()
-    with pytest.raises(Busy):
-        check_cameras(children, tmp_path)
 
 
 def names_in_emoji() -> bytes:
