@@ -318,6 +318,9 @@ def test_directory_without_its_database_or_with_anothers_is_refused(tmp_path: Pa
         path.unlink()
     with pytest.raises(Misconfigured, match=DATABASE):
         Store(tmp_path)
+    (tmp_path / DATABASE).touch()  # empty
+    with pytest.raises(Misconfigured, match=DATABASE):
+        Store(tmp_path)
     assert len(list((tmp_path / "blobs").iterdir())) == 1
 
 

@@ -1,6 +1,6 @@
-"""Stops and deaths as a client sees them: SIGTERM in a lift, an order repeated over a kill, a stream taken up again.
+"""Stops and deaths as a client sees them: SIGTERM in a lift and beside open requests, a stream taken up again.
 
-python -m tests.gate.g11_stop [--stops N] [--replays N]
+python -m tests.gate.g11_stop [--stops N]
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from pathlib import Path
 import httpx
 
 from tests.gate.running import Service, Verdicts, run_gate
-from tests.gate.scenes import long_scene, small_scene
+from tests.gate.scenes import long_scene
 
 QUICK_SECONDS = 5.0  # to end where no request is open; a check, a busy machine and a job's end included
 OPEN_SECONDS = 15.0  # where a stream and half an upload are open
 
 
 def gate(options: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
-    """Stop, kill and replay."""
+    """Stop, kill and follow."""
     chance = random.Random(options.seed)
     with Service(folder / "data") as service:
         body = service.upload(long_scene())
@@ -34,8 +34,6 @@ def gate(options: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
             service, body, [chance.uniform(0, duration / 4) for _ in range(options.stops)], digest, verdicts
         )
         stop_beside_open_requests(service, body, verdicts)
-        small = service.upload(small_scene())
-        replay_over_kills(service, small, [chance.uniform(0, 0.1) for _ in range(options.replays)], verdicts)
         resume_stream(service, body, verdicts)
         verdicts.check("nothing lies in the scratch folders", not service.scratch(), service.scratch())
 
@@ -87,36 +85,6 @@ def stop_beside_open_requests(service: Service, body: dict, verdicts: Verdicts) 
     verdicts.check("its job succeeds", service.wait_for(job)["state"] == "succeeded")
 
 
-def replay_over_kills(service: Service, body: dict, moments: list[float], verdicts: Verdicts) -> None:
-    """SIGKILL beside four clients that send one order with one Idempotency-Key, and send it again afterwards."""
-    before = len(service.get("/jobs", params={"limit": 1000}).json()["jobs"])
-    accepted_changes, doubled, unfinished = 0, 0, 0
-    for number, moment in enumerate(moments):
-
-        def send(_: int, key: str = f"replay {number}") -> str | None:
-            try:
-                return service.order(body, key)
-            except httpx.TransportError:
-                return None
-
-        with ThreadPoolExecutor(4) as pool:
-            answers = pool.map(send, range(4))
-            time.sleep(moment)
-            service.end(signal.SIGKILL)
-            acknowledged = {job for job in answers if job}
-        service.start()
-        job = service.order(body, f"replay {number}")
-        doubled += len(acknowledged | {job}) > 1
-        other = {**body, "settings": {"preset": "row-sum"}}
-        headers = {"Idempotency-Key": f"replay {number}"}
-        accepted_changes += service.post("/lift", json=other, headers=headers).status_code != 422
-        unfinished += service.wait_for(job)["state"] != "succeeded"
-    count = len(service.get("/jobs", params={"limit": 1000}).json()["jobs"]) - before
-    figures = f"{len(moments)} keys, {count} jobs, {doubled} doubled, {unfinished} unfinished"
-    verdicts.check("one key over a kill is one job", count == len(moments) and not doubled + unfinished, figures)
-    verdicts.check("the key with another order is 422 after the kill", not accepted_changes, accepted_changes)
-
-
 def resume_stream(service: Service, body: dict, verdicts: Verdicts) -> None:
     """Follow a job, be cut off by a kill, and go on after the last event."""
     job = service.order(body)
@@ -155,4 +123,4 @@ def follow(service: Service, job: str, after: str | None = None) -> list[tuple[s
 
 
 if __name__ == "__main__":
-    run_gate(gate, __doc__, stops=4, replays=2)
+    run_gate(gate, __doc__, stops=4)

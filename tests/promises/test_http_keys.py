@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import socket
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from typing import Any
 import httpx
 import pytest
 
-from tests.server import Server, run_command, until
+from tests.server import PATIENCE_SECONDS, Server, run_command, until
 from tests.tiny_scene import TinyScene
 
 from .over_http import (
@@ -173,6 +174,30 @@ def test_share_reads_and_asks_its_lift_and_nothing_else(keyed: Keyed) -> None:
     assert keyed.server.client.get(f"/lifts/{keyed.lifts[0]}", headers=guest).status_code == 200
     assert keyed.ask("alice", "DELETE", share["links"]["self"]).status_code == 204
     assert_problem(keyed.server.client.get(f"/lifts/{keyed.lifts[0]}", headers=guest), 401)
+
+
+@pytest.mark.parametrize(
+    ("name", "fields", "status"),
+    [
+        (None, {"Host": "localhost.example.org"}, 421),
+        (None, {"Origin": "null"}, 403),
+        (None, {}, 401),
+        ("reader", {}, 403),
+        ("alice", {"Content-Length": str(1 << 50)}, 413),
+    ],
+    ids=str,
+)
+def test_head_is_refused_before_its_body_comes(
+    keyed: Keyed, name: str | None, fields: dict[str, str], status: int
+) -> None:
+    key = {} if name is None else bearer(keyed.secrets[name])
+    fields = {"Host": "localhost", "Content-Length": "1000"} | key | fields
+    for head in ("PUT /assets/splats", "POST /lift", "POST /lift/plan", "POST /tradeoff"):
+        lines = [f"{head} HTTP/1.1", *(f"{field}: {value}" for field, value in fields.items()), "", ""]
+        address = keyed.server.client.base_url
+        with socket.create_connection((address.host, address.port or 80), PATIENCE_SECONDS) as connection:
+            connection.sendall("\r\n".join(lines).encode())
+            assert connection.recv(100).split()[1] == str(status).encode(), head
 
 
 def test_host_of_the_settings_is_taken(keyed: Keyed) -> None:

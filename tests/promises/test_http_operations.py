@@ -219,6 +219,7 @@ def test_damage_of_a_file_is_found(backup: Path, order: dict[str, Any]) -> None:
         if damage is not None:
             file.write_bytes(damage)
         assert digest[:8] in run_command("store", "verify", data=backup, status=1)
+        assert file.exists() is (damage is not None)  # it changes nothing
         file.touch()
 
 
