@@ -33,15 +33,37 @@ def files(tmp_path: Path) -> dict[str, Path]:
     return write_files(tmp_path)
 
 
+@pytest.fixture(scope="module")
+def empty_service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The address of a service with nothing, of which the first test needs that; all delete what they lift."""
+    folder = tmp_path_factory.mktemp("empty")
+    with serving(folder / "data", encoder=f"table:{write_files(folder)['table']}") as address:
+        yield address
+
+
 @pytest.fixture
-def empty(browser: Browser, files: dict[str, Path], tmp_path: Path) -> Iterator[Browser]:
-    """The page of a service that has nothing yet."""
-    with serving(tmp_path / "data", encoder=f"table:{files['table']}") as address:
-        browser.window(1200, 800)
-        browser.open(address)
-        browser.until(OPEN)
-        yield browser
-        browser.open("about:blank")
+def empty(browser: Browser, empty_service: str) -> Iterator[Browser]:
+    """Its page."""
+    browser.window(1200, 800)
+    browser.open(empty_service)
+    browser.until(OPEN)
+    yield browser
+    browser.open("about:blank")
+
+
+def test_lift_file_asks_for_what_it_was_made_of_and_opens(
+    empty: Browser, empty_service: str, server: PageServer, files: dict[str, Path], tmp_path: Path
+) -> None:
+    (tmp_path / "brought.safetensors").write_bytes(server.client.get(f"/lifts/{server.lift}/features").content)
+    empty.drop([tmp_path / "brought.safetensors"])
+    empty.until("document.querySelector('.file.bad .state')?.textContent.includes('This lift needs its splats')")
+    empty.drop([files["splats"], files["cameras"]])
+    empty.until(READY)
+    ask(empty, "lamp")
+    assert min(columns(empty, AMBER)) > 50
+    lift = empty.value("splatlift.lift.id")
+    deletion = httpx.delete(f"{empty_service}/jobs/{lift}?with_lift=true", timeout=PATIENCE_SECONDS)
+    assert deletion.status_code == 204
 
 
 def test_dropped_files_become_an_object_that_lights_up(empty: Browser, files: dict[str, Path]) -> None:
@@ -78,18 +100,6 @@ def test_dropped_files_become_an_object_that_lights_up(empty: Browser, files: di
     empty.press("#jobs button.danger")  # and away with it
     empty.press("#jobs button.danger")
     empty.until("!document.querySelector('#empty').hidden")
-
-
-def test_lift_file_asks_for_what_it_was_made_of_and_opens(
-    empty: Browser, server: PageServer, files: dict[str, Path], tmp_path: Path
-) -> None:
-    (tmp_path / "brought.safetensors").write_bytes(server.client.get(f"/lifts/{server.lift}/features").content)
-    empty.drop([tmp_path / "brought.safetensors"])
-    empty.until("document.querySelector('.file.bad .state')?.textContent.includes('This lift needs its splats')")
-    empty.drop([files["splats"], files["cameras"]])
-    empty.until(READY)
-    ask(empty, "lamp")
-    assert min(columns(empty, AMBER)) > 50
 
 
 def test_dropped_folder_brings_its_cameras(empty: Browser, tmp_path: Path) -> None:
