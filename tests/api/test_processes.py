@@ -97,8 +97,8 @@ def test_children_that_are_killed_or_stopped_are_replaced(children: Children, tm
 
 def test_reason_ends_an_order_with_its_group(children: Children, tmp_path: Path) -> None:
     until(children.is_ready)
-    order = check_of(tmp_path, "cameras", cameras_json())
     began = time.monotonic()
+    order = check_of(tmp_path, "cameras", cameras_json())
     ending = children.run(order, 600, why_end=lambda: "it is canceled")
     if ending.last is None:  # the check may have been faster than the first look
         assert ending.reason == "it is canceled"
@@ -135,7 +135,7 @@ REQUEST = {
 }  # fmt: skip
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def queries() -> Iterator[QueryClient]:
     client = QueryClient("lvis", 600)
     yield client
@@ -146,18 +146,6 @@ def fault_of_request(queries: QueryClient) -> dict[str, Any]:
     with pytest.raises(Fault) as error:
         queries.call(REQUEST)
     return error.value.fault
-
-
-def test_query_process_that_is_killed_is_replaced(queries: QueryClient) -> None:
-    fault = fault_of_request(queries)
-    assert fault["status"] in (404, 422) and "/nowhere/lift" not in json.dumps(fault)
-    kill(signal.SIGKILL)
-    assert fault_of_request(queries) == fault
-    thread = threading.Thread(target=lambda: (time.sleep(0.05), kill(signal.SIGKILL)))
-    thread.start()
-    assert fault_of_request(queries) == fault  # killed while it answers: the next one does
-    thread.join()
-    until(queries.is_ready)
 
 
 @pytest.mark.parametrize(
@@ -171,6 +159,18 @@ def test_unforeseen_error_fails_its_question_alone(queries: QueryClient, change:
     assert (error.value.fault["status"], error.value.fault["type"]) == (500, "/problems/crashed")
     assert fault_of_request(queries) == fault
     assert running() == process  # the same one answers
+
+
+def test_query_process_that_is_killed_is_replaced(queries: QueryClient) -> None:
+    fault = fault_of_request(queries)
+    assert fault["status"] in (404, 422) and "/nowhere/lift" not in json.dumps(fault)
+    kill(signal.SIGKILL)
+    assert fault_of_request(queries) == fault
+    thread = threading.Thread(target=lambda: (time.sleep(0.05), kill(signal.SIGKILL)))
+    thread.start()
+    assert fault_of_request(queries) == fault  # killed while it answers: the next one does
+    thread.join()
+    until(queries.is_ready)
 
 
 def test_query_beyond_its_time_is_refused() -> None:
