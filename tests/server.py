@@ -1,13 +1,12 @@
-"""The service as tests start it, in this process or as one of its own; known by HTTP, commands and the environment.
+"""The service as tests start it, in a process of its own; known by HTTP, commands and the environment.
 
-Settings have the names of `splatlift serve`; this is the one module of tests that knows how the application is made.
+Settings have the names of `splatlift serve`.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-import io
 import json
 import os
 import re
@@ -16,38 +15,20 @@ import subprocess
 import sys
 import time
 import uuid
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
 import httpx
-from fastapi.testclient import TestClient
 from safetensors.numpy import load
 
-from liftcore.cli import main
-from service.app import create_app
-from service.settings import ServiceSettings
-from service.store import Store
+from tests.promises.command_line import run
 
 Result = TypeVar("Result")
-ADDRESS = "http://127.0.0.1"
 ROOT = Path(__file__).parents[1]
 PATIENCE_SECONDS = 900.0  # of a machine that has other things to do, kernels to compile among them
 FINAL_STATES = ("succeeded", "failed", "canceled")
 MARK = "SERVER_UNDER_TEST"  # in the environment of a server and of all that it starts
-
-
-@contextmanager
-def serving(data: Path, **settings: Any) -> Iterator[TestClient]:
-    """Yield a client of the application over a data directory; settings are those of `splatlift serve`."""
-    options = ServiceSettings.model_validate({"data": data, **settings})
-    store = Store(options.data, options.disk_floor_bytes)
-    try:
-        with TestClient(create_app(options, store), ADDRESS, raise_server_exceptions=False) as client:
-            yield client
-    finally:
-        store.close()
 
 
 def until(condition: Callable[[], Result | None], seconds: float = PATIENCE_SECONDS) -> Result:
@@ -81,24 +62,9 @@ def digest_of_lift(client: Any, lift: str) -> str:
 
 def run_command(*arguments: str, data: Path, status: int = 0) -> str:
     """Run `splatlift ARGUMENTS --data DATA` in this process; it must end with a status; return what it prints."""
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        try:
-            ended_with: Any = main([*arguments, "--data", str(data)])
-        except SystemExit as error:
-            ended_with = error.code
-    assert ended_with == status, out.getvalue() + err.getvalue()
-    return out.getvalue() + (err.getvalue() if status else "")
-
-
-def refused_start(*options: str, data: Path) -> str:
-    """Run `splatlift serve OPTIONS --data DATA`, which must end with status 2; return what it says."""
-    command = [sys.executable, "-m", "liftcore.cli", "serve", "--port", "0", *options, "--data", str(data)]
-    process = subprocess.run(
-        command, capture_output=True, text=True, cwd=ROOT, check=False, timeout=PATIENCE_SECONDS
-    )  # fmt: skip
-    assert process.returncode == 2, process.stdout + process.stderr
-    return process.stderr
+    reply = run(*arguments, "--data", data)
+    assert reply.status == status, reply
+    return reply.out + (reply.err if status else "")
 
 
 class Server:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
+import zipfile
 from collections.abc import Iterator
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from tests.server import wait_for_end
-from tests.tiny_scene import TinyScene
+from tests.tiny_scene import HEIGHT, WIDTH, TinyScene
 
 NO_ID = "0" * 32  # of a job or a lift
 NO_ASSET = f"sha256:{'0' * 64}"
@@ -64,6 +65,15 @@ def events_of(text: str) -> Iterator[tuple[int, str, Any]]:
         fields = dict(re.split(": ?", line, maxsplit=1) for line in block.split("\n") if line and line[0] != ":")
         if fields:
             yield int(fields["id"]), fields["event"], json.loads(fields["data"])
+
+
+def photos_zip(colour: tuple[int, int, int] = (9, 99, 199)) -> bytes:
+    """Return a zip with one photo, of the view "left" of the tiny scene."""
+    photo, content = io.BytesIO(), io.BytesIO()
+    Image.new("RGB", (WIDTH, HEIGHT), colour).save(photo, "PNG")
+    with zipfile.ZipFile(content, "w") as archive:
+        archive.writestr("images/left.png", photo.getvalue())
+    return content.getvalue()
 
 
 def array(content: bytes) -> np.ndarray:

@@ -14,11 +14,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from liftcore import cli, evaluate
+from liftcore import evaluate
 from liftcore.errors import InvalidMasks, InvalidPhotos, InvalidTable
 
 from tests import tiny_scene
 from tests.promises.bad_files import BAD_FILES, BAD_FOLDERS, BINARY, MODEL, SPLATS, BadFile, BadFolder, Intruder
+from tests.promises.command_line import error_line
+from tests.promises.tiny_files import write_files
 
 MEMORY = 150 << 20  # bytes above the file itself, for any bomb
 
@@ -89,23 +91,14 @@ def test_bad_folder_is_refused_in_one_line(row: BadFolder, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("kind", READERS)
-def test_command_line_refuses_a_bad_file_with_exit_2(
-    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_line_refuses_a_bad_file_with_exit_2(kind: str, tmp_path: Path) -> None:
     row = next(row for row in BAD_FILES if row.kind == kind and not row.bomb)
-    path, good = tmp_path / "bad", tiny_scene.make_scene()
+    path = tmp_path / "bad"
     path.write_bytes(row.data())
-    for name, content in {"splats": good.splats, "cameras": good.cameras, "features": good.features}.items():
-        (tmp_path / name).write_bytes(content)
-    files = {name: str(tmp_path / name) for name in ("splats", "cameras", "features")} | {kind: str(path)}
+    inputs = {name: file for name, file in write_files(tmp_path).items() if name != "table"}
     before = sorted(tmp_path.iterdir())
-    command = ["inspect", str(path)]
-    if kind in ("splats", "cameras", "features"):
-        command = ["lift", files["splats"], files["cameras"], files["features"], "-o", str(tmp_path / "out")]
-    assert cli.main(command) == 2
-    output = capsys.readouterr()
-    assert not output.out and output.err.count("\n") == 1
-    assert str(path) in output.err
+    lift = ["lift", *(inputs | {kind: path}).values(), "-o", tmp_path / "out"]
+    assert str(path) in error_line(*(lift if kind in inputs else ["inspect", path]))
     assert sorted(tmp_path.iterdir()) == before
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import httpx
 import pytest
 
-from tests.server import PATIENCE_SECONDS, Server, refused_start, run_command, until
+from tests.server import PATIENCE_SECONDS, Server, run_command, until
 from tests.tiny_scene import TinyScene
 
 from .over_http import assert_problem, delete_lift, operations_of, upload_scene
@@ -226,15 +226,15 @@ def test_damage_of_a_file_is_found(backup: Path, order: dict[str, Any]) -> None:
 def test_files_without_a_database_are_refused_and_stay(backup: Path, order: dict[str, Any]) -> None:
     for path in backup.glob("*.sqlite*"):
         path.unlink()
-    line = refused_start(data=backup)
+    line = run_command("serve", "--port", "0", data=backup, status=2)
     assert line.count("\n") == 1 and "database" in line
     assert [path for path in backup.rglob("*") if order["splats"].removeprefix("sha256:") in path.name]
 
 
 def test_second_server_of_a_directory_is_refused(server: Server, tmp_path: Path) -> None:
-    assert str(server.data) in refused_start(data=server.data)
+    assert str(server.data) in run_command("serve", "--port", "0", data=server.data, status=2)
     port = str(server.client.base_url.port)
-    assert port in refused_start("--port", port, data=tmp_path / "other")
+    assert port in run_command("serve", "--port", port, data=tmp_path / "other", status=2)
     assert server.client.get("/healthz").status_code == 200
 
 
@@ -247,7 +247,7 @@ def test_second_server_of_a_directory_is_refused(server: Server, tmp_path: Path)
     ids=" ".join,
 )
 def test_setting_that_cannot_be_is_refused_at_the_start(options: list[str], tmp_path: Path) -> None:
-    line = refused_start(*options, data=tmp_path / "data")
+    line = run_command("serve", "--port", "0", *options, data=tmp_path / "data", status=2)
     assert "splatlift" in line and "Traceback" not in line
     assert not (tmp_path / "data").exists()
 

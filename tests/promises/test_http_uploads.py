@@ -3,31 +3,18 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import socket
-import zipfile
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
-from PIL import Image
 
 from tests.server import Server, until
 from tests.tiny_scene import TinyScene, colmap_zip, labels, masks, ply, splat_rows, text_table
 
-from .over_http import NO_ASSET, assert_problem, upload
-
-
-def photos_zip() -> bytes:
-    """A zip with one photo of the view "left"."""
-    photo, content = io.BytesIO(), io.BytesIO()
-    Image.new("RGB", (32, 24), (9, 99, 199)).save(photo, "PNG")
-    with zipfile.ZipFile(content, "w") as archive:
-        archive.writestr("images/left.png", photo.getvalue())
-    return content.getvalue()
-
+from .over_http import NO_ASSET, assert_problem, photos_zip, upload
 
 SCENE = TinyScene(
     ply(splat_rows()[::-1]), colmap_zip(), masks({}), text_table(words=("fig", "mug", "pen"))

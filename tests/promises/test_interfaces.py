@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import liftcore as lc
 import numpy as np
 import pytest
-from fastapi.testclient import TestClient
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from liftcore import cli
-from PIL import Image
 
+from tests.promises.command_line import run
 from tests.promises.tiny_files import write_files
-from tests.server import serving
 from tests.tiny_scene import HEIGHT, VIEWS, WORDS, make_scene
 
-from .over_http import lift_of, upload, upload_scene
+from .over_http import array, delete_lift, lift_of, picture, upload
 
 EXAMPLES = (
     "middle:6,12", f"middle:26,{HEIGHT // 2}", "splat:0", "splat:47", "middle:box:3,4,10,20",
@@ -64,19 +61,13 @@ def document_of(*models: Any) -> dict[str, Any]:
     return {name: value for model in models for name, value in model.model_dump(mode="json").items()}
 
 
-def pixels_of(content: bytes) -> np.ndarray:
-    with Image.open(io.BytesIO(content)) as picture:
-        return np.asarray(picture)
-
-
 class Interfaces:
     """One lift, which the service made of uploads, and which all others read by its downloaded file."""
 
-    def __init__(self, client: TestClient, folder: Path) -> None:
-        self.client, self.folder, scene = client, folder, make_scene()
-        self.files = write_files(folder)
-        self.table, self.encoder = upload(client, "table", scene.table), f"table:{self.files['table']}"
-        self.lift = lift_of(client, upload_scene(client, scene) | {"table": self.table})
+    def __init__(self, client: httpx.Client, order: dict[str, Any], folder: Path) -> None:
+        self.client, self.folder, self.files = client, folder, write_files(folder)
+        self.table, self.encoder = upload(client, "table", make_scene().table), f"table:{self.files['table']}"
+        self.lift = lift_of(client, order | {"table": self.table})
         self.path = folder / "downloaded.lift.safetensors"
         self.path.write_bytes(client.get(self.lift["links"]["features"]).content)
         self.scene = lc.Scene(self.path, self.files["splats"], self.files["cameras"])
@@ -97,11 +88,9 @@ class Interfaces:
         """Return the JSON that a command about the lift prints; None where it is refused."""
         lift = [self.path, "--splats", self.files["splats"]]
         lift += [] if name == "objects" else ["--cameras", self.files["cameras"]]
-        output = io.StringIO()
-        with contextlib.redirect_stdout(output), contextlib.redirect_stderr(io.StringIO()):
-            status = cli.main([name, *map(str, (*lift, *words)), "--json"])
-        assert status in (0, cli.BAD_INPUT)
-        return json.loads(output.getvalue()) if status == 0 else None
+        reply = run(name, *lift, *words, "--json")
+        assert reply.status in (0, cli.BAD_INPUT)
+        return reply.document if reply.status == 0 else None
 
     def written_file(self, name: str, option: str, file: str, *words: object) -> bytes:
         """Return the file that an option of a command writes."""
@@ -133,10 +122,13 @@ def words_of(fields: dict[str, Any]) -> list[object]:
 
 
 @pytest.fixture(scope="module")
-def interfaces(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Interfaces]:
-    folder = tmp_path_factory.mktemp("interfaces")
-    with serving(folder / "data") as client:
-        yield Interfaces(client, folder)
+def interfaces(
+    client: httpx.Client, order: dict[str, Any], tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Interfaces]:
+    interfaces = Interfaces(client, order, tmp_path_factory.mktemp("interfaces"))
+    yield interfaces
+    delete_lift(client, interfaces.lift["id"])
+    assert client.delete(f"/assets/{interfaces.table}").status_code == 204
 
 
 def assert_equal_answers(interfaces: Interfaces, fields: dict[str, Any]) -> None:
@@ -180,10 +172,10 @@ def test_scores_and_selections_are_the_same_arrays(interfaces: Interfaces, field
         [*words_of(fields), *encoder_of(interfaces, fields)],
         {k: v for k, v in fields.items() if k != "top"},
     )
-    scores = [np.load(io.BytesIO(interfaces.written_file("query", "--scores", "scores.npy", *words)))]
+    scores = [array(interfaces.written_file("query", "--scores", "scores.npy", *words))]
     for send in (interfaces.get, interfaces.post):
-        scores.append(np.load(io.BytesIO(send("/query/scores", **question).content)))
-        selected = np.load(io.BytesIO(send("/query/selection", **question).content))
+        scores.append(array(send("/query/scores", **question).content))
+        selected = array(send("/query/selection", **question).content)
         assert selected.dtype == np.bool_ and np.array_equal(selected, answer.selected)
     assert all(array.dtype == np.float32 and np.array_equal(array, answer.scores) for array in scores)
     assert 0 < answer.count < len(answer.scores)
@@ -204,41 +196,27 @@ def test_masks_and_attention_of_a_view_are_the_same_pictures(interfaces: Interfa
                 send(f"/query/{kind}", view=view, **question).content for send in (interfaces.get, interfaces.post)
             ]
             pictures.append(interfaces.written_file("query", f"--{kind}", "picture.png", *words, "--view", view))
-            assert all(np.array_equal(pixels_of(picture), pixels_of(pictures[0])) for picture in pictures)
-            views.append(pixels_of(pictures[0]))
+            assert all(np.array_equal(picture(content), picture(pictures[0])) for content in pictures)
+            views.append(picture(pictures[0]))
         assert not np.array_equal(*views[-2:])
     assert answer is not None and np.array_equal(views[0] > 0, interfaces.scene.mask(answer, "left"))
 
 
 def test_a_camera_of_no_file_sees_the_same_everywhere(interfaces: Interfaces) -> None:
-    camera = lc.read_cameras(interfaces.files["cameras"])["middle"]
-    moved_splats = lc.Camera(
-        np.eye(4) @ camera.viewmat, camera.K * [[2], [2], [1]], 2 * camera.width, 2 * camera.height
-    )
-    body = {
-        "width": moved_splats.width,
-        "height": moved_splats.height,
-        "fx": moved_splats.fx,
-        "viewmat": moved_splats.viewmat.tolist(),
-    }
-    frame = {
-        "w": moved_splats.width,
-        "h": moved_splats.height,
-        "fl_x": moved_splats.fx,
-        "fl_y": moved_splats.fy,
-        "file_path": "mine.png",
-    }
-    turned_camera = np.linalg.inv(moved_splats.viewmat) @ np.diag([1.0, -1, -1, 1])
-    (interfaces.folder / "mine.json").write_text(
-        json.dumps({"frames": [frame | {"transform_matrix": turned_camera.tolist()}]})
-    )
+    middle = lc.read_cameras(interfaces.files["cameras"])["middle"]
+    camera = lc.Camera(middle.viewmat, middle.K * [[2], [2], [1]], 2 * middle.width, 2 * middle.height)
+    body = {"width": camera.width, "height": camera.height, "fx": camera.fx, "viewmat": camera.viewmat.tolist()}
+    pose = np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1, -1, 1])
+    frame = {"file_path": "mine.png", "transform_matrix": pose.tolist()}
+    document = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy, "frames": [frame]}
+    (interfaces.folder / "mine.json").write_text(json.dumps(document))
     answer = interfaces.ask({"like": ["splat:0"]})
     assert answer is not None
-    expected = interfaces.scene.mask(answer, moved_splats)
+    expected = interfaces.scene.mask(answer, camera)
     over_http = interfaces.post("/query/mask", like=["splat:0"], camera=body)
     options = ("--like", "splat:0", "--camera", interfaces.folder / "mine.json")
     for content in (over_http.content, interfaces.written_file("query", "--mask", "mine.png", *options)):
-        assert np.array_equal(pixels_of(content) > 0, expected)
+        assert np.array_equal(picture(content) > 0, expected)
     assert expected.shape == (2 * HEIGHT, 64) and 0 < expected.mean() < 0.5
 
 
@@ -246,7 +224,7 @@ def test_a_camera_of_no_file_sees_the_same_everywhere(interfaces: Interfaces) ->
 def test_renders_of_each_channel_are_the_same_pictures(interfaces: Interfaces, channel: str) -> None:
     options = ("--view", "middle", "--channel", channel)
     try:
-        picture = pixels_of(interfaces.exported("render.png", None, channel, view="middle"))
+        image = picture(interfaces.exported("render.png", None, channel, view="middle"))
     except lc.InvalidQuery:  # the lift has no such values
         assert interfaces.get("/render", view="middle", channel=channel).status_code == 422
         assert interfaces.command("render", *options, "-o", interfaces.folder / "render.png") is None
@@ -255,23 +233,23 @@ def test_renders_of_each_channel_are_the_same_pictures(interfaces: Interfaces, c
         send("/render", view="middle", channel=channel).content for send in (interfaces.get, interfaces.post)
     ]
     for content in (*over_http, interfaces.written_file("render", "-o", "render.png", *options)):
-        assert np.array_equal(pixels_of(content), picture)
+        assert np.array_equal(picture(content), image)
     if channel != "depth":
-        assert np.array_equal(picture, interfaces.scene.render("middle", channel))
+        assert np.array_equal(image, interfaces.scene.render("middle", channel))
 
 
 def test_hidden_objects_are_left_out_of_pictures(interfaces: Interfaces) -> None:
-    usual, picture = (interfaces.scene.render("middle", hide=hide) for hide in ((), ["object:0"]))
+    usual, image = (interfaces.scene.render("middle", hide=hide) for hide in ((), ["object:0"]))
     scene = interfaces.scene
     members = scene.ask(lc.Query(sets=["object:0"])).selected
     pixels, rest = (
         lc.render(splats, scene.cameras["middle"], np.ones((splats.count, 1), np.float32)).numpy()[..., 0] > 0
         for splats in (scene.splats[members], scene.splats[~members])
     )
-    assert np.array_equal(picture[~pixels], usual[~pixels]) and not np.array_equal(picture[pixels], usual[pixels])
+    assert np.array_equal(image[~pixels], usual[~pixels]) and not np.array_equal(image[pixels], usual[pixels])
     assert np.array_equal(scene.render("middle", "depth", hide=["object:0"]) > 0, rest)
     for send in (interfaces.get, interfaces.post):
-        assert np.array_equal(pixels_of(send("/render", view="middle", hide=["object:0"]).content), picture)
+        assert np.array_equal(picture(send("/render", view="middle", hide=["object:0"]).content), image)
 
 
 def test_splats_of_an_answer_are_the_same_files(interfaces: Interfaces) -> None:
@@ -328,12 +306,12 @@ def test_labels_of_many_words_are_the_same(interfaces: Interfaces) -> None:
     assert interfaces.written_file("segment", "--labelled", "labelled.ply", *options) == labelled
     labels = [interfaces.post("/query/segment/labels", **body).content]
     labels.append(interfaces.written_file("segment", "--labels", "labels.npy", *options))
-    assert all(np.array_equal(np.load(io.BytesIO(content)), segmentation.labels) for content in labels)
+    assert all(np.array_equal(array(content), segmentation.labels) for content in labels)
     assert len(set(segmentation.labels.tolist())) >= len(words)
     maps = [interfaces.post("/query/segment/map", view="left", **body).content]
     maps.append(interfaces.written_file("segment", "--map", "map.png", *options, "--view", "left"))
     maps.append(interfaces.exported("map.png", segmentation, "map", view="left"))
-    assert all(np.array_equal(pixels_of(content), pixels_of(maps[0])) for content in maps)
+    assert all(np.array_equal(picture(content), picture(maps[0])) for content in maps)
 
 
 @pytest.mark.parametrize("example", ["splat:0", "middle:16,12"])

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from liftcore.cli import main
 from liftcore.errors import InvalidQuery, InvalidSplats
 from liftcore.io.labels import Labels
 from liftcore.io.splats import read_splats
@@ -16,6 +15,7 @@ from liftcore.query.coco import run_lengths
 from liftcore.query.question import Query
 from liftcore.query.scene import Scene
 from liftcore.query.terms import Vector
+from tests.promises.command_line import run
 from tests.tiny_scene import AXES, CHANNELS, WORDS, text_table
 from tests.unit.scene.test_gltf import document_of
 
@@ -71,12 +71,11 @@ def test_masks_in_views_are_those_of_the_instances(scene: Scene, tmp_path: Path)
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb"])
 def test_files_of_a_tree_come_back_with_paths_and_the_smallest_nodes(
-    nested: Scene, tmp_path: Path, suffix: str, capsys: pytest.CaptureFixture[str]
+    nested: Scene, tmp_path: Path, suffix: str
 ) -> None:
     (tmp_path / "words.safetensors").write_bytes(text_table())
-    options = ["--table", str(tmp_path / "words.safetensors")]
-    assert main(["export", str(nested.path), "-o", str(tmp_path / f"x{suffix}"), *options, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["nodes"] == 5
+    words = ["-o", tmp_path / f"x{suffix}", "--table", tmp_path / "words.safetensors"]
+    assert run("export", nested.path, *words, "--json").document["nodes"] == 5
     labels = read_labels(tmp_path / f"x{suffix}")
     assert nested.node is not None and nested.object is not None
     np.testing.assert_array_equal(labels.columns["node_id"], nested.node + 1)
