@@ -29,6 +29,8 @@ def write_files(folder: Path, files: dict[str, Any]) -> Path:
             path.write_bytes(content)
         elif path.suffix == ".npy":
             np.save(path, content)
+        elif path.suffix == ".npz":
+            np.savez_compressed(path, content)
         elif path.suffix.lower() == ".png":
             (Image.fromarray(content) if isinstance(content, np.ndarray) else content).save(path)
         else:

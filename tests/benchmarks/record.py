@@ -1,6 +1,6 @@
 """The recorded run: what lifts of two real scenes answer, and what of it a checkout changes.
 
-    python -m tests.benchmarks.record [--only TEXT ...] [--gone TEXT ...] [--bits] [--threads N]
+    python -m tests.benchmarks.record [--only TEXT ...] [--bits] [--threads N]
     python -m tests.benchmarks.record --write [--only TEXT ...]
     python -m tests.benchmarks.record --seconds OTHER_CHECKOUT [--turns N] [--room FOLDER]
 
@@ -11,13 +11,13 @@ of one core. It speaks public names alone, so that it runs on later checkouts as
 What is promised where. On one machine, with the same libraries, bits are: features, total weights, confidences,
 objects, selections and masks, for any number of threads. They are recorded as digests (``bits``). Another processor,
 another BLAS or another order of sums may change last bits. Figures have four digits, and the tolerances of
-`TOLERANCES` and `SHARES`; all others are exact, such as presence and numbers of objects. Seconds and memory are
-printed, and never compared.
+`TOLERANCES` and `SHARES`; all others are exact, such as presence and numbers of objects. Seconds are printed, and
+never compared.
 
 A figure is ``moved`` beyond its tolerance. It is ``gone`` if the code refuses its setting or question, or lacks a
-name: ``--gone TEXT`` expects that of paths that begin with TEXT. The status is 1 if a figure moved, or is gone
-unexpectedly; with ``--bits`` also if bits moved. It is 2 if nothing could be compared. ``--only TEXT`` chooses lifts
-by the beginnings of their paths, such as "tabletop / hard 13" or, of seconds, "plush / row-sum".
+name. The status is 1 if a figure moved or is gone; with ``--bits`` also if bits moved. It is 2 if nothing could be
+compared. ``--only TEXT`` chooses lifts by the beginnings of their paths, such as "tabletop / hard 13" or, of seconds,
+"plush / row-sum".
 
 ``--seconds`` lifts from files by the command line, in turns with another checkout: user and system seconds of the
 whole process, the ratio of medians, and the peak memory. ``--room`` adds a folder that
@@ -30,7 +30,6 @@ import json
 import math
 import os
 import platform
-import re
 import subprocess
 import sys
 import tempfile
@@ -234,29 +233,19 @@ PARTS = {
 
 
 def run_scene(real: RealScene, threads: int | None) -> Iterator[tuple[str, Figures]]:
-    """Iterate over the lifts of a scene: their paths and figures; prints what the lifts cost."""
+    """Iterate over the lifts of a scene: their paths and figures; prints the seconds of the lifts."""
     for path, entry in real.recorded["lifts"].items():
-        with suppress(OSError):  # the peak begins anew, where Linux lets it
-            Path("/proc/self/clear_refs").write_text("5")
         start = time.process_time()
         lift = attempt(partial(real.lift, entry, threads))
         seconds = time.process_time() - start
-        print(f"{path}: {seconds:.1f} s of processors, peak {_peak_mib()} MiB", flush=True)
+        print(f"{path}: {seconds:.1f} s of processors", flush=True)
         yield path, lift if isinstance(lift, dict) else lift_figures(real, lift, entry["parts"])
-        del lift  # it is not to be in the peak of the next one
 
 
 def lift_figures(real: RealScene, lift: lc.LiftResult, parts: Iterable[str]) -> Figures:
     """Figures of a lift by their parts."""
     scene = lc.Scene(lift, real.splats, real.cameras)
     return {part: attempt(partial(PARTS[part], real, lift, scene)) for part in parts}
-
-
-def _peak_mib() -> str:
-    with suppress(OSError):
-        if peak := re.search(r"VmHWM:\s*(\d+)", Path("/proc/self/status").read_text()):
-            return str(int(peak[1]) // 1024)
-    return "?"
 
 
 def differences(old: Any, new: Any, path: str, name: str = "") -> Iterator[tuple[str, str, str]]:
@@ -317,13 +306,10 @@ def compare(recorded: Mapping[str, Any], figures: Figures, options: argparse.Nam
             counts["not recorded"] += 1
             continue
         for kind, part, text in differences(recorded["figures"][path], new, path):
-            is_expected = kind == "gone" and part.startswith(tuple(options.gone))
-            counts["expectedly gone" if is_expected else kind] += 1
+            counts[kind] += 1
             if kind != "bits moved" or options.bits:
                 print(f"{kind}: {part}: {text}")
-    totals = ", ".join(
-        f"{counts[kind]} {kind}" for kind in ("moved", "gone", "expectedly gone", "not recorded", "bits moved")
-    )
+    totals = ", ".join(f"{counts[kind]} {kind}" for kind in ("moved", "gone", "not recorded", "bits moved"))
     print(
         f"{len(figures)} lifts beside {recorded['commit']}: {totals}.{'' if options.bits else ' --bits lists bits.'}"
     )
@@ -396,9 +382,6 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", default=(), metavar="TEXT", help="beginnings of paths of lifts")
     parser.add_argument("--threads", type=int, help="of lifts; default: the number of cores")
     parser.add_argument("--bits", action="store_true", help="list moved bits, and fail by them")
-    parser.add_argument(
-        "--gone", nargs="+", default=(), metavar="TEXT", help="beginnings of paths that are to be gone"
-    )
     parser.add_argument("--write", action="store_true", help="write figures of this checkout into the record")
     parser.add_argument("--seconds", type=Path, metavar="CHECKOUT", help="compare seconds with another checkout")
     parser.add_argument("--turns", type=int, default=5)

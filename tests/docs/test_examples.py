@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import io
 import json
-import runpy
 import shlex
 import shutil
 import sys
@@ -38,7 +37,8 @@ from tests.tiny_scene import (
     splat_rows,
 )
 
-from .readme import GUIDE, PYTHON, ROOT, blocks, text
+from .readme import GUIDE, PYTHON, blocks, text
+from .test_example_scripts import run
 
 
 @pytest.fixture
@@ -83,11 +83,6 @@ def run_example(page: str, start: str) -> dict[str, Any]:
     names: dict[str, Any] = {}
     exec(compile(example, page, "exec"), names)
     return names
-
-
-def run_script(name: str, *arguments: str) -> None:
-    """Call the main function of an example in this process, where modules may be replaced."""
-    runpy.run_path(str(ROOT / "examples" / name))["main"](*arguments)
 
 
 def test_the_way_from_own_maps_to_a_mask_leads_there(scene_folder: Path) -> None:
@@ -193,7 +188,7 @@ def test_transform_of_gsplat_is_written_and_read(folder: Path, monkeypatch: pyte
     vars(module)["Parser"] = lambda path, factor, normalize: SimpleNamespace(transform=similarity())
     monkeypatch.setitem(sys.modules, "datasets", ModuleType("datasets"))
     monkeypatch.setitem(sys.modules, "datasets.colmap", module)
-    run_script("gsplat_transform.py", "data/garden", "4")
+    run("gsplat_transform.py", "data/garden", "4")
     after = read_cameras(folder / "data/garden")
     for old, new in zip(before.values(), after.values(), strict=True):
         assert np.allclose(new.centre, (similarity() @ [*old.centre, 1])[:3])

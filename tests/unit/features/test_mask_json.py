@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from liftcore.features.mask_files import fill_polygons, read_polygons, read_runs
 from liftcore.features.masks import mask_views
 from liftcore.features.prompts import Prompts, prompt_views
 from liftcore.values.views import NO_LABEL, Regions
-from tests.run_lengths import sam_records
+from tests.run_lengths import sam_records, write_files
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -45,19 +44,9 @@ def coco(*masks: tuple[int, int, Any], images: int = 2, **entries: dict[str, Any
 
 def write(folder: Path, **documents: Any) -> Path:
     """Write JSON documents by their names, ``__`` for a folder; arrays and images with the suffix behind ``_as_``."""
-    for name, content in documents.items():
-        stem, _, suffix = name.partition("_as_")
-        path = folder / f"{stem.replace('__', '/')}.{suffix or 'json'}"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if suffix == "npy":
-            np.save(path, content)
-        elif suffix == "npz":
-            np.savez_compressed(path, content)
-        elif suffix == "png":
-            Image.fromarray(content).save(path)
-        else:
-            path.write_text(json.dumps(content), encoding="utf-8")
-    return folder
+    parts = {name: name.partition("_as_") for name in documents}
+    names = {name: f"{stem.replace('__', '/')}.{suffix or 'json'}" for name, (stem, _, suffix) in parts.items()}
+    return write_files(folder, {names[name]: content for name, content in documents.items()})
 
 
 def label_rows(prompts: Prompts, view: str) -> list[str]:

@@ -5,9 +5,17 @@ from pathlib import Path
 import pytest
 
 from liftcore.query.scene import Scene
+from liftcore.text import LVIS_TABLE
+from liftcore.text.table import TableEncoder
 from tests.promises.tiny_files import write_lift
 
 from .made_up import with_parts
+
+
+@pytest.fixture(scope="session")
+def table() -> TableEncoder:
+    """The words that ship."""
+    return TableEncoder.open(LVIS_TABLE)
 
 
 @pytest.fixture(scope="session")

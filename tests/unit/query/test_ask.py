@@ -35,10 +35,7 @@ NAMES = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=1
 class Axes:
     """Text encoder of "x", "y", "z" as the unit axes of the three clusters."""
 
-    name = "axes"
-
-    def __init__(self, channels: int = CHANNELS) -> None:
-        self.channels = channels
+    name, channels = "axes", CHANNELS
 
     def encode(self, texts: Sequence[str]) -> np.ndarray:
         if not all(text in ("x", "y", "z") for text in texts):

@@ -27,11 +27,6 @@ PRESENT_WORDS = ("cat", "boat", "pizza")
 
 
 @pytest.fixture(scope="module")
-def table() -> TableEncoder:
-    return TableEncoder.open(LVIS_TABLE)
-
-
-@pytest.fixture(scope="module")
 def clip() -> Scene:
     """Three clusters as photos of a cat, a boat and a pizza: cosine .29 to their own words, .22 to others."""
     return scene_with(photo_vectors([word for word in PRESENT_WORDS for _ in range(SPLATS_A_CLUSTER)], 0.25))

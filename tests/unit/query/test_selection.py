@@ -12,15 +12,9 @@ from liftcore.query.presence import References
 from liftcore.query.question import Query
 from liftcore.query.scene import Scene
 from liftcore.query.selection import CompetingWords, correct_by_objects
-from liftcore.text import LVIS_TABLE
 from liftcore.text.table import TableEncoder
 
 from .made_up import lifted
-
-
-@pytest.fixture(scope="module")
-def table() -> TableEncoder:
-    return TableEncoder.open(LVIS_TABLE)
 
 
 def pictures(table: TableEncoder, words: Sequence[str], noise: float, hub: float = 0.0) -> np.ndarray:

@@ -32,10 +32,6 @@ def test_every_word_of_a_table_is_asked_as_it_is() -> None:
         ("tea cup", "teacup", "spelling"),
         ("Tea-Pot?", "teapot", "spelling"), ("octopus", "octopus (animal)", "qualifier"),
          ("donut", "doughnut", "synonym"),
-        ("plane", "airplane", "synonym"),
-          ("T-shirt", "jersey", "synonym"),
-
-         ("plant", "flowerpot", "synonym"),
         ("people", "person", "synonym"), ("hot dog", "sausage", "synonym"), ("apples", "apple", "number"),
          ("knives", "knife", "number"),
         ("cherries", "cherry", "number"), ("trouser", "trousers", "number"),

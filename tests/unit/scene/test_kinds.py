@@ -46,25 +46,16 @@ FOREIGN_FILES = {  # content, a word of its name and of what to do
     "a.mp4": (b"\0\0\0\x20ftypisom" + bytes(60), "video", "COLMAP"),
     "a.ply.gz": (b"\x1f\x8b\x08" + bytes(60), "archive", "unpack"),
     "a.pkl": (b"\x80\x04\x95.", "pickle", "export"),
-    "weights.safetensors": (b"", "safetensors", "pack"),
+    "weights.safetensors": (save({"visual.conv1.weight": np.zeros(2, "f4")}), "safetensors", "pack"),
     "dataparser_transforms.json": (b'{"transform": [], "scale": 1.0}', "frame", "cameras"),
 }
-
-
-def write(path: Path, content: bytes) -> Path:
-    if path.suffix == ".safetensors":
-        from safetensors.numpy import save_file
-
-        save_file({"visual.conv1.weight": np.zeros(2, "f4")}, path)
-    else:
-        path.write_bytes(content)
-    return path
 
 
 @pytest.mark.parametrize("name", FOREIGN_FILES)
 def test_what_is_no_input_is_named_with_what_to_do(name: str, tmp_path: Path) -> None:
     content, word, hint = FOREIGN_FILES[name]
-    path = write(tmp_path / name, content)
+    path = tmp_path / name
+    path.write_bytes(content)
     identity = identify(path)
     assert identity.kind is None and identity.recognised
     for expected_kind in ("splats", "cameras", "features", "lift", "table"):
