@@ -32,16 +32,8 @@ def of_kernel(splats: Splats, kernel: Kernel, betas: Tensor) -> Splats:
 
 def random_splats(seed: int, count: int = 40, spread: float = 1.0, kernel: Kernel = Kernel.GAUSSIAN_3D) -> Splats:
     """Return splats around the origin: needles, discs and balls, faint and opaque, with flat and steep falloffs."""
-    rng = np.random.default_rng(seed)
-    splats = Splats(
-        means=torch.tensor(rng.normal(0, spread, (count, 3)), dtype=torch.float32),
-        quats=torch.tensor(rng.normal(0, 1, (count, 4)), dtype=torch.float32),
-        log_scales=torch.tensor(rng.uniform(-4.5, -0.5, (count, 3)), dtype=torch.float32),
-        opacity_logits=torch.tensor(rng.normal(0, 3, count), dtype=torch.float32),
-        sh=torch.tensor(rng.normal(0, 1, (count, 1, 3)), dtype=torch.float32),
-    )
-    betas = torch.tensor(rng.normal(0, 1.5, count), dtype=torch.float32)
-    return of_kernel(splats, kernel, betas)
+    options = {"spread": spread, "sizes": (-4.5, -0.5), "colours": 1.0, "falloffs": 1.5}
+    return random_scenes.random_splats(seed, count, kernel, **options)
 
 
 def look_at(name: str, centre: np.ndarray, width: int, height: int, focal: float) -> Camera:
@@ -57,22 +49,19 @@ def random_camera(seed: int, width: int = 37, height: int = 29, name: str = "v0"
     return look_at(name, centre, width, height, focal=rng.uniform(0.7, 1.5) * width)
 
 
-def random_regions(
-    seed: int, levels: int = 2, rows: int = 5, size: tuple[int, int] = (15, 18), F: int = 6
-) -> Regions:
+def random_regions(seed: int, levels: int = 2, rows: int = 5, size: tuple[int, int] = (15, 18)) -> Regions:
     """Return blocky label maps of another size than the image, with unlabelled pixels."""
     rng = np.random.default_rng(seed + 2_000)
     coarse = rng.integers(-1, rows, (levels, -(-size[0] // 3), -(-size[1] // 4)))
     labels = np.repeat(np.repeat(coarse, 3, axis=1), 4, axis=2)[:, : size[0], : size[1]]
-    codebook = rng.normal(0, 1, (rows, F))
+    codebook = rng.normal(0, 1, (rows, random_scenes.CHANNELS))
     codebook /= np.linalg.norm(codebook, axis=1, keepdims=True)
     return Regions(torch.tensor(labels.copy(), dtype=torch.int32), torch.tensor(codebook, dtype=torch.float32))
 
 
-def random_grid(seed: int, size: tuple[int, int] = (7, 9), F: int = 6) -> FeatureGrid:
+def random_grid(seed: int, size: tuple[int, int] = (7, 9)) -> FeatureGrid:
     """Return a grid of random vectors."""
-    rng = np.random.default_rng(seed + 3_000)
-    return FeatureGrid(torch.tensor(rng.normal(0, 1, (*size, F)), dtype=torch.float32))
+    return random_scenes.random_grid(np.random.default_rng(seed + 3_000), *size)
 
 
 def splats_at(
@@ -99,10 +88,10 @@ def splats_at(
     return of_kernel(splats, kernel, column(betas, (count,)))
 
 
-def camera_at_origin(width: int = 16, height: int = 12, focal: float = 16.0, name: str = "v0") -> Camera:
+def camera_at_origin(width: int = 16, height: int = 12, focal: float = 16.0) -> Camera:
     """A camera that looks along +z, with the middle of a pixel on its axis."""
     centre = (width // 2 + 0.5, height // 2 + 0.5)
-    return Camera.pinhole(name, width, height, focal, focal, *centre, np.eye(4))
+    return Camera.pinhole("v0", width, height, focal, focal, *centre, np.eye(4))
 
 
 def observed(seed: int, view: int, grids: bool = False) -> ViewFeatures:
@@ -135,12 +124,10 @@ def centred(camera: Camera) -> Camera:
     )  # fmt: skip
 
 
-def write_scene(
-    folder: Path, seed: int, grids: bool = False, kernel: Kernel = Kernel.GAUSSIAN_3D
-) -> tuple[Path, Path, Path]:
+def write_scene(folder: Path, seed: int, kernel: Kernel = Kernel.GAUSSIAN_3D) -> tuple[Path, Path, Path]:
     """A random scene of three views on disk: splats, cameras, and features as ``observed`` gives them."""
     views = tuple(centred(random_camera(seed + k, 32 + 5 * k, 24 + 3 * k, name=f"v{k}")) for k in range(3))
-    observations = {camera.name: observed(seed, k, grids) for k, camera in enumerate(views)}
+    observations = {camera.name: observed(seed, k) for k, camera in enumerate(views)}
     paths = folder / "splats.ply", folder / "cameras.json", folder / "features.safetensors"
     write_splats(paths[0], random_splats(seed, 50, kernel=kernel))
     write_inria_cameras(Cameras(views), paths[1])

@@ -29,16 +29,19 @@ class RandomScene:
         return self.splats, self.cameras, self.views
 
 
-def random_splats(seed: int, count: int, kernel: str = "3dgs", degree: int = 0, flat: float = 1.0) -> lc.Splats:
+def random_splats(
+    seed: int, count: int, kernel: str = "3dgs", degree: int = 0, flat: float = 1.0, *, spread: float = 1.0,
+    sizes: tuple[float, float] = (-4, -0.8), colours: float = 0.5, falloffs: float = 1.0,
+) -> lc.Splats:  # fmt: skip
     """Return splats around the origin, from needles to balls and from faint to opaque; z times ``flat``."""
     rng = np.random.default_rng(seed)
 
     def normal(*shape: int, scale: float = 1.0) -> np.ndarray:
         return rng.normal(0, scale, (count, *shape)).astype(np.float32)
 
-    means, quats = normal(3) * np.array([1, 1, flat], np.float32), normal(4)
-    log_scales, logits = rng.uniform(-4, -0.8, (count, 3)).astype(np.float32), normal(scale=3)
-    sh, betas = normal((degree + 1) ** 2, 3, scale=0.5), normal()
+    means, quats = normal(3, scale=spread) * np.array([1, 1, flat], np.float32), normal(4)
+    log_scales, logits = rng.uniform(*sizes, (count, 3)).astype(np.float32), normal(scale=3)
+    sh, betas = normal((degree + 1) ** 2, 3, scale=colours), normal(scale=falloffs)
     if kernel == "2dgs":
         log_scales = log_scales[:, :2]
     return lc.Splats(means, quats, log_scales, logits, kernel, sh=sh, beta=betas if kernel == "dbs" else None)

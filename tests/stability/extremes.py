@@ -15,7 +15,7 @@ import torch
 import liftcore as lc
 from liftcore.scene.cameras import MAX_FOCAL, MAX_SIDE, MIN_FOCAL
 from liftcore.scene.splats import Kernel
-from tests.scenes import ROTATION, ROW, camera_at_origin, splats_at
+from tests.scenes import ROTATION, ROW, camera_at_origin, random_grid, splats_at
 from tests.stability.extreme_measures import (
     AWAY,
     BETA,
@@ -261,10 +261,6 @@ def _cancelling() -> lc.Regions:
     return lc.Regions(torch.tensor((x + y) % 2, dtype=torch.int32)[None], book)
 
 
-def _random_grid(rows: int, columns: int) -> lc.FeatureGrid:
-    return lc.FeatureGrid(torch.rand(rows, columns, 6, generator=torch.manual_seed(0)))
-
-
 # fmt: off
 LENGTHS: tuple[Extreme, ...] = (
     lift_of("F = 1", checkerboard(channels=1)),
@@ -316,7 +312,7 @@ MAPS: tuple[Extreme, ...] = (
         lambda lift: bool((lift.features[lift.has_feature] - 1).abs().max() < 1e-6)),
 
 
-    lift_of("a grid finer than the pixels", _random_grid(50, 70)),
+    lift_of("a grid finer than the pixels", random_grid(0, (50, 70))),
     lift_of("squared weights and a gain of 16", checkerboard(), settings={"power": 2, "gain": 16.0},
         kernels=GAUSSIAN),
     lift_of("weights of 1e-20, squared (DBS)", checkerboard(), lambda lift: float(lift.total_weight[0]) < 1e-15,

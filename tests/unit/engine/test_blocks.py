@@ -121,9 +121,9 @@ def test_plan_in_blocks_is_of_a_worker_and_asks_this_machine_for_no_room(
     assert worker.in_files == 0
 
 
-def few_views(seed: int, folder: str = "") -> dict[str, lc.FeatureGrid]:
+def few_views(seed: int) -> dict[str, lc.FeatureGrid]:
     rng = np.random.default_rng(seed)
-    return {f"{folder}v{k}": lc.FeatureGrid(rng.normal(0, 1, (6, 8, 4)).astype(np.float32)) for k in range(3)}
+    return {f"v{k}": lc.FeatureGrid(rng.normal(0, 1, (6, 8, 4)).astype(np.float32)) for k in range(3)}
 
 
 @pytest.mark.slow

@@ -39,8 +39,6 @@ def algebra_of(
     codebook: Codebook | None = None,
     levels: np.ndarray | None = None,
     means: Tensor | None = None,
-    threads: int | None = None,
-    memory_limit: int | None = None,
     **settings: Any,
 ) -> Algebra:
     """Return the algebra of W, with codebooks of zeros if there is none."""
@@ -48,10 +46,8 @@ def algebra_of(
     codebook = codebook or codebook_of([torch.zeros(int(count), 1) for count in W.offsets.diff()])
     geometry = Geometry(W, codebook, (), (), np.full(regions, -1, np.int8) if levels is None else levels)
     means, names = torch.zeros(splats, 3) if means is None else means, tuple(map(str, range(len(codebook.views))))
-    pieces = pieces_of(
-        geometry, means, LiftSettings.of(**settings), names, threads=threads, memory_limit=memory_limit
-    )
-    return Algebra(pieces, LocalEngine(threads), silent, threads)
+    pieces = pieces_of(geometry, means, LiftSettings.of(**settings), names, threads=None, memory_limit=None)
+    return Algebra(pieces, LocalEngine(), silent, None)
 
 
 def mask_consensus(W: RegionWeights, levels: np.ndarray, means: Tensor | None = None) -> np.ndarray:
@@ -74,27 +70,23 @@ def reweighting_of(
     W: RegionWeights,
     codebook: Codebook,
     *,
-    principal: int = DIRECTIONS,
-    means: Tensor | None = None,
-    threads: int | None = None,
     masks: Tensor | None = None,
     consensus: Tensor | None = None,
     levels: np.ndarray | None = None,
 ) -> Reweighting:
     """Return the factors of W; masks [M] bool are the regions with a reliability."""
     totals = np.bincount(W.region.numpy(), W.weight.numpy(), minlength=codebook.regions).astype(np.float64)
-    directions = RegionDirections.of(codebook, torch.from_numpy(totals), W.region.shape[0], principal)
+    directions = RegionDirections.of(codebook, torch.from_numpy(totals), W.region.shape[0], DIRECTIONS)
     level_of = np.zeros(codebook.regions) if levels is None else levels
     groups = np.unique(level_of, return_inverse=True)[1].astype(np.int8)
     scores, mask = np.zeros((2, W.splats.shape[0])), np.zeros(groups.size, bool) if masks is None else masks.numpy()
-    block = BlockReweighter(W, groups, means, threads)
+    block = BlockReweighter(W, groups, None, None)
     factors, parts = block.cosines(directions, masks is not None)
     sums = sum_pieces(parts, block.shape)
     block.weigh(factors, SceneConsistency.of(sums, groups, mask), consensus, scores)
     return Reweighting(factors, confidence_of(scores), median_reliability(sums, mask))
 
 
-def solve(W: RegionWeights, codebook: Codebook, dtype: torch.dtype, **options: Any) -> Tensor:
-    """Return ``D^-1 W E`` [P, F]."""
-    name = str(dtype).removeprefix("torch.")
-    return algebra_of(W, codebook, preset="row-sum", dtype=name, **options).solve()[0]
+def solve(W: RegionWeights, codebook: Codebook) -> Tensor:
+    """Return ``D^-1 W E`` [P, F] f32."""
+    return algebra_of(W, codebook, preset="row-sum", dtype="float32").solve()[0]

@@ -1,4 +1,4 @@
-"""W of small views, random or from dense matrices, and what the definitions make of them in float64."""
+"""W of small views, random or from dense matrices."""
 
 from __future__ import annotations
 
@@ -40,11 +40,3 @@ def dense(W: RegionWeights, splats: int) -> np.ndarray:
 def codebook_of(books: Sequence[Tensor]) -> Codebook:
     """Return a codebook in which each region is one row of its view's book [M, F]."""
     return Codebook([ViewCodebook(book) for book in books])
-
-
-def defined(views: Sequence[RegionWeights], books: Sequence[Tensor], splats: int) -> tuple[np.ndarray, np.ndarray]:
-    """``D^-1 W E`` [P, F] and D [P] f64 by their definition; zero rows where D is zero."""
-    X = sum(dense(view, splats) @ book.double().numpy() for view, book in zip(views, books, strict=True))
-    D = sum(dense(view, splats).sum(axis=1) for view in views)
-    assert isinstance(X, np.ndarray) and isinstance(D, np.ndarray)
-    return np.divide(X, D[:, None], out=np.zeros_like(X), where=D[:, None] > 0), D
