@@ -66,14 +66,14 @@ def ply(rows: np.ndarray, properties: list[str] = PROPERTIES) -> bytes:
     return ("\n".join([*lines, "end_header"]) + "\n").encode() + rows.astype("<f4").tobytes()
 
 
-def cameras_document() -> dict[str, Any]:
-    """A transforms.json with the three views."""
-    frames = []
-    for name, x in VIEWS.items():
+def cameras_document(views: dict[str, float] = VIEWS, width: int = WIDTH) -> dict[str, Any]:
+    """A transforms.json with the three views, or others, of 4:3."""
+    frames, focal = [], width * FOCAL / WIDTH
+    for name, x in views.items():
         pose = np.eye(4)
         pose[0, 3] = x
         frames.append({"file_path": f"images/{name}.png", "transform_matrix": pose.tolist()})
-    return {"w": WIDTH, "h": HEIGHT, "fl_x": FOCAL, "fl_y": FOCAL, "frames": frames}
+    return {"w": width, "h": width * HEIGHT // WIDTH, "fl_x": focal, "fl_y": focal, "frames": frames}
 
 
 def cameras_json() -> bytes:
@@ -96,13 +96,13 @@ def colmap_zip() -> bytes:
     return content.getvalue()
 
 
-def labels() -> dict[str, np.ndarray]:
-    """View -> [1, 24, 32] i32, the cluster that owns each column."""
-    columns = np.arange(WIDTH) + 0.5
+def labels(views: dict[str, float] = VIEWS, width: int = WIDTH) -> dict[str, np.ndarray]:
+    """View -> [1, 24, 32] i32, or of another width, the cluster that owns each column."""
+    columns, shape = np.arange(width) + 0.5, (1, width * HEIGHT // WIDTH, width)
     label_maps = {}
-    for name, x in VIEWS.items():
-        world = (columns - WIDTH / 2) * DISTANCE / FOCAL + x
-        label_maps[name] = np.broadcast_to(np.digitize(world, [-0.6, 0.6]).astype(np.int32), (1, HEIGHT, WIDTH))
+    for name, x in views.items():
+        world = (columns - width / 2) * DISTANCE / (width * FOCAL / WIDTH) + x
+        label_maps[name] = np.broadcast_to(np.digitize(world, [-0.6, 0.6]).astype(np.int32), shape)
     return label_maps
 
 

@@ -70,7 +70,7 @@ def stop_beside_open_requests(service: Service, body: dict, verdicts: Verdicts) 
 
     def send_slowly() -> None:
         with contextlib.suppress(httpx.TransportError):
-            service.put("/assets/splats", content=half_upload())
+            service.client.put("/assets/splats", content=half_upload())
 
     with ThreadPoolExecutor(2) as pool:
         upload = pool.submit(send_slowly)
@@ -110,7 +110,7 @@ def follow(service: Service, job: str, after: str | None = None) -> list[tuple[s
     headers = {"Last-Event-ID": after} if after else {}
     with (
         contextlib.suppress(httpx.TransportError),
-        service.stream("GET", f"/jobs/{job}/events", headers=headers) as reply,
+        service.client.stream("GET", f"/jobs/{job}/events", headers=headers) as reply,
     ):
         for line in reply.iter_lines():
             name, _, value = line.partition(": ")

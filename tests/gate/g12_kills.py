@@ -12,7 +12,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from tests.gate.running import Service, Verdicts, run_gate, send_signal
+from tests.gate.running import Service, Verdicts, run_gate
 from tests.gate.scenes import long_scene
 
 ATTEMPTS = 3  # of a job, that the service promises
@@ -37,7 +37,7 @@ def gate(options: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
             elif chance.random() < 0.5 and running and child_kills[running[0]] < ATTEMPTS - 1:
                 child_kills[running[0]] += 1
                 victims["children"] += 1
-                send_signal(service.children(), signal.SIGKILL)
+                service.kill_children()
             else:
                 victims["server"] += 1
                 service.end(signal.SIGKILL)
@@ -46,7 +46,7 @@ def gate(options: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
         states = Counter(service.wait_for(job)["state"] for job in jobs.values())
         lost_count = sum(service.order(body, name) != job for name, job in jobs.items())
         unlike = sum(
-            service.digest(job) != digest for job in jobs.values() if service.job(job)["state"] == "succeeded"
+            service.digest(job) != digest for job in jobs.values() if service.wait_for(job)["state"] == "succeeded"
         )
         counts = {name: len(list_all(service, name)) for name in ("jobs", "lifts")}
         figures = f"{victims.total()} kills {dict(victims)}, {len(jobs)} jobs"
@@ -62,7 +62,7 @@ def gate(options: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
 
 def list_all(service: Service, name: str) -> list[dict]:
     """All rows of /jobs or /lifts, of up to 1,000."""
-    return service.get(f"/{name}", params={"limit": 1000}).json()[name]
+    return service.client.get(f"/{name}", params={"limit": 1000}).json()[name]
 
 
 if __name__ == "__main__":

@@ -32,24 +32,23 @@ def gate(options: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
             is_tradeoff = kind == "tradeoff"
             order = body | {"budget_s": 10} if is_tradeoff else body
             order = {name: order[name] for name in order if not (is_tradeoff and name == "table")}
-            job = (
-                service.post(f"/{'tradeoff' if is_tradeoff else 'lift'}", json=order).raise_for_status().json()["id"]
-            )
+            accepted = service.client.post("/tradeoff" if is_tradeoff else "/lift", json=order)
+            job = accepted.raise_for_status().json()["id"]
             time.sleep(chance.uniform(0, duration))
             start = time.monotonic()
-            reply = service.post(f"/jobs/{job}/cancel")
+            reply = service.client.post(f"/jobs/{job}/cancel")
             state = service.wait_for(job)["state"]
             if state == "canceled":
                 seconds.append(time.monotonic() - start)
                 kinds[kind] += 1
                 if other is None and len(service.children()) > resting:
                     broken.append(f"{kind}: {len(service.children())} processes, {resting} at rest")
-                if any(service.get(f"/{name}/{job}").status_code != 404 for name in ("lifts", "tradeoffs")):
+                if any(service.client.get(f"/{name}/{job}").status_code != 404 for name in ("lifts", "tradeoffs")):
                     broken.append(f"{kind}: it has a result")
             if reply.is_success != (state == "canceled"):
                 broken.append(f"{kind}: {reply.status_code}, then {state}")
             if other is not None:
-                service.post(f"/jobs/{other}/cancel")
+                service.client.post(f"/jobs/{other}/cancel")
                 service.wait_for(other)
         figures = f"{len(seconds)} {dict(kinds)}, slowest {max(seconds):.2f} s"
         verdicts.check("canceled within 2 s", max(seconds) < CANCEL_SECONDS, figures)

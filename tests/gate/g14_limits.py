@@ -6,11 +6,13 @@ python -m tests.gate.g14_limits
 from __future__ import annotations
 
 import argparse
+import contextlib
+import os
 import signal
 import time
 from pathlib import Path
 
-from tests.gate.running import Service, Verdicts, run_gate, send_signal
+from tests.gate.running import Service, Verdicts, run_gate
 from tests.gate.scenes import long_scene, scene, small_scene
 
 JOB_TIME, CHECK_MEMORY, CHECK_TIME = "job_seconds", "check_memory_bytes", "check_seconds"  # settings of the service
@@ -38,12 +40,12 @@ def gate(_: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
     large = scene(splats=600_000, views=1, width=32, channels=8)["splats"]
     for word, settings in {"memory": {CHECK_MEMORY: 16 * MIB}, "s": {CHECK_TIME: 0.05}}.items():
         with Service(folder / f"check-{word}", **settings) as service:
-            reply = service.put("/assets/splats", content=large)
+            reply = service.client.put("/assets/splats", content=large)
             detail = reply.json().get("detail", "")
             is_refused = reply.status_code == 422 and word in detail
             figures = f"{reply.status_code}: {detail[:90]}"
             verdicts.check(f"a check over its limit is refused, and says so ({word})", is_refused, figures)
-            verdicts.check("the service is alive and ready", service.get("/readyz").status_code == 200)
+            verdicts.check("the service is alive and ready", service.client.get("/readyz").status_code == 200)
             verdicts.check("nothing of it is left", not service.scratch(), service.scratch())
 
 
@@ -59,8 +61,15 @@ def check_failure(service: Service, record: dict, word: str, verdicts: Verdicts)
         if time.monotonic() > deadline:
             break
     verdicts.check("no process of it computes on", not at_work, len(at_work))
-    verdicts.check("the service is alive and ready", service.get("/readyz").status_code == 200)
+    verdicts.check("the service is alive and ready", service.client.get("/readyz").status_code == 200)
     verdicts.check("nothing lies in the scratch folders", not service.scratch(), service.scratch())
+
+
+def send_signal(pids: set[int], number: signal.Signals) -> None:
+    """Send a signal to each that still lives."""
+    for pid in pids:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, number)
 
 
 def is_computing(pid: int) -> bool:

@@ -34,7 +34,7 @@ def gate(options: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
             chance = random.Random(f"upload {options.seed} {number}")
             kind, content = contents[number % len(contents)]
             mutated = mutate_bytes(content, chance, [other for _, other in contents])
-            return service.put(f"/assets/{kind}", content=mutated)
+            return service.client.put(f"/assets/{kind}", content=mutated)
 
         with ThreadPoolExecutor(CLIENTS) as pool:
             replies = list(pool.map(send_upload, range(options.uploads)))
@@ -47,7 +47,7 @@ def gate(options: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
             if reply.is_client_error and "problem+json" not in reply.headers["content-type"]
         ]
         verdicts.check("their refusals are problems", not no_problems, no_problems[:2])
-        verdicts.check("the service is ready", service.get("/readyz").status_code == 200)
+        verdicts.check("the service is ready", service.client.get("/readyz").status_code == 200)
         verdicts.check("nothing lies in the scratch folders", not service.scratch(), service.scratch())
         tracebacks = service.log.read_text().count("Traceback")
         verdicts.check("the log has no traceback", not tracebacks, tracebacks)

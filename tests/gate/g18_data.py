@@ -6,6 +6,8 @@ python -m tests.gate.g18_data [--backups N]
 from __future__ import annotations
 
 import argparse
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -30,13 +32,14 @@ def back_up(service: Service, body: dict, folder: Path, options: argparse.Namesp
         number = 0
         while not stop.is_set():
             number += 1
-            cameras = service.put("/assets/cameras", content=small_scene()["cameras"] + b" " * number).json()["id"]
+            content = small_scene()["cameras"] + b" " * number
+            cameras = service.client.put("/assets/cameras", content=content).json()["id"]
             job = service.order(body | {"cameras": cameras})
             if number % 4:
-                service.post(f"/jobs/{job}/cancel")
+                service.client.post(f"/jobs/{job}/cancel")
                 service.wait_for(job)
-                service.delete(f"/jobs/{job}", params={"with_lift": "true"})
-                service.delete(f"/assets/{cameras}")
+                service.client.delete(f"/jobs/{job}", params={"with_lift": "true"})
+                service.client.delete(f"/assets/{cameras}")
 
     client = threading.Thread(target=keep_busy)
     client.start()
@@ -44,22 +47,23 @@ def back_up(service: Service, body: dict, folder: Path, options: argparse.Namesp
     for number in range(options.backups):
         time.sleep(2)
         copy = folder / f"backup-{number}"
-        statuses.append(service.run("store", "backup", str(copy), "--data", str(service.data)).returncode)
-        statuses.append(service.run("store", "verify", "--data", str(copy)).returncode)
+        for words in (("backup", copy, "--data", service.data), ("verify", "--data", copy)):
+            command = [sys.executable, "-m", "liftcore.cli", "store", *map(str, words)]
+            statuses.append(subprocess.call(command, stdout=subprocess.DEVNULL))
     stop.set()
     client.join()
     verdicts.check("a backup beside work succeeds, and verify finds it whole", not any(statuses), statuses)
     broken, count = [], 0
     for number in range(options.backups):
         with Service(folder / f"backup-{number}") as copy:
-            for row in copy.get("/lifts", params={"limit": 1000}).json()["lifts"]:
+            for row in copy.client.get("/lifts", params={"limit": 1000}).json()["lifts"]:
                 count += 1
                 if copy.digest(row["id"]) != service.digest(row["id"]):
                     broken.append(row["id"])
-            for row in copy.get("/assets", params={"limit": 1000}).json()["assets"]:
-                if copy.get(f"/assets/{row['id']}/content").status_code != 200:
+            for row in copy.client.get("/assets", params={"limit": 1000}).json()["assets"]:
+                if copy.client.get(f"/assets/{row['id']}/content").status_code != 200:
                     broken.append(row["id"])
-            jobs = copy.get("/jobs", params={"limit": 1000}).json()["jobs"]
+            jobs = copy.client.get("/jobs", params={"limit": 1000}).json()["jobs"]
             broken += [
                 row["id"] for row in jobs if copy.wait_for(row["id"])["state"] not in ("succeeded", "canceled")
             ]

@@ -23,18 +23,10 @@ def scene(*, splats: int, views: int, width: int, channels: int) -> dict[str, by
     """A scene with views of 4:3: kind -> bytes."""
     rows = np.repeat(tiny_scene.splat_rows(), -(-splats // 60), axis=0)[:splats]
     rows[:, :3] += np.random.default_rng(1).normal(0, 0.02, (splats, 3))
-    height, focal = width * 3 // 4, width * tiny_scene.FOCAL / tiny_scene.WIDTH
-    frames, labels = [], {}
-    for k in range(views):
-        pose = np.eye(4)
-        pose[0, 3] = x = 0.2 * k / max(views - 1, 1) - 0.1
-        frames.append({"file_path": f"images/v{k}.png", "transform_matrix": pose.tolist()})
-        columns = (np.arange(width) + 0.5 - width / 2) * tiny_scene.DISTANCE / focal + x
-        labels[f"v{k}"] = np.broadcast_to(np.digitize(columns, [-0.6, 0.6]).astype(np.int32), (1, height, width))
-    cameras = {"w": width, "h": height, "fl_x": focal, "fl_y": focal, "frames": frames}
+    places = {f"v{k}": float(x) for k, x in enumerate(np.linspace(-0.1, 0.1, views))}
     return {
         "splats": tiny_scene.ply(rows),
-        "cameras": json.dumps(cameras).encode(),
-        "features": tiny_scene.pack(labels, tiny_scene.codebook(channels)),
+        "cameras": json.dumps(tiny_scene.cameras_document(places, width)).encode(),
+        "features": tiny_scene.pack(tiny_scene.labels(places, width), tiny_scene.codebook(channels)),
         "table": tiny_scene.text_table(channels),
     }
