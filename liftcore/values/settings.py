@@ -102,7 +102,8 @@ class LiftSettings(Body):
         "wrong masks": ("robust", "robust_directions"),
         "objects and clusters": ("objects", "aggregation", "aggregation_iou", "aggregation_cluster_size"),
         "neighbours": ("smoothness",),
-        "the result, and where it is made": ("dtype", "codes", "diagnostic_rays", "reference_channels", "seed", "device"),
+        "the result": ("dtype", "codes", "diagnostic_rays", "reference_channels", "seed"),
+        "where it is made": ("device",),
     }  # fmt: skip
 
     preset: Preset = Field(
