@@ -157,7 +157,7 @@ def lift_content(path: Path, lift: LiftResult, metadata: dict[str, Any]) -> dict
     metadata["view_count"] = len(views)
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return {"sha256": digest, "count": len(lift), "channels": lift.features.shape[1], "metadata": metadata}
+    return {"sha256": digest, "count": len(lift), "channels": lift.rows.shape[1], "metadata": metadata}
 
 
 def _of_another_kind(kind: str, path: Path) -> InvalidInput | None:

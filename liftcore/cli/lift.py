@@ -149,7 +149,7 @@ def _summary(result: LiftResult) -> dict[str, Any]:
     return {
         "splats": len(result),
         "feature_share": float(result.has_feature.float().mean()),
-        "channels": result.features.shape[1],
+        "channels": result.rows.shape[1],
         "views": len(metadata.views),
         "lifted": list(metadata.views),
         "encoder": metadata.encoder,

@@ -299,13 +299,13 @@ def _pack_warnings(packs: Views, facts: list[_ViewFacts], low: float, high: floa
 def describe_lift(lift: Lift) -> dict[str, Any]:
     """Return counts, ranges, provenance and warnings of a lift."""
     metadata = lift.metadata
-    count, channels = len(lift), lift.features.shape[1]
+    count, channels = len(lift), lift.rows.shape[1]
     feature_share = float(lift.has_feature.float().mean())
     diagnostics = lift.diagnostics
     return {
         "splats": count,
         "channels": channels,
-        "dtype": str(lift.features.dtype).removeprefix("torch."),
+        "dtype": str(lift.rows.dtype).removeprefix("torch."),
         "feature_share": feature_share,
         "total_weight": _ends(lift.total_weight),
         "encoder": metadata.encoder,
@@ -330,7 +330,7 @@ def _ends(values: torch.Tensor) -> dict[str, float]:
 def _lift_warnings(lift: Lift, metadata: LiftMetadata) -> list[str]:
     count = len(lift)
     unseen = int((~lift.has_feature).sum())
-    is_bad = (~torch.isfinite(lift.features)).any(dim=1)
+    is_bad = (~torch.isfinite(lift.rows)).any(dim=1)
     bad = int((is_bad if lift.code is None else is_bad[lift.code.long()]).sum())
     warnings = list(metadata.diagnostics.get("warnings", ()))
     if unseen:

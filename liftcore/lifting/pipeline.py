@@ -203,7 +203,7 @@ def _run_steps(
         diagnostics = diagnose(inputs, statistics, X.dtype, support, algebra.measure(X), facts)
     table = views.features.table
     return LiftResult(
-        features=X,
+        rows=X,
         total_weight=support.total_weight,
         confidence=support.confidence,
         has_feature=torch.from_numpy(support.sums > 0),

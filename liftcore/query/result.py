@@ -119,7 +119,7 @@ class LiftResult(Lift):
         return has_poses(Path(path), self.metadata)
 
     def as_codes(self) -> Self:
-        """Return the lift with at most 8,192 rows of features, and the number of its row for each splat.
+        """Return the lift with at most 8,192 `rows`, and the number of its row for each splat, `code`.
 
         ``diagnostics["codes"]`` has the number of rows, and the loss: 1 - the mean cosine of splats about the scene's
         mean, by the root of total weight. Where it is too large, or nothing is saved, it has the reason, and features
@@ -132,12 +132,12 @@ class LiftResult(Lift):
         if self.code is not None:
             return self
         lift = self.cpu()
-        columns = (part.numpy() for part in (lift.features, lift.has_feature, lift.total_weight))
+        columns = (part.numpy() for part in (lift.rows, lift.has_feature, lift.total_weight))
         codes = code_features(*columns, of_masks=lift.object is not None)
         facts, changes = {"reason": codes}, dict[str, Any]()
         if not isinstance(codes, str):
             facts = {"rows": len(codes.codebook), "loss": codes.loss}
-            changes = {"features": torch.from_numpy(codes.codebook), "code": torch.from_numpy(codes.code)}
+            changes = {"rows": torch.from_numpy(codes.codebook), "code": torch.from_numpy(codes.code)}
             if (rounded := lift.total_weight.half().float()).isfinite().all():  # so that the file takes two bytes
                 changes["total_weight"] = rounded
             if lift.confidence is not None:  # and one
@@ -169,7 +169,7 @@ class LiftResult(Lift):
             raise InvalidInput("features", expected="exact, codes or None", got=repr(features))
         with shown_progress(progress) as reporter, one_step(reporter, "save"):
             as_codes = self.settings.codes if features is None else features == "codes"
-            save_lift(self.as_codes() if as_codes else self.with_exact_features(), path)
+            save_lift(self.as_codes() if as_codes else replace(self, rows=self.features, code=None), path)
 
     def save_scene(
         self, folder: Path, splats: Splats | None = None, cameras: Mapping[str, Camera] | None = None

@@ -53,7 +53,7 @@ def transfer(lift: AnyLift, old: Splats, new: Splats, matrix: Any = None) -> Any
         raise InvalidSplats("splats", expected="splats of the lifted scene", got=got, hint=hint)
     result = lift[rows]
     labels = ("cluster", "object", "node")
-    values = ("features" if lift.code is None else "code", "total_weight", "has_feature", "confidence", *labels)
+    values = ("rows" if lift.code is None else "code", "total_weight", "has_feature", "confidence", *labels)
     columns = {name: column for name in values if (column := getattr(result, name)) is not None}
     for name, column in columns.items():
         column.numpy()[~is_copy] = -1 if name in labels else 0

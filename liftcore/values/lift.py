@@ -77,8 +77,8 @@ class LiftMetadata(BaseModel):
 class Lift:
     """X and what supports it, one row a splat, in the splats' order."""
 
-    features: Tensor
-    """[P, F] f16 or f32; zero rows without a feature. Of a lift as codes [K, F], the rows that ``code`` refers to"""
+    rows: Tensor
+    """[P, F] f16 or f32, zero without a feature; of a lift as codes [K, F], the rows that ``code`` refers to"""
     total_weight: Tensor
     """[P] f32, sum of plain weights w over the feature views, each ray once"""
     has_feature: Tensor
@@ -107,12 +107,17 @@ class Lift:
     node_features: Tensor | None = None
     """[T, F] f16, the unit mean of its own masks' unit vectors, without those of its parts; zero where they cancel"""
     code: Tensor | None = None
-    """[P] u16, the row of ``features`` of each splat, 0 = none, which is zero; None: a row a splat"""
+    """[P] u16, the row of ``rows`` of each splat, 0 = none, which is zero; None: a row a splat"""
 
     def __repr__(self) -> str:
-        splats, channels = len(self), self.features.shape[1]
+        splats, channels = len(self), self.rows.shape[1]
         counts = f"{splats} splats", f"{channels} channels from {len(self.views)} views"
-        return one_line(self, *counts, f"preset={str(self.settings.preset)!r}", f"on {self.features.device}")
+        return one_line(self, *counts, f"preset={str(self.settings.preset)!r}", f"on {self.rows.device}")
+
+    @property
+    def features(self) -> Tensor:
+        """[P, F] f16 or f32, zero without a feature. Of a lift as codes a new tensor each time."""
+        return self.rows if self.code is None else self.rows[self.code.long()]
 
     @property
     def settings(self) -> LiftSettings:
@@ -146,9 +151,9 @@ class Lift:
         """
         from liftcore.scene.splats import chosen_rows
 
-        rows = chosen_rows(keep, len(self)).to(self.features.device)
+        rows = chosen_rows(keep, len(self)).to(self.rows.device)
         names = (
-            "features" if self.code is None else "code",
+            "rows" if self.code is None else "code",
             "total_weight",
             "has_feature",
             "confidence",
@@ -173,10 +178,6 @@ class Lift:
             "diagnostics": self.diagnostics | {"cropped_from": full_count},
         }
         return replace(self, **columns, metadata=self.metadata.model_copy(update=changes))
-
-    def with_exact_features(self) -> Self:
-        """Return the lift with a row of features a splat, [P, F]."""
-        return self if self.code is None else replace(self, features=self.features[self.code.long()], code=None)
 
     def transformed(self, matrix: Numbers) -> Self:
         """Return the lift of splats that were moved alike (`Splats.transformed`), ``p' = scale R p + translation``.

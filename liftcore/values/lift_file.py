@@ -70,7 +70,7 @@ def save_lift(lift: Lift, path: Path | str) -> None:
     """Write the lift whole or not at all (temporary file, fsync, rename), with no copy of X in memory."""
     from liftcore.io.safetensors_file import write_tensors
 
-    nodes, channels = lift.node_features, lift.features.shape[1]
+    nodes, channels = lift.node_features, lift.rows.shape[1]
     if nodes is not None and nodes.shape[1] != channels:
         expected, got = f"node_features of {channels} channels, as features have", f"{nodes.shape[1]}"
         raise InvalidLift(
@@ -81,7 +81,7 @@ def save_lift(lift: Lift, path: Path | str) -> None:
     for name in NARROWED.keys() & tensors.keys():
         tensors[name] = _narrowed(tensors[name], is_share=name == CONFIDENCE)
     if lift.code is not None:
-        tensors |= _as_bytes(lift.features)
+        tensors |= _as_bytes(lift.rows)
         if ((lift.code.int() > 0) == lift.has_feature).all():
             del tensors["has_feature"]
     if lift.object is not None and lift.object_views is not None and lift.node is not None:
@@ -132,7 +132,8 @@ def _objects_of(node: np.ndarray, parents: np.ndarray, objects: int) -> np.ndarr
 
 def tensors_of(lift: Lift) -> dict[str, Tensor]:
     """Return the tensors of a lift by their names, in the order of its file."""
-    return {name: tensor for name in SCHEMA if (tensor := getattr(lift, name, None)) is not None}
+    columns = {**vars(lift), "features": lift.rows}
+    return {name: tensor for name in SCHEMA if (tensor := columns.get(name)) is not None}
 
 
 def open_lift(path: Path | str) -> Lift:
@@ -143,7 +144,8 @@ def open_lift(path: Path | str) -> Lift:
 
     arrays, text = read_lift(path)
     metadata = parse_metadata(text, path)
-    return Lift(**{name: torch.from_numpy(array) for name, array in arrays.items()}, metadata=metadata)
+    tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    return Lift(tensors.pop("features"), **tensors, metadata=metadata)
 
 
 def read_lift(path: Path | str) -> tuple[dict[str, np.ndarray], str]:

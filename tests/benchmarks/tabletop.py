@@ -162,7 +162,7 @@ def coded_rows(scene: Truth, folder: Path, pack: str, stride: int) -> Iterator[d
     lift = scene.lift(read_pack(folder, pack, stride))
     encoder = lc.open_encoder(f"table:{folder / 'text_table.safetensors'}")
     for name, lifted in {"exact": lift, "codes": lift.as_codes()}.items():
-        figures, lift_scene = scene.evaluate(lifted.with_exact_features()), scene.open_scene(lifted)
+        figures, lift_scene = scene.evaluate(lifted), scene.open_scene(lifted)
         ious, seconds = list[float](), list[float]()
         for number, word in enumerate(scene.words):
             lift_scene.ask(word, encoder=encoder, places=False)

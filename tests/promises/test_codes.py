@@ -25,7 +25,7 @@ def lift_with(features: np.ndarray, has_feature: np.ndarray | None = None) -> lc
     lift = scene_with(features[:12]).lift
     rows, weights = torch.from_numpy(features).half(), torch.linspace(1.0, 9.0, len(features))
     columns = {"total_weight": weights * torch.from_numpy(has_feature), "confidence": weights / 10}
-    columns |= {"features": rows, "has_feature": torch.from_numpy(has_feature)}
+    columns |= {"rows": rows, "has_feature": torch.from_numpy(has_feature)}
     columns |= {"object": torch.full((len(features),), -1).int(), "object_views": torch.zeros(0, 5).int()}  # of masks
     metadata = lift.metadata.model_copy(update={"landmarks": ()})
     return lc.LiftResult.of(replace(lift, **columns, metadata=metadata))
@@ -47,16 +47,21 @@ def coded(exact: lc.LiftResult) -> lc.LiftResult:
     return exact.as_codes()
 
 
+def expanded(lift: lc.LiftResult) -> lc.LiftResult:
+    """Return a lift as codes with a row a splat."""
+    return replace(lift, rows=lift.features, code=None)
+
+
 def test_codes_answer_as_exact_features_do(exact: lc.LiftResult, coded: lc.LiftResult) -> None:
     assert coded.code is not None and coded.code.dtype == torch.uint16
     facts = coded.diagnostics["codes"]
-    assert facts["rows"] == len(coded.features) <= 8_192 and facts["loss"] < 0.05
+    assert facts["rows"] == len(coded.rows) <= 8_192 and facts["loss"] < 0.05
     assert len(coded) == COUNT and f"{COUNT} splats" in repr(coded)
     for word in (*WORDS, "sofa", "zebra"):
-        exact_answer, answer, expanded = (
-            lift.query(word, encoder="lvis") for lift in (exact, coded, coded.with_exact_features())
+        exact_answer, answer, full_answer = (
+            lift.query(word, encoder="lvis") for lift in (exact, coded, expanded(coded))
         )
-        assert np.array_equal(answer.selected, expanded.selected) and answer.threshold == expanded.threshold
+        assert np.array_equal(answer.selected, full_answer.selected) and answer.threshold == full_answer.threshold
         assert answer.present == exact_answer.present, word
         assert (answer.selected != exact_answer.selected).mean() < 0.02, word
         assert answer.count == exact_answer.count == 0 or word in WORDS
@@ -67,7 +72,7 @@ def test_codes_answer_as_exact_features_do(exact: lc.LiftResult, coded: lc.LiftR
 
 def test_codes_are_labelled_clicked_and_named_as_their_rows_are(coded: lc.LiftResult) -> None:
     columns = {"object": torch.arange(COUNT).int() % 5, "object_views": torch.zeros(5, 5).int()}
-    lifts = [replace(lift, **columns) for lift in (coded, coded.with_exact_features())]
+    lifts = [replace(lift, **columns) for lift in (coded, expanded(coded))]
     of_codes, of_rows = (lc.Scene(lift, row_of_splats(COUNT)) for lift in lifts)
     labels, expected = (scene.segment([*WORDS, "sofa"], encoder="lvis") for scene in (of_codes, of_rows))
     assert np.array_equal(labels.rows, expected.rows) and (labels.rows >= 0).mean() > 0.8
@@ -115,7 +120,7 @@ def test_codes_are_saved_read_cropped_and_moved_as_codes(
 def test_codes_are_saved_as_exact_features_where_these_are_wanted(
     coded: lc.LiftResult, exact: lc.LiftResult, tmp_path: Path
 ) -> None:
-    expected = coded.features[coded.code.long()] if coded.code is not None else exact.features
+    expected = coded.features
     coded.save(tmp_path / "exact.safetensors", features="exact")
     read = lc.load_lift(tmp_path / "exact.safetensors")
     assert read.code is None and torch.equal(read.features, expected)
@@ -159,7 +164,7 @@ def test_labelled_splats_bring_their_codes(coded: lc.LiftResult, tmp_path: Path,
     scene, path = lc.Scene(coded, row_of_splats(COUNT)), tmp_path / f"labelled{suffix}"
     scene.export(path, scene.segment(WORDS, encoder="lvis"), "labelled")
     codes = lc.read_splats(path).extras["code"].numpy()
-    assert np.array_equal(coded.arrays()["features"][codes], coded.with_exact_features().arrays()["features"])
+    assert np.array_equal(coded.arrays()["features"][codes], coded.features.numpy())
 
 
 def test_features_that_share_nothing_or_differ_within_things_stay_exact(exact: lc.LiftResult) -> None:

@@ -145,7 +145,7 @@ def test_maps_and_masks_of_a_distorted_photo_lie_where_it_shows_things(
         has_feature = result.has_feature.numpy()
         right[name] = (result.features.float().argmax(dim=1).numpy() == patches)[has_feature].mean()
         assert ("distorted photos" in " ".join(result.diagnostics["warnings"])) == bool(lens)
-        exact = lc.LiftResult.of(replace(result, features=torch.from_numpy(book[patches]), has_feature=patches >= 0))
+        exact = lc.LiftResult.of(replace(result, rows=torch.from_numpy(book[patches]), has_feature=patches >= 0))
         exact_scene, common, union = lc.Scene(exact, splats, with_lens), 0, 0
         for patch in range(16):
             expected = truth["v0"] == patch

@@ -52,4 +52,4 @@ def lifted(scene: Scene, features: np.ndarray, **fields: Any) -> Scene:
         "has_feature": ones > 0,
         **dict.fromkeys(("object", "object_views", *NODE_TENSORS)),
     }
-    return Scene(replace(scene.lift, features=torch.from_numpy(features.astype(np.float32)), **defaults | fields))
+    return Scene(replace(scene.lift, rows=torch.from_numpy(features.astype(np.float32)), **defaults | fields))

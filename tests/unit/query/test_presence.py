@@ -108,7 +108,7 @@ def test_vectors_of_words_are_present_or_absent_too(clip: Scene, table: TableEnc
     assert not LiftResult.of(clip.lift).query(sofa, splats=clip.splats).selected.any()
     assert LiftResult.of(clip.lift).query(sofa, absent="keep").selected.any()
     rotation = np.linalg.qr(np.random.default_rng(3).normal(size=(512, 512)))[0].astype(np.float32)
-    rotated = LiftResult.of(replace(clip.lift, features=clip.lift.features @ torch.from_numpy(rotation)))
+    rotated = LiftResult.of(replace(clip.lift, rows=clip.lift.features @ torch.from_numpy(rotation)))
     assert rotated.query(sofa @ rotation).present is None
 
 

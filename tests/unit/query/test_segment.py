@@ -28,7 +28,7 @@ def clear(scene: Scene) -> Scene:
     """Three clusters, each of one unit axis with noise."""
     rows = EYE[CLUSTER] + np.random.default_rng(0).normal(0, 0.05, (COUNT, CHANNELS)).astype(np.float32)
     ones = torch.ones(COUNT)
-    lift = replace(scene.lift, features=torch.from_numpy(rows), total_weight=ones, has_feature=ones > 0)
+    lift = replace(scene.lift, rows=torch.from_numpy(rows), total_weight=ones, has_feature=ones > 0)
     lifted = Scene(lift, scene.splats, scene.cameras)
     lifted.splat_file = scene.splat_file
     return lifted
@@ -49,7 +49,7 @@ def test_splats_of_no_word_and_unseen_ones_are_named_none(clear: Scene) -> None:
     assert not segmentation.margin[rest].any()
     without_feature = Scene(replace(clear.lift, has_feature=torch.arange(COUNT) != 3), clear.splats)
     assert segment(without_feature, ["apple", "book", "lamp"], EYE[:3]).rows[3] == -1
-    flat = Scene(replace(clear.lift, features=torch.ones(COUNT, CHANNELS)), clear.splats)  # of equal scores
+    flat = Scene(replace(clear.lift, rows=torch.ones(COUNT, CHANNELS)), clear.splats)  # of equal scores
     assert segment(flat, ["apple", "book"], EYE[:2]).named_words == ()
 
 
@@ -66,7 +66,7 @@ def test_splat_of_no_word_gets_the_one_of_most_of_its_node(clear: Scene) -> None
         "node_views": views,
     }
     tree |= {"node_confidence": torch.ones(3), "node_features": torch.from_numpy(EYE[:3]).half()}
-    lift = replace(clear.lift, features=rows, has_feature=torch.arange(COUNT) != 1)
+    lift = replace(clear.lift, rows=rows, has_feature=torch.arange(COUNT) != 1)
     without_tree, with_tree = (Scene(replace(lift, **fields), clear.splats) for fields in (dict.fromkeys(tree), tree))
     words = ["apple", "book", "lamp"]
     assert segment(without_tree, words, EYE[:3]).rows[odd].tolist() == [-1, -1, -1]
