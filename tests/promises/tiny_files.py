@@ -65,7 +65,7 @@ def scene_with(features: np.ndarray, weights: np.ndarray | None = None, **fields
     result = lc.lift(splats, cameras, {"front": grid}, preset="row-sum", progress=False)
     rows = torch.from_numpy(features.astype(np.float32))
     total_weight = torch.ones(count) if weights is None else torch.from_numpy(weights.astype(np.float32))
-    values: dict[str, object] = {"features": rows, "total_weight": total_weight, "has_feature": total_weight > 0}
+    values: dict[str, object] = {"rows": rows, "total_weight": total_weight, "has_feature": total_weight > 0}
     return lc.Scene(replace(result, **values, **fields), splats, cameras)
 
 

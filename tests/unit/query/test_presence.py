@@ -51,7 +51,7 @@ def test_references_that_mean_the_same_hide_nothing(clip: Scene, table: TableEnc
 def test_small_total_weight_makes_no_object(clip: Scene, table: TableEncoder) -> None:
     features = torch.cat([clip.lift.features, torch.from_numpy(table.encode(["sofa"]))])
     ones = torch.ones(COUNT + 1)
-    values = {"features": features, "has_feature": ones > 0}
+    values = {"rows": features, "has_feature": ones > 0}
     total_weight = torch.cat([torch.ones(COUNT), torch.tensor([1e-4])])
     for weight, present in ((1e-4, False), (1.0, True)):
         total_weight[-1] = weight

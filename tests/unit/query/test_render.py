@@ -160,7 +160,7 @@ def scene_of(base: Scene, splats: Splats, camera: Camera) -> Scene:
     ones = torch.ones(splats.count)
     metadata = base.metadata.model_copy(update={"landmarks": ()})
     lift = replace(
-        base.lift, features=torch.ones(splats.count, 1), total_weight=ones, has_feature=ones > 0, metadata=metadata
+        base.lift, rows=torch.ones(splats.count, 1), total_weight=ones, has_feature=ones > 0, metadata=metadata
     )
     return Scene(lift, splats, Cameras((camera,)))
 
