@@ -190,7 +190,7 @@ def test_vectors_come_from_numpy_files(tmp_path: Path) -> None:
 def test_a_lift_with_other_rows_than_its_splats_answers_nothing(suffix: str, tmp_path: Path) -> None:
     path = write_lift(tmp_path)
     lift, splats = load_lift(path), tmp_path / f"other{suffix}"
-    rows = ("features", "total_weight", "has_feature", "confidence", "cluster", "object", "node")
+    rows = ("rows", "total_weight", "has_feature", "confidence", "cluster", "object", "node")
     cropped = {name: getattr(lift, name)[:-1] for name in rows if getattr(lift, name) is not None}
     save_lift(replace(lift, **cropped), tmp_path / "cropped.lift")
     ask(Scene(path), Query.of((SplatTerm(0),)))
