@@ -73,6 +73,14 @@ def test_what_the_format_has_no_word_for_is_kept(tmp_path: Path) -> None:
     assert_same(read_splats(write(tmp_path / "s.glb", far)), far)
 
 
+def test_viewers_that_draw_points_have_linear_colours(tmp_path: Path) -> None:
+    grey = replace(some_splats(), sh=torch.zeros(P, 1, 3))
+    document, binary = parts_of(write(tmp_path / "s.glb", grey))
+    accessor = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
+    start = document["bufferViews"][accessor["bufferView"]].get("byteOffset", 0)
+    assert [*binary[start : start + 3]] == [55, 55, 55]  # half of sRGB's range is .214 of the light
+
+
 @pytest.mark.parametrize("kernel", [Kernel.GAUSSIAN_2D, Kernel.BETA])
 def test_other_kernels_are_written_as_gaussians(kernel: Kernel, tmp_path: Path) -> None:
     splats = some_splats(kernel)
