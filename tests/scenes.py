@@ -124,10 +124,12 @@ def centred(camera: Camera) -> Camera:
     )  # fmt: skip
 
 
-def write_scene(folder: Path, seed: int, kernel: Kernel = Kernel.GAUSSIAN_3D) -> tuple[Path, Path, Path]:
+def write_scene(
+    folder: Path, seed: int, grids: bool = False, kernel: Kernel = Kernel.GAUSSIAN_3D
+) -> tuple[Path, Path, Path]:
     """A random scene of three views on disk: splats, cameras, and features as ``observed`` gives them."""
     views = tuple(centred(random_camera(seed + k, 32 + 5 * k, 24 + 3 * k, name=f"v{k}")) for k in range(3))
-    observations = {camera.name: observed(seed, k) for k, camera in enumerate(views)}
+    observations = {camera.name: observed(seed, k, grids) for k, camera in enumerate(views)}
     paths = folder / "splats.ply", folder / "cameras.json", folder / "features.safetensors"
     write_splats(paths[0], random_splats(seed, 50, kernel=kernel))
     write_inria_cameras(Cameras(views), paths[1])

@@ -256,6 +256,7 @@ def diagnose(
     facts: dict[str, Any] = {
         "device": plan.device.facts(),
         "weights_entries": statistics.entries,
+        "masks": any(map(inputs.views.features.is_regions, inputs.views.names)),
         "views_without_camera": inputs.views.unpaired,
         "plan": plan.facts(),
         "views_without_splats": list(statistics.blind),

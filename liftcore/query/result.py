@@ -122,8 +122,8 @@ class LiftResult(Lift):
         """Return the lift with at most 8,192 `rows`, and the number of its row for each splat, `code`.
 
         ``diagnostics["codes"]`` has the number of rows, and the loss: 1 - the mean cosine of splats about the scene's
-        mean, by the root of total weight. Where it is too large, or nothing is saved, it has the reason, and features
-        stay exact.
+        mean, by the root of total weight. Where it is too large, sooner for maps than for masks, or nothing is saved,
+        it has the reason, and features stay exact.
         """
         import torch
 
@@ -133,7 +133,7 @@ class LiftResult(Lift):
             return self
         lift = self.cpu()
         columns = (part.numpy() for part in (lift.rows, lift.has_feature, lift.total_weight))
-        codes = code_features(*columns, of_masks=lift.object is not None)
+        codes = code_features(*columns, of_masks=bool(self.diagnostics.get("masks")))
         facts, changes = {"reason": codes}, dict[str, Any]()
         if not isinstance(codes, str):
             facts = {"rows": len(codes.codebook), "loss": codes.loss}
@@ -157,7 +157,7 @@ class LiftResult(Lift):
         Args:
             path: a file.
             features: ``codes``: two bytes a splat, where that loses little (`as_codes`); ``exact``: a row of features
-                a splat; None: as the lift's setting ``codes`` has it.
+                a splat; None: as the lift's setting ``codes`` has it, which is that of the last `save`.
             progress: as `liftcore.lift` has it; there is one step.
 
         Raises:
@@ -169,7 +169,9 @@ class LiftResult(Lift):
             raise InvalidInput("features", expected="exact, codes or None", got=repr(features))
         with shown_progress(progress) as reporter, one_step(reporter, "save"):
             as_codes = self.settings.codes if features is None else features == "codes"
-            save_lift(self.as_codes() if as_codes else replace(self, rows=self.features, code=None), path)
+            lift = self.as_codes() if as_codes else replace(self, rows=self.features, code=None)
+            settings = self.settings.model_copy(update={"codes": as_codes})
+            save_lift(replace(lift, metadata=lift.metadata.model_copy(update={"settings": settings})), path)
 
     def save_scene(
         self, folder: Path, splats: Splats | None = None, cameras: Mapping[str, Camera] | None = None

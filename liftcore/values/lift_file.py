@@ -84,9 +84,9 @@ def save_lift(lift: Lift, path: Path | str) -> None:
         tensors |= _as_bytes(lift.rows)
         if ((lift.code.int() > 0) == lift.has_feature).all():
             del tensors["has_feature"]
-    if lift.object is not None and lift.object_views is not None and lift.node is not None:
-        node, parents = lift.node.cpu().numpy(), tensors["node_parents"].cpu().numpy()
-        if np.array_equal(_objects_of(node, parents, len(lift.object_views)), lift.object.cpu().numpy()):
+    if {*OBJECT_TENSORS, *NODE_TENSORS} <= tensors.keys():
+        object_of, _, node, parents = (tensors[name].cpu().numpy() for name in (*OBJECT_TENSORS, *NODE_TENSORS[:2]))
+        if np.array_equal(_objects_of(node, parents, len(tensors["object_views"])), object_of):
             del tensors["object"]
     write_tensors(as_path(path), tensors, {"splatlift": lift.metadata.model_dump_json()})
 
@@ -95,6 +95,7 @@ def _narrowed(column: Tensor, is_share: bool) -> Tensor:
     """Return a column [P] i32 or f32 in two bytes, a share in one, where that loses nothing."""
     import torch
 
+    column = column.cpu()  # another device may divide by 255 otherwise
     if is_share:
         levels = (255 * column).round().clamp(0, 255).byte()
         if torch.equal(levels.float() / 255, column):
@@ -115,7 +116,7 @@ def _as_bytes(features: Tensor) -> dict[str, Tensor]:
 
     rows = features.cpu().numpy()
     steps = byte_steps(rows)
-    multiples = np.round(rows / steps)
+    multiples = np.clip(np.round(rows / steps), -127, 127)
     if rows.dtype != np.float16 or not np.array_equal(multiples * steps, rows):
         return {"features": features}
     return {"features": torch.from_numpy(multiples.astype(np.int8)), "feature_steps": torch.from_numpy(steps)}
@@ -156,13 +157,14 @@ def read_lift(path: Path | str) -> tuple[dict[str, np.ndarray], str]:
             tensors, header = map_tensors(source)
             if "splatlift" not in header:
                 raise ValueError(f"{EXPECTED}, got safetensors without lift metadata")
-            if "code" in tensors:
-                tensors.setdefault("has_feature", tensors["code"] > 0)
-            if missing := [name for name in TENSORS if name not in tensors]:
+            stand_in = {"has_feature"} if "code" in tensors else set[str]()
+            if missing := [name for name in TENSORS if name not in tensors.keys() | stand_in]:
                 _check_format(header["splatlift"])
                 raise ValueError(f"{EXPECTED}, got one without {missing[0]}")
             arrays = {name: tensors[name] for name in SCHEMA if name in tensors}
             lengths = check_arrays(arrays, SCHEMA)
+            if stand_in:
+                arrays.setdefault("has_feature", arrays["code"] > 0)
             _widen(arrays)
             _check_tensors(arrays, lengths)
             if "object_views" in arrays and "object" not in arrays:
@@ -196,8 +198,9 @@ def _widen(arrays: dict[str, np.ndarray]) -> None:
     if (steps is None) != (features.dtype != np.int8):
         raise ValueError(f"feature_steps beside features of int8 alone, got features of {features.dtype}")
     if steps is not None:
-        if not ((steps >= STEPS[0]) & (steps <= STEPS[1])).all():
-            raise ValueError(f"feature_steps of {STEPS[0]:g}..{STEPS[1]:g}, got {steps.min()}..{steps.max()}")
+        if not ((steps >= STEPS[0]) & (steps <= STEPS[1])).all() or features.min(initial=0) < -127:
+            expected = f"feature_steps of {STEPS[0]:g}..{STEPS[1]:g} and features of -127..127"
+            raise ValueError(f"{expected}, got {steps.min()}..{steps.max()} and from {features.min(initial=0)} on")
         arrays["features"] = (features * steps).astype(np.float16)
     if CONFIDENCE in arrays and arrays[CONFIDENCE].dtype == np.uint8:
         arrays[CONFIDENCE] = arrays[CONFIDENCE] / np.float32(255)
@@ -226,7 +229,7 @@ def _check_tensors(arrays: dict[str, np.ndarray], lengths: dict[str, int]) -> No
         if int(numbers.min(initial=-1)) < -1 or int(numbers.max(initial=-1)) >= lengths.get(axis, 0):
             raise ValueError(f"{name} of -1..{lengths[axis] - 1}, got {numbers.min()}..{numbers.max()}")
     above = arrays.get("node_parents", np.empty(0, np.int32))
-    if lengths.get("O", 0) > len(above) > 0:
+    if "node" in arrays and lengths.get("O", 0) > len(above):
         raise ValueError(f"a node for each of {lengths['O']} objects, got {len(above)}")
     above = np.append(above, np.int32(-1))
     for _ in range(MOST_DEPTH.bit_length()):  # each step leads twice as far up

@@ -26,8 +26,7 @@ def lift_with(features: np.ndarray, has_feature: np.ndarray | None = None) -> lc
     rows, weights = torch.from_numpy(features).half(), torch.linspace(1.0, 9.0, len(features))
     columns = {"total_weight": weights * torch.from_numpy(has_feature), "confidence": weights / 10}
     columns |= {"rows": rows, "has_feature": torch.from_numpy(has_feature)}
-    columns |= {"object": torch.full((len(features),), -1).int(), "object_views": torch.zeros(0, 5).int()}  # of masks
-    metadata = lift.metadata.model_copy(update={"landmarks": ()})
+    metadata = lift.metadata.model_copy(update={"landmarks": (), "diagnostics": {"masks": True}})
     return lc.LiftResult.of(replace(lift, **columns, metadata=metadata))
 
 
@@ -117,11 +116,24 @@ def test_codes_are_saved_read_cropped_and_moved_as_codes(
     assert np.array_equal(larger.arrays()["code"], code)
 
 
+def test_columns_that_do_not_follow_from_others_come_back(coded: lc.LiftResult, tmp_path: Path) -> None:
+    views, count = torch.zeros(2, 5).int(), len(coded)
+    tree = {"node": torch.arange(count).int() % 3, "node_parents": torch.tensor([-1, -1, 0]).int()}
+    tree |= {"node_views": torch.zeros(3, 5).int(), "node_confidence": torch.ones(3), "object_views": views}
+    tree |= {"node_features": torch.zeros(3, coded.rows.shape[1]).half(), "object": torch.arange(count).int() % 2}
+    lift = replace(coded, has_feature=torch.arange(count) % 5 > 0, **tree)
+    lift.save(tmp_path / "odd.safetensors")
+    read = lc.load_lift(tmp_path / "odd.safetensors")
+    for name in ("has_feature", "object"):
+        assert np.array_equal(read.arrays()[name], lift.arrays()[name])
+
+
 def test_codes_are_saved_as_exact_features_where_these_are_wanted(
     coded: lc.LiftResult, exact: lc.LiftResult, tmp_path: Path
 ) -> None:
     expected = coded.features
     coded.save(tmp_path / "exact.safetensors", features="exact")
+    lc.load_lift(tmp_path / "exact.safetensors").save(tmp_path / "exact.safetensors")  # stays so
     read = lc.load_lift(tmp_path / "exact.safetensors")
     assert read.code is None and torch.equal(read.features, expected)
     exact.save(tmp_path / "coded.safetensors")
@@ -168,7 +180,8 @@ def test_labelled_splats_bring_their_codes(coded: lc.LiftResult, tmp_path: Path,
 
 
 def test_features_that_share_nothing_or_differ_within_things_stay_exact(exact: lc.LiftResult) -> None:
-    assert replace(exact, object=None, object_views=None).as_codes().code is None  # of maps
+    of_maps = exact.metadata.model_copy(update={"diagnostics": {"masks": False}})
+    assert replace(exact, metadata=of_maps).as_codes().code is None
     rng = np.random.default_rng(0)
     for features in (rng.normal(size=(COUNT, 64)), rng.normal(size=(40, 64))):
         lift = lift_with(features)

@@ -64,8 +64,11 @@ def kill_lift(scene: tuple[Path, Path, Path], stage: str, at: int, **keywords: A
         lifted(scene, progress=killing(stage, at), **keywords)
 
 
-def test_killed_lift_goes_on_from_its_last_view_to_the_same_bits(tmp_path: Path, rasterized_views: list[str]) -> None:
-    scene = write_scene(tmp_path, 3)
+@pytest.mark.parametrize("grids", [False, True])
+def test_killed_lift_goes_on_from_its_last_view_to_the_same_bits(
+    tmp_path: Path, rasterized_views: list[str], grids: bool
+) -> None:
+    scene = write_scene(tmp_path, 3, grids)
     uninterrupted = lifted(scene, threads=1)
     rasterized_views.clear()
     checkpoint = tmp_path / "kept"
