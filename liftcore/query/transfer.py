@@ -52,11 +52,9 @@ def transfer(lift: AnyLift, old: Splats, new: Splats, matrix: Any = None) -> Any
         hint = "give the matrix if the scene was moved, or lift the new splats"
         raise InvalidSplats("splats", expected="splats of the lifted scene", got=got, hint=hint)
     result = lift[rows]
-    labels = ("cluster", "object", "node")
-    values = ("rows" if lift.code is None else "code", "total_weight", "has_feature", "confidence", *labels)
-    columns = {name: column for name in values if (column := getattr(result, name)) is not None}
+    columns = result.columns
     for name, column in columns.items():
-        column.numpy()[~is_copy] = -1 if name in labels else 0
+        column.numpy()[~is_copy] = -1 if name in ("cluster", "object", "node") else 0
     counts = {"from_splats": len(lift), "rows": int(is_copy.sum()), "without_partner": int((~is_copy).sum())}
     diagnostics = lift.diagnostics | {"transfer": counts}
     if isinstance(plan := diagnostics.get("plan"), dict):

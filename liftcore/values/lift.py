@@ -5,7 +5,7 @@ Its metadata are read without torch, so that a query of a file does not load it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict
@@ -16,7 +16,7 @@ from liftcore.scene.origin import FILE_ORIGIN, Origin
 from liftcore.scene.views import composed
 from liftcore.scene.world import UNKNOWN, WorldFrame
 from liftcore.text.table import TableEncoder, own_words
-from liftcore.values.lift_file import FORMAT, NODE_TENSORS
+from liftcore.values.lift_file import FORMAT, NODE_TENSORS, SCHEMA
 from liftcore.values.settings import LiftSettings
 
 if TYPE_CHECKING:
@@ -120,6 +120,12 @@ class Lift:
         return self.rows if self.code is None else self.rows[self.code.long()]
 
     @property
+    def columns(self) -> dict[str, Tensor]:
+        """Its tensors with a row a splat, by their names."""
+        names = [name for name, (_, axes) in SCHEMA.items() if axes == "P"] + ["rows"] * (self.code is None)
+        return {name: column for name in names if (column := getattr(self, name)) is not None}
+
+    @property
     def settings(self) -> LiftSettings:
         """Settings of the lift."""
         return self.metadata.settings
@@ -152,22 +158,13 @@ class Lift:
         from liftcore.scene.splats import chosen_rows
 
         rows = chosen_rows(keep, len(self)).to(self.rows.device)
-        names = (
-            "rows" if self.code is None else "code",
-            "total_weight",
-            "has_feature",
-            "confidence",
-            "cluster",
-            "object",
-        )
-        tensors = {name: getattr(self, name) for name in names}
-        columns = {name: column[rows] for name, column in tensors.items() if column is not None}
+        columns = {name: column[rows] for name, column in self.columns.items()}
         for labels, table in (("cluster", "cluster_features"), ("object", "object_views")):
             if labels in columns and (values := getattr(self, table)) is not None:
                 columns[labels], columns[table] = renumbered(columns[labels], values)
         if self.node is not None:
             tree = {name: getattr(self, name) for name in NODE_TENSORS}
-            columns |= cropped_tree(tree | {"node": self.node[rows]})
+            columns |= cropped_tree(tree | {"node": columns["node"]})
         places = {row: place for row, *place in self.metadata.landmarks}
         row_numbers = enumerate(rows.tolist())
         landmarks = tuple((new, *places[old]) for new, old in row_numbers if old in places)
@@ -236,8 +233,7 @@ class Lift:
         """Return the same with its tensors there; where they are, if there is no room for them."""
         from liftcore.runtime.device import out_of_memory
 
-        parts = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "metadata"}
-        tensors = {name: part for name, part in parts.items() if part is not None}
+        tensors = {name: part for name, part in vars(self).items() if hasattr(part, "device")}
         if all(part.device == place for part in tensors.values()):
             return self
         try:

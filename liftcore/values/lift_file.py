@@ -157,14 +157,14 @@ def read_lift(path: Path | str) -> tuple[dict[str, np.ndarray], str]:
             tensors, header = map_tensors(source)
             if "splatlift" not in header:
                 raise ValueError(f"{EXPECTED}, got safetensors without lift metadata")
-            stand_in = {"has_feature"} if "code" in tensors else set[str]()
-            if missing := [name for name in TENSORS if name not in tensors.keys() | stand_in]:
+            needed = TENSORS[: 2 if "code" in tensors else 3]
+            if missing := [name for name in needed if name not in tensors]:
                 _check_format(header["splatlift"])
                 raise ValueError(f"{EXPECTED}, got one without {missing[0]}")
             arrays = {name: tensors[name] for name in SCHEMA if name in tensors}
             lengths = check_arrays(arrays, SCHEMA)
-            if stand_in:
-                arrays.setdefault("has_feature", arrays["code"] > 0)
+            if "has_feature" not in arrays:
+                arrays["has_feature"] = arrays["code"] > 0
             _widen(arrays)
             _check_tensors(arrays, lengths)
             if "object_views" in arrays and "object" not in arrays:

@@ -72,8 +72,6 @@ class Regions:
         cls,
         masks: Array | Sequence[Array],
         vectors: Array,
-        *,
-        context: str = "",
     ) -> Self:
         """Return regions of masks that may overlap, as those of SAM, with a vector each.
 
@@ -85,7 +83,6 @@ class Regions:
             masks: [M, H, W] of booleans, or a sequence of M of [H, W]; also [M, 1, H, W], as SAM's predictor gives
                 them. They need not have the photo's size.
             vectors: [M, F] of floats, row k of mask k.
-            context: text before the argument's name in errors, such as a view.
 
         Raises:
             InvalidFeatures: masks that are no booleans, or of another number than the vectors; or as the constructor
@@ -94,9 +91,9 @@ class Regions:
         if np.ndim(vectors) == 2 and not len(vectors) and np.shape(masks)[:1] == (0,):  # nothing was found here
             size = np.shape(masks)[-2:] if np.ndim(masks) >= 3 else (1, 1)
             return cls(np.full(size, NO_LABEL, np.int32), np.zeros((1, vectors.shape[1]), np.float32))
-        with reading(f"{context} vectors".strip(), InvalidFeatures, "floats [M, F]"):
+        with reading("vectors", InvalidFeatures, "floats [M, F]"):
             codebook = _features(vectors, "M, F")
-        with reading(f"{context} masks".strip(), InvalidFeatures, "booleans [M, H, W]"):
+        with reading("masks", InvalidFeatures, "booleans [M, H, W]"):
             labels = label_levels(list(_planes(masks, len(codebook))))
         return cls.unchecked(torch.from_numpy(labels).to(codebook.device), codebook)
 

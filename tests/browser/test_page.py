@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from safetensors import safe_open
-from safetensors.numpy import save
+import torch
 
+import liftcore as lc
 from service.store import create_key, open_keys, revoke_key
 
 from .browser import Browser, Chromium, launch, profile
@@ -165,15 +165,16 @@ def test_click_takes_the_object_and_another_its_patch(page: Browser) -> None:
 def scene_with_parts(server: PageServer, tmp_path: Path) -> Iterator[str]:
     """A lift whose lamp has two parts, nodes 3 and 4: its splats of even and of odd rows."""
     (tmp_path / "lift").write_bytes(server.client.get(f"/lifts/{server.lift}/features").content)
-    with safe_open(tmp_path / "lift", framework="np") as file:
-        metadata = file.metadata()
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    lamp, rows = int(tensors["object"][LAMP]), np.flatnonzero(tensors["object"] == tensors["object"][LAMP])
-    tensors["node"][rows] = 3 + rows % 2
-    tensors["node_parents"] = np.array([-1, -1, -1, lamp, lamp], np.int32)
+    lift = lc.load_lift(tmp_path / "lift")
+    assert lift.object is not None
+    lamp, rows, tree = int(lift.object[LAMP]), torch.nonzero(lift.object == lift.object[LAMP])[:, 0], dict[str, Any]()
+    tree["node"] = lift.object.index_copy(0, rows, (3 + rows % 2).int())
+    tree["node_parents"] = torch.tensor([-1, -1, -1, lamp, lamp]).int()
     for name in ("node_views", "node_confidence", "node_features"):
-        tensors[name] = tensors[name][[0, 1, 2, lamp, lamp]]
-    lifted = server.client.post("/lifts", content=save(tensors, metadata)).raise_for_status().json()["id"]
+        tree[name] = getattr(lift, name)[[0, 1, 2, lamp, lamp]]
+    replace(lift, **tree).save(tmp_path / "parts")
+    content = (tmp_path / "parts").read_bytes()
+    lifted = server.client.post("/lifts", content=content).raise_for_status().json()["id"]
     yield lifted
     server.client.delete(f"/jobs/{lifted}?with_lift=true").raise_for_status()
 
