@@ -18,7 +18,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from safetensors.torch import load_file
@@ -161,7 +161,8 @@ def coded_rows(scene: Truth, folder: Path, pack: str, stride: int) -> Iterator[d
     """The rows of a lift by the preset default, exact and as codes."""
     lift = scene.lift(read_pack(folder, pack, stride))
     encoder = lc.open_encoder(f"table:{folder / 'text_table.safetensors'}")
-    for name, lifted in {"exact": lift, "codes": lift.as_codes()}.items():
+    lifts: dict[Literal["exact", "codes"], lc.LiftResult] = {"exact": lift, "codes": lift.as_codes()}
+    for name, lifted in lifts.items():
         figures, lift_scene = scene.evaluate(lifted), scene.open_scene(lifted)
         ious, seconds = list[float](), list[float]()
         for number, word in enumerate(scene.words):
@@ -176,7 +177,7 @@ def coded_rows(scene: Truth, folder: Path, pack: str, stride: int) -> Iterator[d
             ]
             ious.append(sum(float((mask & truth).sum() / (mask | truth).sum()) for mask, truth in pairs) / len(pairs))
         with tempfile.TemporaryDirectory() as output:
-            lifted.save(Path(output) / "lift.safetensors")
+            lifted.save(Path(output) / "lift.safetensors", features=name)
             size = (Path(output) / "lift.safetensors").stat().st_size
         facts = lifted.diagnostics.get("codes", {})
         yield {
