@@ -52,6 +52,16 @@ def test_every_source_gives_instances_that_lie_in_their_boxes(scene: Scene) -> N
         scene.labels(scene.ask(Query.of((Vector((1.0,) * CHANNELS),), threshold=1.0)))
 
 
+def test_a_splat_of_two_answers_is_of_that_whose_threshold_it_exceeds_more(scene: Scene) -> None:
+    vector = Vector(tuple(AXES[0]))
+    narrow, wide = (scene.ask(Query.of((vector,), threshold=cut), places=False) for cut in (0.9, 0.1))
+    rows = np.flatnonzero(narrow.selected)
+    for answer, score in ((narrow, 0.95), (wide, 0.6)):  # a half and 5/9 of the way up from the threshold
+        answer.scores[rows[1:]] = score
+    labels = scene.labels({"narrow": narrow, "wide": wide})
+    assert labels.columns["class_id"][rows].tolist() == [1, *[2] * (len(rows) - 1)]
+
+
 def test_masks_in_views_are_those_of_the_instances(scene: Scene, tmp_path: Path) -> None:
     segmentation = scene.segment(WORDS, EYE)
     scene.export(tmp_path / "m.json", segmentation)
