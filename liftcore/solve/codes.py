@@ -65,11 +65,14 @@ def code_features(
     if len(rows[sample]) < LEAST_SPLATS:
         return f"Features are exact: {len(rows)} splats with a feature are too few to share codes."
     root_weights = has_feature * np.sqrt(np.maximum(total_weight, np.float32(1e-6)))
-    offsets, weights = _unit(features[rows[sample]]), root_weights[rows[sample]]
+    weights, centre = root_weights[rows[sample]], np.zeros(features.shape[1], np.float32)
+    units = np.empty((len(weights), len(centre)), np.float16)  # float32 would be most of the memory here
     with one_thread():
-        centre = (weights @ offsets / weights.sum()).astype(np.float32)
-        offsets -= centre
-        axes = principal_axes(offsets[::HELD_OUT], CHANNELS)
+        for first in range(0, len(units), BLOCK):
+            block = slice(first, first + BLOCK)
+            units[block] = _unit(features[rows[sample][block]])
+            centre += weights[block] @ _wide(units[block]) / weights.sum()
+        axes = principal_axes(_wide(units[::HELD_OUT]) - centre, CHANNELS)
     points = _points(features, rows, centre, axes)
     training = np.where(np.arange(len(weights)) % HELD_OUT > 0, weights, np.float32(0.0))
     groups, number, loss = np.zeros(len(rows), np.int32), 1, 1.0
@@ -77,11 +80,12 @@ def code_features(
         groups = _cut(points, groups, sample, training, most_groups)
         previous, number = number, int(groups.max()) + 1
         if number == previous or number >= LEAST_CODES:
-            loss = _loss(offsets, training, weights, groups[sample])
+            loss = _loss(units, centre, training, weights, groups[sample])
         if number == previous:
             break
     if loss > (MOST_LOSS_OF_MASKS if of_masks else MOST_LOSS):
         return f"Features are exact: as codes their mean cosine about the scene's mean would be {1 - loss:.3f}."
+    del units, points  # most of the memory here
     present = np.bincount(groups) > 0  # a cut may leave nothing on one side
     code, number = np.zeros(len(features), np.uint16), int(np.count_nonzero(present))
     code[rows] = np.cumsum(present)[groups]
@@ -89,7 +93,8 @@ def code_features(
     for first in range(0, len(code), BLOCK):
         block = slice(first, first + BLOCK)
         sums += _sums(code[block], root_weights[block], _wide(features[block]), number + 1)
-    codebook = sums / np.maximum(np.bincount(code, root_weights, number + 1), 1e-30)[:, None]
+    sums /= np.maximum(np.bincount(code, root_weights, number + 1), 1e-30)[:, None]
+    codebook = sums.astype(np.float32)
     if features.dtype == np.float16:  # the file has bytes of these: 1 - cosine about the mean grows by .0001 to .0004
         steps = byte_steps(codebook)
         codebook = (np.clip(np.round(codebook / steps), -127, 127) + 0.0) * steps  # + 0, as bytes have no -0
@@ -132,11 +137,17 @@ def _beyond(points: np.ndarray, groups: np.ndarray, normals: np.ndarray, middles
     return beyond
 
 
-def _loss(offsets: np.ndarray, training: np.ndarray, weights: np.ndarray, groups: np.ndarray) -> float:
-    """Return 1 - the mean cosine of held-out offsets [n, F] from the centre with the means of their groups."""
-    means = _sums(groups, training, offsets, int(groups.max()) + 1)
+def _loss(
+    units: np.ndarray, centre: np.ndarray, training: np.ndarray, weights: np.ndarray, groups: np.ndarray
+) -> float:
+    """Return 1 - the mean cosine of held-out units [n, F] f16 about the centre with the means of their groups."""
+    count = int(groups.max()) + 1
+    means = np.zeros((count, len(centre)), np.float32)
+    for first in range(0, len(units), BLOCK):
+        block = slice(first, first + BLOCK)
+        means += _sums(groups[block], training[block], _wide(units[block]) - centre, count)
     means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-30)
-    held_out = offsets[::HELD_OUT]
+    held_out = _wide(units[::HELD_OUT]) - centre
     along = np.einsum("nf,nf->n", held_out, means[groups[::HELD_OUT]].astype(np.float32))
     cosines = along / np.maximum(np.linalg.norm(held_out, axis=1), 1e-30)
     return 1 - float(np.average(cosines, weights=weights[::HELD_OUT]))
