@@ -12,6 +12,7 @@ rays meet.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -68,8 +69,7 @@ def code_features(
     weights, centre = root_weights[rows[sample]], np.zeros(features.shape[1], np.float32)
     units = np.empty((len(weights), len(centre)), np.float16)  # float32 would be most of the memory here
     with one_thread():
-        for first in range(0, len(units), BLOCK):
-            block = slice(first, first + BLOCK)
+        for block in _blocks(len(units)):
             units[block] = _unit(features[rows[sample][block]])
             centre += weights[block] @ _wide(units[block]) / weights.sum()
         axes = principal_axes(_wide(units[::HELD_OUT]) - centre, CHANNELS)
@@ -90,8 +90,7 @@ def code_features(
     code, number = np.zeros(len(features), np.uint16), int(np.count_nonzero(present))
     code[rows] = np.cumsum(present)[groups]
     sums = np.zeros((number + 1, features.shape[1]))  # of all splats: a sample has ten a group
-    for first in range(0, len(code), BLOCK):
-        block = slice(first, first + BLOCK)
+    for block in _blocks(len(code)):
         sums += _sums(code[block], root_weights[block], _wide(features[block]), number + 1)
     sums /= np.maximum(np.bincount(code, root_weights, number + 1), 1e-30)[:, None]
     codebook = sums.astype(np.float32)
@@ -130,8 +129,7 @@ def _cut(points: np.ndarray, groups: np.ndarray, sample: slice, weights: np.ndar
 def _beyond(points: np.ndarray, groups: np.ndarray, normals: np.ndarray, middles: np.ndarray) -> np.ndarray:
     """Return the points [n, D] beyond the hyperplanes of their groups, [n] bool."""
     beyond = np.empty(len(points), np.bool_)
-    for first in range(0, len(points), BLOCK):
-        block = slice(first, first + BLOCK)
+    for block in _blocks(len(points)):
         along = np.einsum("nd,nd->n", points[block], normals[groups[block]])
         beyond[block] = along > middles[groups[block]]
     return beyond
@@ -143,8 +141,7 @@ def _loss(
     """Return 1 - the mean cosine of held-out units [n, F] f16 about the centre with the means of their groups."""
     count = int(groups.max()) + 1
     means = np.zeros((count, len(centre)), np.float32)
-    for first in range(0, len(units), BLOCK):
-        block = slice(first, first + BLOCK)
+    for block in _blocks(len(units)):
         means += _sums(groups[block], training[block], _wide(units[block]) - centre, count)
     means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-30)
     held_out = _wide(units[::HELD_OUT]) - centre
@@ -164,13 +161,16 @@ def _points(features: np.ndarray, rows: np.ndarray, centre: np.ndarray, axes: np
     in_file = 4 * len(rows) * axes.shape[1] > MEMORY_LIMIT
     points = zeros(shape, torch.float32, name="codes", in_file=in_file).numpy()
 
-    def project(first: int) -> None:
-        block = slice(first, first + BLOCK)
+    def project(block: slice) -> None:
         np.subtract(_unit(features[rows[block]]) @ axes, centre @ axes, out=points[block])
 
     with one_thread(), ThreadPoolExecutor(cores()) as pool:
-        list(pool.map(project, range(0, len(rows), BLOCK)))
+        list(pool.map(project, _blocks(len(rows))))
     return points
+
+
+def _blocks(count: int) -> Iterator[slice]:
+    return (slice(first, first + BLOCK) for first in range(0, count, BLOCK))
 
 
 def _unit(rows: np.ndarray) -> np.ndarray:

@@ -102,8 +102,7 @@ class LiftSettings(Body):
         "wrong masks": ("robust", "robust_directions"),
         "objects and clusters": ("objects", "aggregation", "aggregation_iou", "aggregation_cluster_size"),
         "neighbours": ("smoothness",),
-        "the result": ("dtype", "codes", "diagnostic_rays", "reference_channels", "seed"),
-        "where it is made": ("device",),
+        "the result and its place": ("dtype", "codes", "diagnostic_rays", "reference_channels", "seed", "device"),
     }  # fmt: skip
 
     preset: Preset = Field(
