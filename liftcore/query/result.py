@@ -111,7 +111,7 @@ class LiftResult(Lift):
     def has_cameras(self, path: Path | str) -> bool:
         """Return True if a file or folder has the cameras of the lifted views with their poses; it may have others.
 
-        Older lifts do not store poses: then it is False.
+        A lift that was transformed stores no poses: then it is False.
 
         Raises:
             InvalidCameras: the file is invalid.
