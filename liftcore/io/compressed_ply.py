@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from liftcore.io.ply import parse_elements, read_head, tail_warnings
-from liftcore.io.quantised import Fields, decoded, field_shapes, logits, smallest_three
+from liftcore.io.quantised import Fields, decoded, logits, smallest_three
 from liftcore.scene.harmonics import constant_terms
 from liftcore.scene.render_mode import mode_of_comments
 
@@ -60,7 +60,7 @@ def read_compressed_ply(path: Path, *, colour: bool) -> Fields:
             fields["sh"][:, 1:] = ((unit - 0.5) * SH_RANGE).reshape(-1, 3, higher).transpose(0, 2, 1)
         return fields
 
-    fields = decoded(len(vertices), field_shapes(1 + higher if colour else 0), decode)
+    fields = decoded(len(vertices), decode)
     return fields | {"render_mode": mode, "warnings": (*warnings, *tail_warnings(path, size, total))}
 
 

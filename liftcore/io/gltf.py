@@ -31,7 +31,7 @@ from liftcore.io.labels import COLUMN, IDS, stored_columns
 from liftcore.io.ply import MODEL
 from liftcore.io.quantised import MOST_GROWTH, Fields, gaussians_in, logits
 from liftcore.runtime.version import __version__
-from liftcore.scene.harmonics import band_rotation
+from liftcore.scene.harmonics import rotate_bands
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.origin import FILE_ORIGIN
 from liftcore.scene.quaternions import product_matrix, rotation_matrices
@@ -185,12 +185,9 @@ class _Asset:
             return fields
         bands = [[harmonic_name(band, place) for place in range(2 * band + 1)] for band in range(MAX_DEGREE + 1)]
         absent = (band for band, names in enumerate(bands) if band and not attributes.keys() & set(names))
-        bands = bands[: next(absent, len(bands))]
-        sh = np.empty((count, len(bands) ** 2, 3), np.float32)
-        for band, names in enumerate(bands):
-            coefficients = np.stack([read(name, 3) for name in names], axis=1)
-            sh[:, band**2 : (band + 1) ** 2] = np.einsum("ij,njc->nic", band_rotation(band, rotation), coefficients)
-        return fields | {"sh": sh, "extras": self._extras(primitive, count)}
+        coefficients = [read(name, 3) for names in bands[: next(absent, len(bands))] for name in names]
+        sh = np.stack(coefficients, axis=1, dtype=np.float32)
+        return fields | {"sh": rotate_bands(sh, rotation), "extras": self._extras(primitive, count)}
 
     def _extras(self, primitive: dict[str, Any], count: int) -> dict[str, np.ndarray]:
         """Return feature ids by their label, else by their number, and other columns by name, each [P]."""

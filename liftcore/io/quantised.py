@@ -7,13 +7,13 @@ splats as 3D Gaussians (`gaussian_rows`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liftcore.scene.harmonics import SH_C0, band_rotation, constant_terms
+from liftcore.scene.harmonics import SH_C0, constant_terms, rotate_bands
 from liftcore.scene.origin import LARGEST_SCALE
 from liftcore.scene.quaternions import product_matrix
 
@@ -31,8 +31,8 @@ MOST_SH_ROWS = 16  # of what other formats hold: degree 3
 Fields = dict[str, Any]  # arguments of `Splats` by their names
 
 
-def decoded(count: int, shapes: Mapping[str, tuple[int, ...]], decode: Callable[[slice], Fields]) -> Fields:
-    """Decode fields of such shapes behind P = ``count`` a block of rows at a time: memory stays near their size."""
+def decoded(count: int, decode: Callable[[slice], Fields]) -> Fields:
+    """Decode the fields of P = ``count`` splats a block of rows at a time: memory stays near their size."""
     fields: Fields = {}
     with np.errstate(over="ignore", invalid="ignore"):  # values beyond float32 are infinite, and refused as such
         for first in range(0, count, BLOCK_ROWS):
@@ -40,15 +40,9 @@ def decoded(count: int, shapes: Mapping[str, tuple[int, ...]], decode: Callable[
             for name, values in decode(rows).items():
                 if name not in fields:
                     dtype = np.float64 if name == "means" and values.dtype == np.float64 else np.float32
-                    fields[name] = np.empty((count, *shapes[name]), dtype)
+                    fields[name] = np.empty((count, *values.shape[1:]), dtype)
                 fields[name][rows] = values
     return fields
-
-
-def field_shapes(sh_rows: int) -> dict[str, tuple[int, ...]]:
-    """Return field -> shape behind P, of splats with K rows of harmonics; without them if K is 0."""
-    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": ()}
-    return shapes | ({"sh": (sh_rows, 3)} if sh_rows else {})
 
 
 def logits(alpha: np.ndarray) -> np.ndarray:
@@ -123,13 +117,11 @@ def gaussians_in(splats: Splats, axes: np.ndarray) -> GaussianRows:
         for name in ("means", "scales", "quats", "opacities", "colours")
     )
     sh = constant_terms(colours)[:, None] if splats.sh is None else splats.sh.cpu().numpy()[:, :MOST_SH_ROWS]
-    bands = [sh[:, band**2 : (band + 1) ** 2] for band in range(round(sh.shape[1] ** 0.5))]
-    bands = [np.einsum("ij,njc->nic", band_rotation(band, axes), part) for band, part in enumerate(bands)]
     return GaussianRows(
         means=(means * np.diag(axes)).astype("<f4"),
         scales=scales.astype("<f4"),
         quats=np.roll(quats @ product_matrix(axes).T, -1, axis=1).astype("<f4"),
         opacities=opacities.astype("<f4"),
         colours=colours,
-        sh=np.concatenate(bands, axis=1).astype("<f4"),
+        sh=rotate_bands(np.array(sh), axes).astype("<f4"),
     )

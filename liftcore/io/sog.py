@@ -19,7 +19,7 @@ import numpy as np
 
 from liftcore.io.files import BROKEN_ZIP, open_regular, open_zip
 from liftcore.io.photos import open_image
-from liftcore.io.quantised import MOST_GROWTH, Fields, decoded, field_shapes, logits, smallest_three
+from liftcore.io.quantised import MOST_GROWTH, Fields, decoded, logits, smallest_three
 from liftcore.scene.render_mode import mode_of_word
 
 META = "meta.json"
@@ -119,7 +119,9 @@ class _Pictures:
         lower, upper = (self._pixels("means", i) for i in (0, 1))
         quats, scales, colours = (self._pixels(part, 0) for part in ("quats", "scales", "sh0"))
         scale_book, colour_book = (self._numbers(part, "codebook", 256) for part in ("scales", "sh0"))
-        palette, labels = self._harmonics() if colour and self.meta.get("shN") else (np.empty((1, 0, 3)), None)
+        palette, labels = np.empty((1, 0, 3)), np.zeros(self.count, np.int64)
+        if colour and self.meta.get("shN"):
+            palette, labels = self._harmonics()
 
         def decode(rows: slice) -> Fields:
             levels = lower[rows, :3] + 256.0 * upper[rows, :3]
@@ -135,14 +137,14 @@ class _Pictures:
                 "opacity_logits": logits(colours[rows, 3] / 255.0),
             }
             if colour:
-                higher = palette[labels[rows] if labels is not None else np.zeros(len(parts), int)]
-                fields["sh"] = np.concatenate([colour_book[colours[rows, None, :3]], higher], axis=1)
+                terms = colour_book[colours[rows, None, :3]]
+                fields["sh"] = np.concatenate([terms, palette[labels[rows]]], axis=1)
             return fields
 
         mode, warnings = None, ()
         if (model := self.meta.get("model")) is not None:
             mode, warnings = mode_of_word(model, f"'model' {repr(model)[:60]} in {META}")
-        fields = decoded(self.count, field_shapes(1 + palette.shape[1] if colour else 0), decode)
+        fields = decoded(self.count, decode)
         return fields | {"render_mode": mode, "warnings": warnings}
 
     def _harmonics(self) -> tuple[np.ndarray, np.ndarray]:

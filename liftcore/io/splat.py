@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from liftcore.io.quantised import Fields, decoded, field_shapes, gaussian_rows, logits
+from liftcore.io.quantised import Fields, decoded, gaussian_rows, logits
 from liftcore.scene.harmonics import constant_terms
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def read_splat(path: Path, *, colour: bool) -> Fields:
         fields["opacity_logits"] = logits(rgba[:, 3])
         return fields | ({"sh": constant_terms(rgba[:, None, :3])} if colour else {})
 
-    return decoded(len(table), field_shapes(1 if colour else 0), decode)
+    return decoded(len(table), decode)
 
 
 def splat_blocks(splats: Splats) -> Iterator[bytes]:

@@ -28,7 +28,6 @@ from liftcore.io.quantised import (
     Fields,
     GaussianRows,
     decoded,
-    field_shapes,
     gaussian_rows,
     logits,
     smallest_three,
@@ -262,7 +261,7 @@ def _decode(
                 fields["sh"][:, 1:] = (stored[rows] / 128.0 - 1) * sh_signs[:, None]
         return fields
 
-    return decoded(count, field_shapes(1 + higher if colour else 0), decode)
+    return decoded(count, decode)
 
 
 def _quats(stored: np.ndarray) -> np.ndarray:

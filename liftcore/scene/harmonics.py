@@ -36,3 +36,11 @@ def band_rotation(band: int, rotation: np.ndarray) -> np.ndarray:
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     rotated = band_values(band, directions @ rotation)  # rows are R^T d
     return np.linalg.lstsq(band_values(band, directions), rotated, rcond=None)[0]
+
+
+def rotate_bands(sh: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Rotate all coefficients [n, K, 3] where they lie by ``rotation`` [3, 3] f64, and return them."""
+    for band in range(round(sh.shape[1] ** 0.5)):
+        rows = slice(band**2, (band + 1) ** 2)
+        sh[:, rows] = np.einsum("ij,njc->nic", band_rotation(band, rotation), sh[:, rows])
+    return sh
