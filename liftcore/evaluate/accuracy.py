@@ -47,16 +47,6 @@ def cosine_figures(features: Tensor, exact: Tensor, total_weight: Tensor) -> dic
     }
 
 
-def rendered_scores(
-    raster: Raster, camera: Camera, features: Tensor, classes: Tensor, params: CompositingParams
-) -> Tensor:
-    """Render the scores of every class vector [H, W, K] f32: the products of rendered features and classes.
-
-    Rendering is linear, so ``(A X) C^T = A (X C^T)``. The norm of ``A X`` is left out, as no argmax depends on it.
-    """
-    return raster.render(camera, features.to(torch.float32) @ classes.to(torch.float32).T, params)
-
-
 def shared_pixels(labels: Tensor, truth: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Count the pixels of intersection and union of labels and truth [...] int, by class: [count] i64 each."""
     masks = [((labels == k), (truth == k)) for k in range(count)]

@@ -177,8 +177,8 @@ def _check(
         wrong += unlike
     figures: dict[str, float] = {}
     if features is not None:
-        figures, found_wrong = _check_features(features, cameras, files)
         paired_features = pair(features, cameras)[0]
+        figures, found_wrong = _check_features(paired_features, files)
         fit_figures, wrong_fit = _fit_of_maps(paired_features, cameras, files)
         figures |= fit_figures
         found_wrong += wrong_fit
@@ -216,14 +216,10 @@ def _paired_photos(
         names = f"{first_names(photos)}, but the cameras {first_names(cameras)}"
         wrong.append(f"photos: none is named as a camera: the photos are {names}")
     else:
-        without_photo, unpaired = (
-            [name for name in cameras if name not in files],
-            [name for name in photos if name not in paired],
-        )
-        notes += (
-            [f"photos: {len(without_photo)} cameras have none: {first_names(without_photo)}"] if without_photo else []
-        )
-        notes += [f"photos: {len(unpaired)} have no camera: {first_names(unpaired)}"] if unpaired else []
+        if without_photo := [name for name in cameras if name not in files]:
+            notes.append(f"photos: {len(without_photo)} cameras have none: {first_names(without_photo)}")
+        if unpaired := [name for name in photos if name not in paired]:
+            notes.append(f"photos: {len(unpaired)} have no camera: {first_names(unpaired)}")
     return files
 
 
@@ -359,13 +355,13 @@ def _unlike_photos(
     }
     if not psnrs:
         return []
-    if _median([own_psnr - other for own_psnr, other in psnrs.values()]) >= LEAST_GAIN:
+    gain = _median([own_psnr - other for own_psnr, other in psnrs.values()])
+    if gain >= LEAST_GAIN:
         return _some_turned(psnrs, pictures, renders)
-    own_psnr = {name: psnr for name, (psnr, _) in psnrs.items()}
-    gain = _median([psnr - other for psnr, other in psnrs.values()])
-    finding = f"photos: renders are hardly more like their own photos ({_median(list(own_psnr.values())):.1f} dB)"
+    typical = _median([own_psnr for own_psnr, _ in psnrs.values()])
+    finding = f"photos: renders are hardly more like their own photos ({typical:.1f} dB)"
     finding = f"{finding} than like other views' ({gain:+.1f} dB)"
-    floor = {name: max(psnrs[name]) for name in own_psnr}
+    floor = {name: max(pair) for name, pair in psnrs.items()}
     cause = (
         _scaled_intrinsics(floor, pictures, scaled)
         or _turned_photos(floor, pictures, renders, headers)
@@ -383,12 +379,7 @@ def _some_turned(
     for name, (own_psnr, other) in psnrs.items():
         if own_psnr - other >= LEAST_GAIN:
             continue
-        ways = {tag: turn(pictures[name]) for tag, (_, turn) in TURNS.items()}
-        gains = {
-            tag: _psnr(renders[name], picture) - max(own_psnr, other)
-            for tag, picture in ways.items()
-            if picture.shape == renders[name].shape
-        }
+        gains = _turn_gains({name: max(own_psnr, other)}, pictures, renders)
         best = max(gains, key=lambda tag: gains[tag])
         if gains[best] >= LEAST_GAIN:
             names_by_turn.setdefault(best, []).append(name)
@@ -399,6 +390,19 @@ def _some_turned(
     ]
 
 
+def _turn_gains(
+    floor: Mapping[str, float], pictures: Mapping[str, np.ndarray], renders: Mapping[str, np.ndarray]
+) -> dict[int, float]:
+    """Return the median gain in dB of renders over ``floor`` by each turn of their photos, where shapes fit."""
+    gains: dict[int, list[float]] = {}
+    for tag, (_, turn) in TURNS.items():
+        for name, least in floor.items():
+            picture = turn(pictures[name])
+            if picture.shape == renders[name].shape:
+                gains.setdefault(tag, []).append(_psnr(renders[name], picture) - least)
+    return {tag: _median(values) for tag, values in gains.items()}
+
+
 def _turned_photos(
     floor: Mapping[str, float],
     pictures: Mapping[str, np.ndarray],
@@ -406,19 +410,11 @@ def _turned_photos(
     headers: Mapping[str, PhotoHeader],
 ) -> str:
     """Report the turn of all photos that makes renders match; empty if none does."""
-    best, turn = 0.0, 0
-    for tag, (_, way) in TURNS.items():
-        turned_pictures = {name: way(pictures[name]) for name in floor}
-        gains = [
-            _psnr(renders[name], turned_pictures[name]) - floor[name]
-            for name in floor
-            if turned_pictures[name].shape == renders[name].shape
-        ]
-        if gains and _median(gains) > best:
-            best, turn = _median(gains), tag
-    if best < LEAST_GAIN:
+    gains = _turn_gains(floor, pictures, renders)
+    turn = max(gains, key=lambda tag: gains[tag])
+    if gains[turn] < LEAST_GAIN:
         return ""
-    finding = f"with the photos {TURNS[turn][0]} they are {best:.1f} dB more so"
+    finding = f"with the photos {TURNS[turn][0]} they are {gains[turn]:.1f} dB more so"
     if _median([float(headers[name].orientation == turn) for name in floor]) > 0:
         return f"{finding}: cameras are of the photos as their EXIF turns them; save them turned, without the tag"
     return f"{finding}: photos and cameras are turned to each other; take the photos that cameras were made of"
@@ -451,11 +447,8 @@ def _median(values: Sequence[float]) -> float:
     return float(np.median(values))
 
 
-def _check_features(
-    features: Views, cameras: Cameras, files: Mapping[str, Path]
-) -> tuple[dict[str, float], list[str]]:
+def _check_features(views: Views, files: Mapping[str, Path]) -> tuple[dict[str, float], list[str]]:
     """Measure features: medians over some views, and messages of what is wrong."""
-    views = pair(features, cameras)[0]
     grids: list[np.ndarray] = []
     rows: list[list[float]] = []
     for name in evenly_spaced(views.views, VIEWS):

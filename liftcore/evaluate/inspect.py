@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from liftcore.errors import InvalidInput, InvalidSplats, InvalidTable
+from liftcore.errors import InvalidInput, InvalidSplats, InvalidTable, reading
 from liftcore.evaluate.class_masks import describe_masks
 from liftcore.features.smoothness import some_grids, unlike_maps
 from liftcore.io.cameras import camera_source, read_cameras
@@ -19,13 +19,16 @@ from liftcore.io.formats import SplatFormat
 from liftcore.io.kinds import identify
 from liftcore.io.photo_zip import describe_photos
 from liftcore.io.ply import EXPORT_PLY, dialect_of
+from liftcore.io.safetensors_file import check_arrays, check_header, map_tensors
 from liftcore.io.splats import format_of, read_splats, splat_files
 from liftcore.runtime.arguments import as_path, check_choice
 from liftcore.scene.cameras import Cameras, distortion_warning
 from liftcore.scene.compositing import ALPHA_FLOOR
 from liftcore.scene.splats import Kernel, Splats
 from liftcore.solve.diagnostics import UNSEEN
+from liftcore.text.table import EXPECTED as TABLE
 from liftcore.text.table import normalize_text
+from liftcore.values.lift_file import open_lift
 from liftcore.values.pack import read_features
 from liftcore.values.views import NO_LABEL, Regions
 
@@ -69,41 +72,20 @@ def inspect_file(path: Path | str, kind: str = "", *, trusted: bool = True) -> d
         raise InvalidInput(str(path), expected="a file or a folder", got="nothing of that name")
     identified = identify(path)
     kind = kind or ("" if identified.kind == "photos" else identified.kind or "")
-    describe, files_of = DESCRIPTIONS.get(kind, (None, None))
-    if describe is None or files_of is None:
+    if kind not in DESCRIPTIONS:
         if not identified.recognised and (path.is_dir() or path.suffix.lower() == ".json"):
             describe_camera_file(path)  # raises with what cameras lack
         if identified.kind == "photos":
             hint = "'splatlift encode' and 'splatlift pack masks' make features of photos"
             raise InvalidInput(str(path), expected=ANY_KIND, got="photos", hint=hint)
         raise InvalidInput(str(path), expected=ANY_KIND, got=identified.name, hint=identified.hint)
-    if kind == "splats" and not trusted:
-        _reject_code(path)
-    description = describe(path)  # first, as a reader's error names the missing file
-    size = sum(file.stat().st_size for file in files_of(path))
-    return {"kind": kind, "bytes": size, **description}
-
-
-def describe_lift_file(path: Path) -> dict[str, Any]:
-    """Describe a lift.
-
-    Raises:
-        InvalidLift: it is malformed.
-    """
-    from liftcore.values.lift_file import open_lift
-
-    return describe_lift(open_lift(path))
-
-
-def _files_of_lift(path: Path) -> list[Path]:
-    return sorted(path.iterdir()) if path.is_dir() else [path]
-
-
-def _reject_code(path: Path) -> None:
-    file_format = format_of(path)
-    if file_format is SplatFormat.CHECKPOINT:
+    if kind == "splats" and not trusted and format_of(path) is SplatFormat.CHECKPOINT:
         got = "a checkpoint of a trainer, which is a Python pickle"
         raise InvalidSplats("splats", expected="a format that holds no code", got=got, hint=EXPORT_PLY)
+    description = DESCRIPTIONS[kind](path)  # first, as a reader's error names the missing file
+    files = splat_files(path) if kind == "splats" else camera_source(path).files if kind == "cameras" else [path]
+    size = sum(file.stat().st_size for file in files)
+    return {"kind": kind, "bytes": size, **description}
 
 
 def describe_splat_file(path: Path) -> dict[str, Any]:
@@ -344,19 +326,19 @@ def _lift_warnings(lift: Lift, metadata: LiftMetadata) -> list[str]:
 
 
 def describe_table(path: Path) -> dict[str, Any]:
-    """Return counts, ranges and warnings of a table of text embeddings, valid or not.
+    """Return counts, ranges and warnings of a table of text embeddings, whatever its words and rows are.
 
     Raises:
-        InvalidTable: the file has other tensors, so that it may be of another kind.
+        InvalidTable: the file has no embeddings [n, F], or other tensors, so that it may be of another kind.
     """
-    from safetensors import safe_open
-
-    with safe_open(str(path), framework="pt") as handle:
-        other_tensors = sorted({*handle.keys()} - {"embeddings"})
-        if other_tensors:
-            raise InvalidTable(str(path), expected="embeddings alone", got=f"{other_tensors[0][:80]!r} beside them")
-        embeddings, metadata = handle.get_tensor("embeddings"), handle.metadata() or {}
-    norms = torch.linalg.vector_norm(embeddings.float().reshape(len(embeddings), -1), dim=1)
+    with reading(path, InvalidTable, TABLE):
+        check_header(path)
+        tensors, metadata = map_tensors(path)
+        if other_tensors := sorted(tensors.keys() - {"embeddings"}):
+            raise ValueError(f"embeddings alone, got {other_tensors[0][:80]!r} beside them")
+        embeddings = tensors["embeddings"]
+        check_arrays(tensors, {"embeddings": ("f2 f4", "n F")})
+    norms = torch.linalg.vector_norm(torch.from_numpy(embeddings).float(), dim=1)
     words = _words(metadata)
     warnings = [] if len(words) == len(embeddings) else [f"{len(words)} words for {len(embeddings)} rows"]
     if int((norms == 0).sum()):
@@ -376,18 +358,17 @@ def describe_table(path: Path) -> dict[str, Any]:
 def _words(metadata: dict[str, str]) -> list[str]:
     try:
         words = json.loads(metadata.get("words", "[]"))
-    except ValueError:
+    except (ValueError, RecursionError):
         return []
     return [str(word) for word in words] if isinstance(words, list) else []
 
 
-# By kind: how a file is described, and the files whose bytes count.
-DESCRIPTIONS: dict[str, tuple[Callable[[Path], dict[str, Any]], Callable[[Path], list[Path]]]] = {
-    "splats": (describe_splat_file, splat_files),
-    "cameras": (describe_camera_file, lambda path: camera_source(path).files),
-    "features": (lambda path: describe_packs(read_features(path)), lambda path: [path]),
-    "masks": (describe_masks, lambda path: [path]),
-    "table": (describe_table, lambda path: [path]),
-    "lift": (describe_lift_file, _files_of_lift),
-    "photos": (describe_photos, lambda path: [path]),
+DESCRIPTIONS: dict[str, Callable[[Path], dict[str, Any]]] = {  # by kind
+    "splats": describe_splat_file,
+    "cameras": describe_camera_file,
+    "features": lambda path: describe_packs(read_features(path)),
+    "masks": describe_masks,
+    "table": describe_table,
+    "lift": lambda path: describe_lift(open_lift(path)),
+    "photos": describe_photos,
 }

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from liftcore.errors import InvalidInput, SplatliftError, Unavailable
-from liftcore.evaluate.accuracy import centred_cosines, cosine_figures, rendered_scores, shared_pixels
+from liftcore.evaluate.accuracy import centred_cosines, cosine_figures, shared_pixels
 from liftcore.evaluate.class_masks import read_masks
 from liftcore.evaluate.hardware import hardware, peak_memory
 from liftcore.evaluate.ranking import accuracy_of, choose
@@ -320,8 +320,10 @@ def _accuracy_figures(
     accuracies: dict[str, Any] = {"centred_cosine": cosines, "intersections": [], "unions": [], "phrase_iou": []}
     if spec.labelled:
         masks, classes = spec.scene.truth(cameras)
+        # Rendering is linear: (A X) C^T = A (X C^T). The norm of A X is left out, as no argmax depends on it.
+        products = result.features.to(torch.float32) @ classes.to(torch.float32).T
         for view in spec.labelled:
-            scores = in_photo(cameras[view], lambda of: rendered_scores(raster, of, result.features, classes, params))
+            scores = in_photo(cameras[view], lambda of: raster.render(of, products, params))
             shared, unions = shared_pixels(_resized(scores.argmax(dim=2), masks[view]), masks[view], len(classes))
             accuracies["intersections"].append(shared.tolist())
             accuracies["unions"].append(unions.tolist())

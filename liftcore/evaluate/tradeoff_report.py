@@ -46,11 +46,38 @@ class SpeedComparison:
 
     def lines(self) -> list[str]:
         """Return the table, the verdict and the conditions as lines of Markdown."""
-        return page_of(self.document)
+        views, not_run = self.document["views"], ", ".join(self.document["over_budget"])
+        over_budget = f" Not run for want of time: {not_run}." if not_run else ""
+        subset = "" if views["lifted"] == views["of"] else f" (every n-th of {views['of']}, to fit the budget)"
+        command, date, seconds = (self.document[name] for name in ("command", "date", "seconds"))
+        return [
+            *table_of(self.document),
+            "",
+            KEY,
+            "",
+            verdict_of(self.document),
+            "",
+            f"`{command}`, {date}, {seconds:.0f} s; {views['lifted']} views lifted{subset}, {views['held_out']} with "
+            f"features and {self.document['labelled_views']} with masks held out.{over_budget} "
+            f"{machine_line(self.document['hardware'])}",
+        ]
 
     def save(self, folder: Path) -> list[Path]:
         """Write ``tradeoff.json``, ``.png`` (a chart) and ``.md`` in a folder; return their paths."""
-        return save(self.document, folder)
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        folder.mkdir(parents=True, exist_ok=True)
+        data, chart, table = (folder / f"tradeoff.{ending}" for ending in ("json", "png", "md"))
+        with whole_file(data) as handle:
+            handle.write((json.dumps(self.document, indent=1, allow_nan=False) + "\n").encode())
+        figure = Figure(dpi=150, layout="constrained")  # no window is opened, no display is needed
+        draw(figure, self.document)
+        with whole_file(chart) as handle:
+            FigureCanvasAgg(figure).print_png(handle)
+        with whole_file(table) as handle:
+            handle.write(("\n".join(self.lines()) + "\n").encode())
+        return [data, chart, table]
 
 
 def compare_speeds(
@@ -101,43 +128,6 @@ def _check_chart() -> None:
         hint = "pip install 'splatlift[evaluate]'"
         expected = "the package matplotlib"
         raise Unavailable("chart of a trade-off", expected=expected, got=str(error), hint=hint) from None
-
-
-def save(document: Mapping[str, Any], out: Path) -> list[Path]:
-    """Write the three files; return their paths."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    out.mkdir(parents=True, exist_ok=True)
-    data, chart, table = (out / f"tradeoff.{ending}" for ending in ("json", "png", "md"))
-    with whole_file(data) as handle:
-        handle.write((json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
-    figure = Figure(dpi=150, layout="constrained")  # no window is opened, no display is needed
-    draw(figure, document)
-    with whole_file(chart) as handle:
-        FigureCanvasAgg(figure).print_png(handle)
-    with whole_file(table) as handle:
-        handle.write(("\n".join(page_of(document)) + "\n").encode())
-    return [data, chart, table]
-
-
-def page_of(document: Mapping[str, Any]) -> list[str]:
-    """Return the table, the verdict and the conditions as lines of Markdown."""
-    views, machine = document["views"], document["hardware"]
-    not_run = ", ".join(document["over_budget"])
-    over_budget = f" Not run for want of time: {not_run}." if not_run else ""
-    subset = "" if views["lifted"] == views["of"] else f" (every n-th of {views['of']}, to fit the budget)"
-    return [
-        *table_of(document),
-        "",
-        KEY,
-        "",
-        verdict_of(document),
-        "",
-        f"`{document['command']}`, {document['date']}, {document['seconds']:.0f} s; {views['lifted']} views lifted"
-        f"{subset}, {views['held_out']} with features and {document['labelled_views']} with masks held out."
-        f"{over_budget} {machine_line(machine)}",
-    ]
 
 
 def verdict_of(document: Mapping[str, Any]) -> str:

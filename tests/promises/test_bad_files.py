@@ -18,7 +18,17 @@ from liftcore import evaluate
 from liftcore.errors import InvalidMasks, InvalidPhotos, InvalidTable
 
 from tests import tiny_scene
-from tests.promises.bad_files import BAD_FILES, BAD_FOLDERS, BINARY, MODEL, SPLATS, BadFile, BadFolder, Intruder
+from tests.promises.bad_files import (
+    BAD_FILES,
+    BAD_FOLDERS,
+    BINARY,
+    MODEL,
+    SPLATS,
+    BadFile,
+    BadFolder,
+    Intruder,
+    table_of,
+)
 from tests.promises.command_line import error_line
 from tests.promises.tiny_files import write_files
 
@@ -88,6 +98,15 @@ def test_bad_folder_is_refused_in_one_line(row: BadFolder, tmp_path: Path) -> No
             READERS[row.kind][0](folder)
     assert_one_line(error.value, row.word)
     assert not Intruder.ran and not out.exists()
+
+
+def test_odd_table_is_described_or_refused(tmp_path: Path) -> None:
+    path = tmp_path / "upload"
+    path.write_bytes(table_of("[" * 100_000))
+    assert evaluate.inspect_file(path)["words"] == []
+    path.write_bytes(table_of(["a"], 0.0))
+    with pytest.raises(InvalidTable):
+        evaluate.inspect_file(path)
 
 
 @pytest.mark.parametrize("kind", READERS)
