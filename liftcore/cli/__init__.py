@@ -38,7 +38,7 @@ COMMANDS = {
     "tradeoff": "compare speed and accuracy on a scene",
 }
 SHARED = {  # modules of commands beside another one
-    "plan": "lift", "render": "export", "encode": "pack",
+    "plan": "lift", "transfer": "lift", "render": "export", "encode": "pack", "objects": "segment",
     **dict.fromkeys(("inspect", "check", "tradeoff"), "evaluate"),
 }  # fmt: skip
 SERVICE_COMMANDS = {  # modules of the package service

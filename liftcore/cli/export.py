@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.cli import options as common
-from liftcore.cli.objects import named_tree
 from liftcore.cli.reply import check_outputs, reply, write_files
-from liftcore.cli.segment import encoder_and_words
+from liftcore.cli.segment import encoder_and_words, named_tree
 from liftcore.errors import InvalidInput, InvalidQuery
 
 if TYPE_CHECKING:
@@ -77,7 +76,7 @@ def run(options: argparse.Namespace) -> int:
         }
     if suffix != ".ply" and content not in CONTENT_BY_SUFFIX.values() and scene.splats.kernel != "3dgs":
         document["warnings"] = [
-            f"{scene.splats.kernel} splats are paths as the nearest Gaussians, the only kernel of this format"
+            f"{scene.splats.kernel} splats are written as the nearest Gaussians, the only kernel of this format"
         ]
     reply(document, as_json=options.json)
     return 0

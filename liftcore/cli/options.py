@@ -6,6 +6,7 @@ import argparse
 import json
 import textwrap
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, Self, Union, get_args, get_origin
@@ -58,7 +59,9 @@ class Parser(argparse.ArgumentParser):
         self.add_options()
         required = [action for action in self._actions if action.required or not action.option_strings]
         words = [*self.prog.split(), "[options]", *map(_usage_of, required)]
-        self.usage, self.formatter_class = " ".join(filter(None, words)), _OptionLines
+        self.usage = " ".join(filter(None, words))
+        # Wide enough for the longest options of most commands.
+        self.formatter_class = partial(argparse.HelpFormatter, max_help_position=30)
         return super().format_help()
 
     def parse_known_args(  # pyright: ignore[reportIncompatibleMethodOverride]: it has overloads
@@ -78,13 +81,6 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         self.exit(BAD_INPUT, f"{self.prog}: {' '.join(message.split())}; see '{self.prog} --help'\n")
-
-
-class _OptionLines(argparse.HelpFormatter):
-    """The format of a help: wide enough for the longest options of most commands."""
-
-    def __init__(self, prog: str) -> None:
-        super().__init__(prog, max_help_position=30)
 
 
 def _usage_of(action: argparse.Action) -> str:

@@ -1,4 +1,4 @@
-"""``splatlift segment``: label every splat with the best of many words, or list the best words for an example."""
+"""``splatlift segment`` and ``objects``: label splats with words, and list the objects of a lift with their names."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from liftcore import Scene, TextEncoder
+    from liftcore.models import SceneTree
 
 
 def add_arguments(parser: common.Parser) -> None:
@@ -91,3 +92,54 @@ def _lines(document: dict[str, Any]) -> Iterable[str]:
     unlabelled = f"{answer['none']} of {answer['splats']} splats have no word"
     yield f"{len(answer['named_words'])} of {document['words']} words found; {unlabelled}"
     yield from lines_of(document)
+
+
+def add_arguments_objects(parser: common.Parser) -> None:
+    """Add the options of the command ``objects``."""
+    parser.add_argument("lift", type=Path, help="a lift (.safetensors)")
+    parser.add_argument("--vocabulary", type=Path, metavar="FILE", help="names: words, or a text table")
+    common.add_encoder(parser)
+    parser.add_argument("--tree", action="store_true", help="list parts and groups too")
+    common.add_world(parser)
+    parser.add_argument("--csv", type=Path, metavar="CSV", help="write the objects as a table")
+    parser.add_argument("--into", type=Path, metavar="FOLDER", help="write a PLY of each object")
+    common.add_splats(parser)
+
+
+def run_objects(options: argparse.Namespace) -> int:
+    """List the objects, or all nodes of the tree, and write the requested files."""
+    files = outputs_of(options)
+    from liftcore import Scene
+
+    scene = Scene(options.lift, splats=options.splats, world=common.world_of(options))
+    check_outputs(files, options, scene)
+    encoder, tree = named_tree(options, scene)
+    exports: dict[str, Any] = {"csv": partial(scene.export, source=tree, content="csv")}
+    if not options.tree:
+        tree = tree.model_copy(update={"count": len(tree.objects), "nodes": tree.objects})
+    names = {node.id: "-".join(["object", *map(str, node.path)]) for node in tree.nodes}
+    if options.into:
+        files |= {name: options.into / f"{name}.ply" for name in names.values()}
+        exports |= {name: partial(scene.export, source=number) for number, name in names.items()}
+        check_outputs(files, options, scene)
+    document: dict[str, Any] = {"encoder": None if encoder is None else encoder.name}
+    document |= {"answer": tree.model_dump(mode="json"), "files": write_files(files, exports)}
+    lines = [document["answer"]["explanation"], *lines_of(document)]
+    reply(document, as_json=options.json, lines=lines)
+    return 0
+
+
+def named_tree(options: argparse.Namespace, scene: Scene) -> tuple[TextEncoder | None, SceneTree]:
+    """Return the encoder of the names, None without names; and the lift's objects with parts and groups."""
+    encoder, words = _vocabulary(options, scene)
+    return encoder, scene.tree(words, encoder=encoder)
+
+
+def _vocabulary(options: argparse.Namespace, scene: Scene) -> tuple[TextEncoder | None, list[str]]:
+    """Return the encoder and the words; None and no words if objects get no names."""
+    if options.vocabulary is None and not options.table and not options.encoder and scene.table is None:
+        return None, []
+    if options.vocabulary is not None and options.vocabulary.suffix == ".safetensors":
+        encoder = scene.encoder(f"table:{options.vocabulary}")
+        return encoder, scene.words(encoder)
+    return encoder_and_words(options, scene, options.vocabulary, "--vocabulary")
