@@ -41,8 +41,8 @@ from liftcore.query.result import LiftResult as LiftResult
 from liftcore.query.result import load_lift as load_lift
 from liftcore.query.scene import Scene as Scene
 from liftcore.query.segment import Segmentation as Segmentation
-from liftcore.runtime.commands import load_command as load_command
 from liftcore.runtime.device import choose_device as choose_device
+from liftcore.runtime.lazy_names import load_command as load_command
 from liftcore.runtime.version import __version__ as __version__
 from liftcore.scene.cameras import Camera as Camera
 from liftcore.scene.cameras import Cameras as Cameras

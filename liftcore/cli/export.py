@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from liftcore import Answer, Scene, Segmentation
     from liftcore.models import SceneTree
 
-CONTENT_BY_SUFFIX = {".json": "masks"}  # other suffixes: splats with labels
-
 
 def add_arguments(parser: common.Parser) -> None:
     """Add the options of the command."""
@@ -49,8 +47,7 @@ def add_arguments_render(parser: common.Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Write the scene, and describe the file."""
     suffix = options.output.suffix.lower()
-    content = CONTENT_BY_SUFFIX.get(suffix, "labelled")
-    kind = "json" if content == "masks" else "splats"
+    content, kind = ("masks", "json") if suffix == ".json" else ("labelled", "splats")
     if options.only and not options.text:
         raise InvalidInput("--only", expected="--text as well", got="no --text", hint="use --object ID")
     files, scene = {"output": options.output}, common.open_lift(options)
@@ -74,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
         document |= {
             name: len(labels.document[name]) for name in ("classes", "instances", "nodes") if name in labels.document
         }
-    if suffix != ".ply" and content not in CONTENT_BY_SUFFIX.values() and scene.splats.kernel != "3dgs":
+    if suffix != ".ply" and content != "masks" and scene.splats.kernel != "3dgs":
         document["warnings"] = [
             f"{scene.splats.kernel} splats are written as the nearest Gaussians, the only kernel of this format"
         ]

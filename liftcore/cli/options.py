@@ -20,10 +20,8 @@ if TYPE_CHECKING:
     from liftcore.models import Body
 
 BAD_INPUT = 2
-ROLES = {  # kind of file of each argument
-    "splats": "splats", "cameras": "cameras", "features": "features", "lift": "lift", "table": "table",
-}  # fmt: skip
 ORDER = ("splats", "cameras", "features")
+ROLES = (*ORDER, "lift", "table")  # arguments of files of that kind
 ORDERED = ("lift", "plan", "check", "tradeoff")  # commands that take splats, cameras and features
 PRESETS = "default, row-sum, tikhonov, argmax or top-k"
 
@@ -99,15 +97,15 @@ def wrong_kind_error(options: argparse.Namespace) -> InvalidInput | None:
     from liftcore.files import identify, wrong_kind
 
     paths = {name: paths_of(getattr(options, name, None)) for name in ROLES}
-    for name, kind in ROLES.items():
+    for name in ROLES:
         is_ordered = options.command in ORDERED and name in ORDER
         argument = name.upper() if is_ordered or name == "lift" else f"--{name}"
         for path in paths[name]:
-            error = wrong_kind(path, kind, InvalidInput, expected=f"{kind} as {argument}")
+            error = wrong_kind(path, name, InvalidInput, expected=f"{name} as {argument}")
             if error is None:
                 continue
             other_kinds = (identify(path).kind for other in ORDER if other != name for path in paths[other])
-            if is_ordered and kind in other_kinds:
+            if is_ordered and name in other_kinds:
                 hint = "the order is SPLATS CAMERAS FEATURES"
                 error = InvalidInput(error.argument, expected=error.expected, got=error.got, hint=hint)
             return error

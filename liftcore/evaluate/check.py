@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from liftcore.features.encoders.encode import find_images, read_image, readings_of
+from liftcore.features.encoders.encode import find_images, read_image
 from liftcore.features.smoothness import smoothness, unlike_maps
 from liftcore.io.cameras import read_cameras
 from liftcore.io.photos import PhotoHeader, orientation_warnings, read_header
@@ -143,15 +143,15 @@ def _check(
 ) -> CheckReport:
     trained = CompositingParams(antialiased=settings.antialiased is True)
     wrong: list[str] = []
-    contradicting = rendering_warnings(splats.render_mode, trained.antialiased, splats.kernel)
-    notes = [f"splats: {text}" for text in (*contradicting, *splats.warnings)]
-    notes += [f"cameras: {text}" for text in cameras.warnings]
+    of_splats = *rendering_warnings(splats.render_mode, trained.antialiased, splats.kernel), *splats.warnings
+    notes = [*(f"splats: {text}" for text in of_splats), *(f"cameras: {text}" for text in cameras.warnings)]
     if trained.antialiased:
         notes.append(f"splats: rendered antialiased: {rendering_reason(splats.render_mode, True)}")
     files = _paired_photos(photos, cameras, features is not None, wrong, notes)
     sizes = {name: cameras[name].photo_size for name in files}
     headers = {name: read_header(file) for name, file in files.items()}
-    notes += [f"photos: {line}" for line in orientation_warnings(readings_of(headers, sizes), "their cameras")]
+    readings = {name: header.reading(sizes[name]) for name, header in headers.items()}
+    notes += [f"photos: {line}" for line in orientation_warnings(readings, "their cameras")]
     misshapen, found_wrong = _other_shapes(headers, sizes)
     wrong += found_wrong
     comparable = {name: file for name, file in files.items() if name not in misshapen}

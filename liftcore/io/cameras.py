@@ -18,6 +18,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+import numpy as np
+
 from liftcore.errors import InvalidCameras, Unavailable, naming, reading
 from liftcore.io.colmap import MODEL_FILES, has_model, is_whole, model_files, read_colmap, read_image_names
 from liftcore.io.files import BROKEN_ZIP, files_in_zip, first_bytes, is_zip, open_regular, open_zip
@@ -249,9 +251,9 @@ def _parse_inria(document: list[Any], source: str) -> Cameras:
             fx, fy = (number(record[key], key) for key in ("fx", "fy"))
         with reading(f"{source} camera {name!r}", InvalidPose, "a pose"):
             rotation = matrix(record["rotation"], (3,), 3, "rotation")
-            (position,) = matrix([record["position"]], (1,), 3, "position")
-        pose = viewmat_of(rotation, position)
-        return Camera.pinhole(name, width, height, fx, fy, width / 2, height / 2, viewmat=pose)
+            position = matrix([record["position"]], (1,), 3, "position")
+        viewmat = viewmat_of(np.concatenate([rotation, position.T], axis=1), "opencv")
+        return Camera.pinhole(name, width, height, fx, fy, width / 2, height / 2, viewmat)
 
     views, warnings = read_views(zip(names, document, strict=True), camera)
     return Cameras(views, warnings=warnings)

@@ -67,9 +67,9 @@ LOD_META = "lod-meta.json"  # of a streamed SOG
 class FileKind:
     """The kind of a file or folder, in the words of an error."""
 
-    kind: str | None  # splats, cameras, photos (a zip or folder), features, masks, table or lift; None: none of these
     name: str  # as errors have it behind "got"
     hint: str = ""  # remedy
+    kind: str | None = None  # splats, cameras, photos (a zip or folder), features, masks, table, lift; None: no such
     format: SplatFormat | None = None  # of splats
     splats: tuple[str, ...] = ()  # splat files in a folder or zip, the one to give first
     recognised: bool = True  # False: only its first bytes are known
@@ -81,27 +81,24 @@ class FileKind:
 
 
 _WEB_PAGE = FileKind(
-    None, "a web page", f"{DOWNLOAD}; of a viewer export the splats as .ply or .sog, from SuperSplat's editor"
+    "a web page", f"{DOWNLOAD}; of a viewer export the splats as .ply or .sog, from SuperSplat's editor"
 )
-_PICKLE = FileKind(None, "a Python pickle, which may run code when it is opened", EXPORT_PLY)
-_GLTF = FileKind(None, "a glTF model without splats (KHR_gaussian_splatting)", f"a mesh has none: {NOT_CONVERTED}")
+_PICKLE = FileKind("a Python pickle, which may run code when it is opened", EXPORT_PLY)
+_GLTF = FileKind("a glTF model without splats (KHR_gaussian_splatting)", f"a mesh has none: {NOT_CONVERTED}")
 _USD = FileKind(
-    None,
     "a USD scene",
     "USD is written and not read: give the splats as .ply or .glb",
 )
 _STREAMED = FileKind(
-    None, "a streamed SOG, whose levels of detail lie in many files", "give the .ply or .sog that it was made of"
+    "a streamed SOG, whose levels of detail lie in many files", "give the .ply or .sog that it was made of"
 )
-_PICTURE = FileKind(None, "a picture")
-_VIDEO = FileKind(
-    None, "a video", "take frames of it, reconstruct their cameras with COLMAP, and train splats on them"
-)
-_MESH = FileKind(None, "a mesh", TRAINED)
-_ARCHIVE = FileKind(None, "an archive", UNPACK)
+_PICTURE = FileKind("a picture")
+_VIDEO = FileKind("a video", "take frames of it, reconstruct their cameras with COLMAP, and train splats on them")
+_MESH = FileKind("a mesh", TRAINED)
+_ARCHIVE = FileKind("an archive", UNPACK)
 _PACK_ARRAYS = "of features, 'splatlift pack npy' makes a pack of a folder of them"
-_ARRAY = FileKind(None, "a NumPy array", f"{_PACK_ARRAYS}; of splats, export PLY")
-_ARRAYS = FileKind(None, "NumPy arrays (.npz)", f"save each as .npy; {_PACK_ARRAYS}")
+_ARRAY = FileKind("a NumPy array", f"{_PACK_ARRAYS}; of splats, export PLY")
+_ARRAYS = FileKind("NumPy arrays (.npz)", f"save each as .npy; {_PACK_ARRAYS}")
 _OF_ARRAYS = {  # by the kind that was expected, what to do with arrays in its place
     "cameras": "of VGGT give the COLMAP model (demo_colmap.py writes it), of others a transforms.json of the poses; "
     "in Python Camera(viewmat, K, width, height) takes them as they are",
@@ -111,7 +108,6 @@ _OF_ARRAYS = {  # by the kind that was expected, what to do with arrays in its p
     "masks": f"save each as .npy; {_PACK_ARRAYS}",
 }
 _TILES = FileKind(
-    None,
     "a tileset of 3D Tiles, which lists the tiles of a scene for a map",
     "give the splats, a .glb of its tiles, and the cameras that they were trained with",
 )
@@ -126,7 +122,7 @@ _REPLACEMENTS = {  # by the kind that was expected and the one that came, what t
 }
 # By the bytes at a place of a file. Of two that fit the first counts.
 _MAGIC: tuple[tuple[int, bytes, FileKind], ...] = (
-    (0, LFS_POINTER, FileKind(None, "a Git LFS pointer, which stands for the file", LFS_HINT)),
+    (0, LFS_POINTER, FileKind("a Git LFS pointer, which stands for the file", LFS_HINT)),
     *((0, magic, _ARCHIVE) for magic in (
         b"\x1f\x8b", b"7z\xbc\xaf\x27\x1c", b"Rar!\x1a\x07", b"\xfd7zXZ\x00", b"BZh", b"\x28\xb5\x2f\xfd",
     )),
@@ -144,7 +140,7 @@ _MAGIC: tuple[tuple[int, bytes, FileKind], ...] = (
 )  # fmt: skip
 # By the suffix, if the content is ambiguous.
 _BY_SUFFIX: dict[str, FileKind] = {
-    ".ksplat": FileKind(None, "splats in GaussianSplats3D's .ksplat format", CONVERT),
+    ".ksplat": FileKind("splats in GaussianSplats3D's .ksplat format", CONVERT),
     **dict.fromkeys((".usdz", ".usdc", ".usda", ".usd"), _USD),
     **dict.fromkeys((".html", ".htm"), _WEB_PAGE),
     **dict.fromkeys((".obj", ".fbx", ".stl"), _MESH),
@@ -155,16 +151,16 @@ _BY_SUFFIX: dict[str, FileKind] = {
 # By keys of a JSON object. Of two that fit the first counts.
 _BY_KEYS = (
     ({"tree", "filenames"}, _STREAMED),
-    ({"frames"}, FileKind("cameras", "cameras")),
+    ({"frames"}, FileKind("cameras", kind="cameras")),
     (
         {"transform", "scale"},
-        FileKind(None, f"the frame of a nerfstudio run ({FRAME_FILE})", "give the cameras that it belongs to"),
+        FileKind(f"the frame of a nerfstudio run ({FRAME_FILE})", "give the cameras that it belongs to"),
     ),
-    ({"asset", "accessors"}, FileKind(None, "a .gltf, which is not one file", "make one .glb of it")),
+    ({"asset", "accessors"}, FileKind("a .gltf, which is not one file", "make one .glb of it")),
     ({"root", "geometricError"}, _TILES),
     (
         {"annotations", "images"},
-        FileKind(None, "masks as JSON (COCO)", "'splatlift pack prompts' makes a feature pack of its folder"),
+        FileKind("masks as JSON (COCO)", "'splatlift pack prompts' makes a feature pack of its folder"),
     ),
 )
 _COLMAP_POINTS = ("points3D.bin", "points3D.txt", "frames.bin", "rigs.bin", "frames.txt", "rigs.txt")
@@ -206,14 +202,12 @@ def identify(path: Path | str) -> FileKind:
         if stat.S_ISDIR(mode):
             return _folder(path)
         if not stat.S_ISREG(mode):
-            return FileKind(None, "no regular file (a device, pipe or socket)", "give the file itself")
+            return FileKind("no regular file (a device, pipe or socket)", "give the file itself")
         return _file(path)
     except FileNotFoundError:
-        return FileKind(None, "no such file or folder", recognised=False)
+        return FileKind("no such file or folder", recognised=False)
     except (OSError, ValueError) as error:
-        return FileKind(
-            None, f"one that does not open ({getattr(error, 'strerror', None) or error})", recognised=False
-        )
+        return FileKind(f"one that does not open ({getattr(error, 'strerror', None) or error})", recognised=False)
 
 
 # ---- files
@@ -224,7 +218,7 @@ def _file(path: Path) -> FileKind:  # noqa: PLR0911 - a rule each
         head, size = handle.read(MAX_HEADER_BYTES), handle.seek(0, 2)
     suffix = path.suffix.lower()
     if not head:
-        return FileKind(None, "an empty file", "copy or export it again")
+        return FileKind("an empty file", "copy or export it again")
     if path.name in (*MODEL_FILES, *_COLMAP_POINTS):
         return _colmap_part(path)
     if head[:4] in (b"ply\n", b"ply\r"):
@@ -234,7 +228,7 @@ def _file(path: Path) -> FileKind:  # noqa: PLR0911 - a rule each
     if head[:2] == b"PK" and is_zip(path):
         return _zip(path)
     if head[:4] == b"PK\3\4":
-        return FileKind(None, "a zip that is cut short or damaged", "copy or download it again")
+        return FileKind("a zip that is cut short or damaged", "copy or download it again")
     if suffix == ".safetensors" or (head[8:9] == b"{" and int.from_bytes(head[:8], "little") < size):
         return _safetensors(path)
     is_text = not any(byte < 9 or 13 < byte < 32 for byte in head[:HEAD_BYTES])
@@ -242,22 +236,22 @@ def _file(path: Path) -> FileKind:  # noqa: PLR0911 - a rule each
     is_unknown = by_content is None and suffix not in _BY_SUFFIX
     if suffix == ".splat" or (is_unknown and looks_like_splat(head, size)):
         return _splats_as(SplatFormat.SPLAT)
-    unknown = FileKind(None, f"a file that begins with {first_bytes(head)}", recognised=False)
+    unknown = FileKind(f"a file that begins with {first_bytes(head)}", recognised=False)
     return by_content or _BY_SUFFIX.get(suffix, unknown)
 
 
 def _splats_as(splat_format: SplatFormat) -> FileKind:
     pickled = "a checkpoint or another Python pickle, which may run code when it is opened"
-    return FileKind("splats", pickled if splat_format is SplatFormat.CHECKPOINT else "splats", format=splat_format)
+    name = pickled if splat_format is SplatFormat.CHECKPOINT else "splats"
+    return FileKind(name, kind="splats", format=splat_format)
 
 
 def _ply(head: bytes) -> FileKind:
     lines = head.partition(b"end_header")[0].decode("latin1").splitlines()
     if cloud := cloud_without_splats(lines):
-        return FileKind(None, *cloud)
+        return FileKind(*cloud)
     first = next((line.split()[1:2] for line in lines if line.startswith("element ")), [])
-    splat_format = SplatFormat.COMPRESSED_PLY if first == ["chunk"] else SplatFormat.PLY
-    return FileKind("splats", "splats", format=splat_format)
+    return _splats_as(SplatFormat.COMPRESSED_PLY if first == ["chunk"] else SplatFormat.PLY)
 
 
 def _safetensors(path: Path) -> FileKind:
@@ -267,7 +261,7 @@ def _safetensors(path: Path) -> FileKind:
         with safe_open(str(path), framework="np") as handle:
             keys, metadata = set(handle.keys()), handle.metadata() or {}
     except (SafetensorError, OSError) as error:
-        return FileKind(None, f"one that does not open ({str(error)[:120]})", recognised=False)
+        return FileKind(f"one that does not open ({str(error)[:120]})", recognised=False)
     parts = {key.rpartition("/")[2] for key in keys}
     signs = {
         "lift": LIFT_KEY in metadata, "table": keys == {"embeddings"}, "masks": "mask" in parts,
@@ -275,10 +269,10 @@ def _safetensors(path: Path) -> FileKind:
     }  # fmt: skip
     kind = next((kind for kind, fits in signs.items() if fits), None)
     if kind is not None:
-        return FileKind(kind, kind)
+        return FileKind(kind, kind=kind)
     tensors = ", ".join(repr(key[:40]) for key in sorted(keys)[:3]) or "no tensor"
     hint = "weights of an encoder go to --weights or the encoder's name; 'splatlift pack' makes feature packs"
-    return FileKind(None, f"a safetensors file of {tensors}", hint)
+    return FileKind(f"a safetensors file of {tensors}", hint)
 
 
 def _by_magic(head: bytes) -> FileKind | None:
@@ -302,18 +296,18 @@ def _by_text(path: Path, head: bytes, size: int) -> FileKind | None:
 
 
 def _colmap_part(path: Path) -> FileKind:
-    is_model = path.name in MODEL_FILES
-    return FileKind("cameras" if is_model else None, "a part of a COLMAP model", "give the folder that it lies in")
+    kind = "cameras" if path.name in MODEL_FILES else None
+    return FileKind("a part of a COLMAP model", "give the folder that it lies in", kind)
 
 
 def _json(path: Path, size: int) -> FileKind:
     if size > MAX_JSON_BYTES:
-        return FileKind(None, f"a JSON file of {size} bytes", recognised=False)
+        return FileKind(f"a JSON file of {size} bytes", recognised=False)
     try:
         with open_regular(path) as handle:
             document = json.loads(handle.read(MAX_JSON_BYTES))
     except (ValueError, RecursionError, MemoryError):
-        return FileKind("cameras", "JSON that does not parse", recognised=False)
+        return FileKind("JSON that does not parse", kind="cameras", recognised=False)
     return _document(document, path)
 
 
@@ -322,17 +316,17 @@ def _document(document: Any, path: Path) -> FileKind:
     if isinstance(document, list):
         first = document[0] if document and isinstance(document[0], dict) else {}
         if not document or first.keys() & {"img_name", "transform", "file_path"}:
-            return FileKind("cameras", "cameras")
+            return FileKind("cameras", kind="cameras")
         if "segmentation" in first:
             hint = "'splatlift pack masks' or 'splatlift pack prompts' makes a feature pack of its folder"
-            return FileKind(None, "masks as JSON", hint)
-        return FileKind(None, "a JSON list of something else", recognised=False)
+            return FileKind("masks as JSON", hint)
+        return FileKind("a JSON list of something else", recognised=False)
     if not isinstance(document, dict):
-        return FileKind(None, f"JSON ({str(document)[:TEXT_SHOWN]!r})", recognised=False)
+        return FileKind(f"JSON ({str(document)[:TEXT_SHOWN]!r})", recognised=False)
     if is_sog_document(document):
         return _splats_as(SplatFormat.SOG)
     listing = ", ".join(map(str, list(document)[:5]))[:TEXT_SHOWN]
-    unknown = FileKind(None, f"a JSON object with {listing or 'nothing'}", recognised=False)
+    unknown = FileKind(f"a JSON object with {listing or 'nothing'}", recognised=False)
     by_suffix = _BY_SUFFIX.get(path.suffix.lower(), unknown)
     return next((kind for keys, kind in _BY_KEYS if document.keys() >= keys), by_suffix)
 
@@ -347,14 +341,14 @@ def _zip(path: Path) -> FileKind:
             splats = _splat_files(files, lambda name: _begins_with_splats(archive.open(files[name])))
             return _of_names_in_zip([*files], splats)
     except BROKEN_ZIP as error:
-        return FileKind(None, f"a zip that does not open ({str(error)[:120]})", recognised=False)
+        return FileKind(f"a zip that does not open ({str(error)[:120]})", recognised=False)
 
 
 def _of_names_in_zip(names: list[str], splats: tuple[str, ...]) -> FileKind:  # noqa: PLR0911 - a rule each
     lasts = {name.rpartition("/")[2] for name in names}
     suffixes = {PurePosixPath(last).suffix.lower() for last in lasts}
     if not names:
-        return FileKind(None, "a zip without a file", "zip or export it again")
+        return FileKind("a zip without a file", "zip or export it again")
     if LOD_META in lasts:
         return _STREAMED
     if sog_folder(names) is not None:
@@ -366,9 +360,9 @@ def _of_names_in_zip(names: list[str], splats: tuple[str, ...]) -> FileKind:  # 
     if suffixes == {".npy"}:
         return _ARRAYS
     if any(CAMERA_FILES.search(name) for name in names):
-        return FileKind("cameras", "a zip of cameras", splats=splats)
+        return FileKind("a zip of cameras", kind="cameras", splats=splats)
     if not splats and suffixes & IMAGE_SUFFIXES:
-        return FileKind("photos", "photos")
+        return FileKind("photos", kind="photos")
     if interesting := splats or tuple(name for name in names if name.endswith(".safetensors")):
         return _zip_with(interesting)
     return replace(_zip_with(names), hint="unzip it and give the file itself")
@@ -378,7 +372,7 @@ def _zip_with(names: Sequence[str]) -> FileKind:
     """Return a zip with files of interest, the first of which is the one to give."""
     several = f" and {len(names) - 1} more" if len(names) > 1 else ""
     splats = tuple(name for name in names if name.lower().endswith((*HTTP_SUFFIXES, *PICKLED)))
-    return FileKind(None, f"a zip with {names[0]}{several} in it", f"unzip it and give {names[0]}", splats=splats)
+    return FileKind(f"a zip with {names[0]}{several} in it", f"unzip it and give {names[0]}", splats=splats)
 
 
 def _begins_with_splats(file: IO[bytes]) -> bool:
@@ -414,21 +408,21 @@ def _folder(path: Path) -> FileKind:  # noqa: PLR0911 - a rule each
     splats = _splat_files(names, lambda name: _has_splats(path / name))
     label = f"a folder with {len(splats)} files of splats in it" if len(splats) > 1 else ""
     if _has_cameras(path):
-        return FileKind("cameras", label or "a folder of cameras", splats=splats)
+        return FileKind(label or "a folder of cameras", kind="cameras", splats=splats)
     if splats:
-        return FileKind(None, label or "a folder of splats", f"give {path / splats[0]}", splats=splats)
+        return FileKind(label or "a folder of splats", f"give {path / splats[0]}", splats=splats)
     suffixes = {PurePosixPath(name).suffix.lower() for name in names}
     if all(any(name.endswith(end) for name in names) for end in ("_f.npy", "_s.npy")):
         hint = f"'splatlift pack langsplat {path} -o PACK.safetensors' makes a feature pack of it"
-        return FileKind(None, "a folder of LangSplat's features", hint)
+        return FileKind("a folder of LangSplat's features", hint)
     if ".npy" in suffixes:
         hint = f"'splatlift pack npy {path}' or 'splatlift pack masks {path}' makes a feature pack of it"
-        return FileKind(None, "a folder of NumPy arrays", hint)
+        return FileKind("a folder of NumPy arrays", hint)
     if tensors := [path / name for name in names if name.endswith(".safetensors")]:
-        return FileKind(None, "a folder with safetensors files in it", f"give the file itself, such as {tensors[0]}")
+        return FileKind("a folder with safetensors files in it", f"give the file itself, such as {tensors[0]}")
     if suffixes & IMAGE_SUFFIXES:
-        return FileKind("photos", "a folder of photos")
-    return FileKind(None, "a folder without any of them" if names else "an empty folder", recognised=False)
+        return FileKind("a folder of photos", kind="photos")
+    return FileKind("a folder without any of them" if names else "an empty folder", recognised=False)
 
 
 def _has_cameras(path: Path) -> bool:

@@ -69,6 +69,12 @@ class PhotoHeader(NamedTuple):
         (width, height), (across, down) = self.stored, size or self.stored
         return self.orientation >= LEAST_SIDEWAYS and (width - height) * (across - down) < 0
 
+    def reading(self, size: tuple[int, int] | None) -> Reading:
+        """Return the orientation in which a photo with a camera or masks of this size is read."""
+        if self.orientation == UPRIGHT:
+            return Reading.UPRIGHT
+        return Reading.ORIENTED if self.turns_for(size) else Reading.STORED
+
 
 def orientation_warnings(readings: Mapping[str, Reading], counterparts: str) -> list[str]:
     """Return warnings of how photos with an EXIF orientation were read."""

@@ -61,7 +61,6 @@ UNDISTORT = (
     "undistort the photos first (OpenCV does it, or 'colmap image_undistorter' where there is a COLMAP model), train "
     "and lift on them, and write their fl_x, fl_y, cx and cy without distortion"
 )
-LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])  # of a rigid pose
 OF_NERFSTUDIO = ("applied_transform", "ply_file_path")  # fields that only its own converter writes
 EXPORTED = ("file_path", "transform")  # of each camera of an export
 FOCALS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
@@ -153,12 +152,8 @@ def _camera(name: str, keys: ChainMap[str, Any], source: str, photos: PhotosBesi
         width, height = _size(keys, photos)
         intrinsics = _intrinsics(keys, width, height)
     with reading(location, InvalidPose, "a pose"):
-        rows = matrix(keys.get("transform_matrix"), (3, 4), 4, "transform_matrix")
-        if len(rows) == 4 and np.abs(rows[3] - LAST_ROW).max() > 1e-6:
-            got = " ".join(f"{value:g}" for value in rows[3])
-            raise ValueError(f"0 0 0 1 as the last row of transform_matrix, got {got}")
-    pose = viewmat_of(rows[:3, :3] * CAMERA_AXES["opengl"], rows[:3, 3])
-    camera = Camera.pinhole(name, width, height, *intrinsics, viewmat=pose)
+        pose = matrix(keys.get("transform_matrix"), (3, 4), 4, "transform_matrix")
+    camera = Camera.pinhole(name, width, height, *intrinsics, viewmat=viewmat_of(pose, "opengl"))
     return behind_lens(camera, distortion)
 
 

@@ -227,7 +227,7 @@ class LiftResult(Lift):
             InvalidInput: required splats or cameras are missing, or not those of the lift.
             Unavailable: no package with the page is installed.
         """
-        from liftcore.runtime.commands import load_command
+        from liftcore.runtime.lazy_names import load_command
 
         load_command("view").show(self, splats, cameras, port=port, browser=browser)
 

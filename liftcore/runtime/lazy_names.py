@@ -1,4 +1,4 @@
-"""Lazy import of a package's names, as its stub lists them."""
+"""Late imports: names of a package, as its stub lists them, and commands of the service, which may be missing."""
 
 import re
 import sys
@@ -6,6 +6,9 @@ from collections.abc import Callable
 from functools import cache
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
+
+from liftcore.errors import Unavailable
 
 
 def lazy_names(package: str, file: str) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
@@ -34,3 +37,12 @@ def lazy_names(package: str, file: str) -> tuple[Callable[[str], object], Callab
         return sorted({*vars(sys.modules[package]), *read_stub()})
 
     return get, names
+
+
+def load_command(name: str) -> ModuleType:
+    """Import the module of a command of the service, where that is installed."""
+    try:
+        return import_module(f"service.commands.{name}")
+    except ModuleNotFoundError as error:
+        hint = "the package 'service' has it: pip install 'splatlift[service]', or run make setup in a checkout"
+        raise Unavailable(repr(name), expected=f"the package {error.name}", got="none", hint=hint) from error

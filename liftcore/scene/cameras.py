@@ -152,10 +152,7 @@ class Camera:
         if pose_matrix.shape not in ((4, 4), (3, 4)):
             expected, got = "a finite 4x4 or 3x4 matrix", f"shape {list(pose_matrix.shape)}"
             raise InvalidCameras(f"camera {name!r} pose", expected=expected, got=got)
-        viewmat = viewmat_of(pose_matrix[:3, :3] * CAMERA_AXES[convention], pose_matrix[:3, 3])
-        if len(pose_matrix) == 4:
-            viewmat[3] = pose_matrix[3]  # refused if it is no pose's
-        return cls(viewmat, K, width, height, name=name)
+        return cls(viewmat_of(pose_matrix, convention), K, width, height, name=name)
 
     def transformed(self, matrix: Numbers) -> Camera:
         """Return the camera in another frame of the world, ``p' = scale R p + translation`` (`Splats.transformed`).
@@ -394,13 +391,14 @@ class Cameras(Mapping[str, Camera]):
         return tuple(name for name, camera in self._by_name.items() if camera.lens is not None)
 
 
-def viewmat_of(camera_to_world: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """Return [4, 4] f64 of a camera's axes in the world, [3, 3], and its centre, [3]; a ``Camera`` validates it."""
-    pose = np.eye(4)
-    pose[:3, :3] = camera_to_world.T
+def viewmat_of(pose: np.ndarray, convention: Convention) -> np.ndarray:
+    """Return [4, 4] f64 of a camera's pose in the world, [4, 4] or [3, 4]; a ``Camera`` validates it, row 4 too."""
+    viewmat, rotation = np.eye(4), (pose[:3, :3] * CAMERA_AXES[convention]).T
+    viewmat[:3, :3] = rotation
     with np.errstate(over="ignore", invalid="ignore"):  # an overflow is not finite, and is refused as such
-        pose[:3, 3] = -camera_to_world.T @ centre
-    return pose
+        viewmat[:3, 3] = -rotation @ pose[:3, 3]
+    viewmat[3] = pose[3] if len(pose) == 4 else viewmat[3]
+    return viewmat
 
 
 def read_views(

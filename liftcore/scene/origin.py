@@ -37,7 +37,7 @@ def local_origin(means: np.ndarray | Tensor, log_scales: np.ndarray | Tensor) ->
     Args:
         means: [P, 3] floats, frame and unit of the file. log_scales: [P, 2 or 3], log of scene units.
     """
-    middle, extent = _middle_and_extent(means)
+    middle, extent = middle_and_extent(means)
     reach, size = float(np.abs(middle).max()), usual_size(log_scales)
     if not MIN_DISTANCE * extent < reach <= FARTHEST or float32_step(reach) <= COARSE * size:
         return FILE_ORIGIN
@@ -53,13 +53,8 @@ def float32_step(reach: float) -> float:
 
 def lies_apart(means: np.ndarray) -> bool:
     """Return True if splats are far enough from their file's origin to need one of their own, by means alone."""
-    middle, extent = _middle_and_extent(means)
+    middle, extent = middle_and_extent(means)
     return float(np.abs(middle).max()) > MIN_DISTANCE * extent
-
-
-def extent_of_most(means: np.ndarray | Tensor) -> float:
-    """Return the largest side of the box about the middle 80% of the finite means [P, 3], scene units; 0 of none."""
-    return _middle_and_extent(means)[1]
 
 
 def usual_size(log_scales: np.ndarray | Tensor) -> float:
@@ -69,8 +64,8 @@ def usual_size(log_scales: np.ndarray | Tensor) -> float:
     return float(np.exp(np.median(sizes).clip(max=LARGEST_SCALE))) if len(sizes) else 0.0
 
 
-def _middle_and_extent(means: np.ndarray | Tensor) -> tuple[np.ndarray, float]:
-    """Return the middle [3] of the finite means, and the largest side of the box about most; zeros of none."""
+def middle_and_extent(means: np.ndarray | Tensor) -> tuple[np.ndarray, float]:
+    """Return the middle [3] of the finite means, and the largest side of the box about 80% of them; zeros of none."""
     places = _sample(means)
     places = places[np.isfinite(places).all(axis=1)]
     low, middle, high = np.quantile(places, MIDDLE, axis=0) if len(places) else np.zeros((3, 3))

@@ -21,7 +21,7 @@ from liftcore.errors import InvalidInput, InvalidSplats, reading
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.harmonics import SH_C0, band_rotation
 from liftcore.scene.kernel import DARK_LOBE, LOBE_COLOURS, NORMALS, Kernel, kernel_named, scale_count
-from liftcore.scene.origin import FILE_ORIGIN, Origin, extent_of_most, float32_step, local_origin, usual_size
+from liftcore.scene.origin import FILE_ORIGIN, Origin, float32_step, local_origin, middle_and_extent, usual_size
 from liftcore.scene.quaternions import product_matrix
 from liftcore.scene.render_mode import RenderMode, RenderModel, render_mode_of
 from liftcore.scene.similarity import Similarity
@@ -336,7 +336,7 @@ def _activation_warnings(columns: Mapping[str, Tensor]) -> list[str]:
             "all opacities lie between 0 and 1, as if they were no logits: sigmoid makes them 0.5 to 0.73; if they "
             "are opacities o, give log(o / (1 - o))"
         )
-    spacing = extent_of_most(columns["means"]) / len(columns["means"]) ** 0.5
+    spacing = middle_and_extent(columns["means"])[1] / len(columns["means"]) ** 0.5
     if bool((columns["log_scales"] > 0).all()) and usual_size(columns["log_scales"]) > WIDEST * spacing:
         warnings.append(
             "all scales are above 0, as if they were no logarithms: exp makes them larger than 1; if they are "

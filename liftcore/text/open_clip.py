@@ -36,6 +36,7 @@ class OpenedModel:
     """A model with its weights."""
 
     name: str  # ``open_clip:MODEL/TAG``, or ``open_clip:MODEL`` for weights of a file
+    text_space: str  # the name, with the path of a file of weights, as queries open it
     model_name: str  # open_clip's name of the architecture
     model: Any  # open_clip's module, both towers
 
@@ -52,8 +53,10 @@ def open_model(kind: str, spec: str) -> OpenedModel:
         hint = nearest(model_name, model_names, 3)
         raise InvalidQuery(label, expected="a model of open_clip", got=repr(model_name), hint=hint)
     if at:
-        return OpenedModel(f"open_clip:{model_name}", model_name, _from_file(label, model_name, Path(file)))
-    return OpenedModel(f"open_clip:{model_name}/{tag}", model_name, _from_tag(label, kind, model_name, tag))
+        name, model = f"open_clip:{model_name}", _from_file(label, model_name, Path(file))
+        return OpenedModel(name, f"{name}@{Path(file).resolve()}", model_name, model)
+    name = f"open_clip:{model_name}/{tag}"
+    return OpenedModel(name, name, model_name, _from_tag(label, kind, model_name, tag))
 
 
 def create_model(model_name: str, pretrained: str) -> Any:

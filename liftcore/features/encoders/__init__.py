@@ -77,8 +77,9 @@ def open_image_encoder(spec: str, device: str = "cpu") -> ImageEncoder:
 
         return TimmEncoder.open(rest, torch_device)
     from liftcore.features.encoders.clip import ClipImageEncoder
+    from liftcore.text.open_clip import open_model
 
-    return ClipImageEncoder.open(rest, torch_device)
+    return ClipImageEncoder(open_model("maskclip", rest), torch_device)
 
 
 def device_named(name: str) -> torch.device:

@@ -7,8 +7,7 @@ Other towers (SigLIP, MobileCLIP, ConvNeXt) encode crops of masks (`liftcore.fea
 """
 
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,7 +15,7 @@ from torch.nn import functional
 
 from liftcore.errors import InvalidInput
 from liftcore.features.encoders import Pixels
-from liftcore.text.open_clip import OpenedModel, library, open_model
+from liftcore.text.open_clip import OpenedModel, library
 
 RESNET_PATCH = 32  # pixels, the stride of a ResNet's last feature map
 
@@ -24,9 +23,9 @@ RESNET_PATCH = 32  # pixels, the stride of a ResNet's last feature map
 class ClipImageEncoder:
     """Dense features of open_clip models by MaskCLIP (``ImageEncoder``)."""
 
-    def __init__(self, clip_model: OpenedModel, text_space: str, device: torch.device) -> None:
+    def __init__(self, clip_model: OpenedModel, device: torch.device) -> None:
         self.name = f"maskclip:{clip_model.name.removeprefix('open_clip:')}"
-        self.text_space = text_space
+        self.text_space = clip_model.text_space
         self._tower = clip_model.model.visual.to(device).float().eval()
         self._device = device
         self._dense = _dense(clip_model.model_name, self._tower)
@@ -36,22 +35,10 @@ class ClipImageEncoder:
             probe = self._dense(self._tower, torch.zeros(1, 3, self.pixels.patch, self.pixels.patch, device=device))
         self.channels = int(probe.shape[-1])
 
-    @classmethod
-    def open(cls, spec: str, device: torch.device) -> Self:
-        """Load ``MODEL/PRETRAINED_TAG`` or ``MODEL@WEIGHTS_FILE``."""
-        clip_model = open_model("maskclip", spec)
-        return cls(clip_model, space_of(clip_model, spec), device)
-
     def encode(self, images: Tensor) -> Tensor:
         """Encode images [n, 3, h p, w p] f32 as grids [n, h, w, F] f32 on the CPU."""
         with torch.inference_mode():
             return self._dense(self._tower, images.to(self._device)).to("cpu", torch.float32).clone()
-
-
-def space_of(clip_model: OpenedModel, spec: str) -> str:
-    """Return the text space of a model: its name, with the path of a file of weights, as queries open it."""
-    _, at, file = spec.partition("@")
-    return f"{clip_model.name}@{Path(file).resolve()}" if at else clip_model.name
 
 
 def _dense(model_name: str, tower: Any) -> Callable[[Any, Tensor], Tensor]:

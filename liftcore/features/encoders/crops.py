@@ -20,7 +20,7 @@ from torch.nn import functional
 
 from liftcore.errors import InvalidInput, reading
 from liftcore.features.encoders import Pixels
-from liftcore.features.encoders.clip import space_of, training_pixels
+from liftcore.features.encoders.clip import training_pixels
 from liftcore.features.encoders.encode import prepare, read_image
 from liftcore.features.masks import labels_alone
 from liftcore.io.photos import Reading
@@ -35,9 +35,9 @@ BATCH = 32  # crops encoded at once
 class CropEncoder:
     """Encoder of whole images by an open_clip model."""
 
-    def __init__(self, clip_model: OpenedModel, text_space: str, device: torch.device) -> None:
+    def __init__(self, clip_model: OpenedModel, device: torch.device) -> None:
         self.name = clip_model.name
-        self.text_space = text_space
+        self.text_space = clip_model.text_space
         self._tower = clip_model.model.visual.to(device).float().eval()
         self._device = device
         side, mean, std, interpolation = training_pixels(clip_model.model, self._tower)
@@ -49,8 +49,7 @@ class CropEncoder:
         kind, _, rest = spec.partition(":")
         if kind != "open_clip" or not rest:
             raise InvalidInput("encoder", expected=SPEC, got=repr(spec))
-        clip_model = open_model(kind, rest)
-        return cls(clip_model, space_of(clip_model, rest), device)
+        return cls(open_model(kind, rest), device)
 
     def encode(self, images: Tensor) -> Tensor:
         """Encode images [n, 3, side, side] f32, prepared by `pixels`, as unit vectors [n, F] f32 on the CPU."""

@@ -3,7 +3,7 @@
 Photos are read in the orientation of their cameras (`liftcore.io.photos`).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from liftcore.features.encoders import ImageEncoder, Pixels, open_image_encoder
 from liftcore.features.folders import files_below, folders_of, grids_of
 from liftcore.io.cameras import read_cameras
 from liftcore.io.files import check_output, writing
-from liftcore.io.photos import ORIENTATION, UPRIGHT, PhotoHeader, Reading, header_of, open_photo, orientation_warnings
+from liftcore.io.photos import ORIENTATION, Reading, header_of, open_photo, orientation_warnings
 from liftcore.runtime.arguments import as_path, as_paths
 from liftcore.runtime.folders import scratch_folder
 from liftcore.runtime.progress import Progress, shown_progress
@@ -96,12 +96,8 @@ def encode_images(
                     cells = cells.to(torch.float16)
                 np.save(files[name], cells.numpy())
                 reporter("encode", count, len(photos), "views")
-            metadata = {
-                "encoder": model.name,
-                "text_space": model.text_space,
-                "normalised": "true" if normalised else "false",
-            }
-            write_pack(file, grids_of(files), metadata, reporter)
+            names = {"encoder": model.name, "text_space": model.text_space}
+            write_pack(file, grids_of(files), names | {"normalised": str(normalised).lower()}, reporter)
         size_bytes = file.stat().st_size
     warnings = orientation_warnings(readings, "their cameras")
     if wide:
@@ -116,8 +112,7 @@ def encode_images(
         "channels": model.channels,
         "patch": model.pixels.patch,
         "size": size or model.pixels.shorter,
-        "encoder": model.name,
-        "text_space": model.text_space,
+        **names,
         "normalised": normalised,
         "warnings": warnings,
     }
@@ -162,23 +157,12 @@ def read_image(path: Path | str, size: tuple[int, int] | None = None) -> tuple[I
     """
     with open_photo(Path(path)) as image:
         header = header_of(image)
-        orientation = _reading(header, size)
+        orientation = header.reading(size)
         image.load()
         if image.format == "TIFF" and orientation is Reading.STORED:  # which Pillow turned as it was loaded
             image.getexif()[ORIENTATION] = TURNED_BACK.get(header.orientation, header.orientation)
             return _colours(ImageOps.exif_transpose(image)), orientation
         return _colours(ImageOps.exif_transpose(image) if orientation is Reading.ORIENTED else image), orientation
-
-
-def readings_of(headers: Mapping[str, PhotoHeader], sizes: Mapping[str, tuple[int, int]]) -> dict[str, Reading]:
-    """Return the orientation that photos are read in by view, for cameras of these sizes."""
-    return {view: _reading(header, sizes.get(view)) for view, header in headers.items()}
-
-
-def _reading(header: PhotoHeader, size: tuple[int, int] | None) -> Reading:
-    if header.orientation == UPRIGHT:
-        return Reading.UPRIGHT
-    return Reading.ORIENTED if header.turns_for(size) else Reading.STORED
 
 
 def _colours(image: Image.Image) -> Image.Image:

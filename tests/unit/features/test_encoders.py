@@ -240,8 +240,8 @@ class Holder(nn.Module):
 
 
 def small_encoder(tower: Any) -> ClipImageEncoder:
-    model = OpenedModel("open_clip:small/tag", "small", Holder(tower))
-    return ClipImageEncoder(model, model.name, torch.device("cpu"))
+    model = OpenedModel("open_clip:small/tag", "", "small", Holder(tower))
+    return ClipImageEncoder(model, torch.device("cpu"))
 
 
 @cache

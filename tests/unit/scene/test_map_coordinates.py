@@ -157,7 +157,7 @@ def test_cameras_whose_rotation_has_few_digits_stand_where_their_file_says() -> 
     camera = random_camera(9)
     rotation = camera.viewmat[:3, :3].T.astype(np.float32).astype(np.float64)
     rotation[:, 0] *= 1 + 1e-5  # as of a file with five digits
-    far_camera = camera.replace(viewmat=viewmat_of(rotation, UTM))
+    far_camera = camera.replace(viewmat=viewmat_of(np.column_stack([rotation, UTM]), "opencv"))
     assert np.abs(far_camera.centre - UTM).max() < 1e-6
     assert np.abs(far_camera.about((500_000.0, 5_400_000.0, 256.0)).centre - (0.25, 0.5, 44.125)).max() < 1e-2
     assert far_camera.about(FILE_ORIGIN) is far_camera
