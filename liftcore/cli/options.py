@@ -23,6 +23,7 @@ BAD_INPUT = 2
 ORDER = ("splats", "cameras", "features")
 ROLES = (*ORDER, "lift", "table")  # arguments of files of that kind
 ORDERED = ("lift", "plan", "check", "tradeoff")  # commands that take splats, cameras and features
+MAX_DIGITS = 100  # of a whole number, with zeros before it
 PRESETS = "default, row-sum, tikhonov, argmax or top-k"
 
 
@@ -272,19 +273,15 @@ def view_of(options: argparse.Namespace, *pictures: str) -> Any:
     return cameras[options.view] if options.view is not None else next(iter(cameras.values()))
 
 
-def count(text: str) -> int:
-    """Parse a whole number of one or more."""
-    value = int(text) if text.isascii() and text.isdigit() else 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"expected a whole number of one or more, got {text!r}")
-    return value
-
-
-def whole_number(text: str) -> int:
+def whole_number(text: str, least: int = 0, largest: int = 2**63 - 1, expected: str = "a whole number") -> int:
     """Parse a whole number that a database can store."""
-    if not (text.isascii() and text.isdigit()) or int(text) >= 2**63:
-        raise argparse.ArgumentTypeError(f"expected a whole number, got {text[:80]!r}")
+    is_short = text.isascii() and text.isdigit() and len(text) < MAX_DIGITS
+    if not is_short or not least <= int(text) <= largest:
+        raise argparse.ArgumentTypeError(f"expected {expected}, got {text[:80]!r}")
     return int(text)
+
+
+count = partial(whole_number, least=1, expected="a whole number of one or more")
 
 
 def encoder_spec(options: argparse.Namespace) -> str | None:

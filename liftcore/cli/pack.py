@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import Parser, count, option_errors
+from liftcore.cli.options import Parser, count, option_errors, whole_number
 from liftcore.cli.reply import list_folders, reply, short_text
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ NAMES = {
     "normalised": "--no-normalised",
     **{name: f"--{name}" for name in ("device", "encoder", "names", "photos", "unlabelled")},
 }  # of arguments
-LARGEST_GREY = 65_535  # of a picture of 16 bits
+GREY = partial(whole_number, largest=65_535, expected="a whole number from 0 to 65535")  # of a picture of 16 bits
 
 
 def add_arguments(parser: Parser, shared: Parser) -> None:
@@ -34,14 +35,14 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
     arrays.add_argument("--map-fit", choices=fits, default=argparse.SUPPRESS, help=fit)
     masks = formats.add_parser("masks", parents=[shared], help="IMG.npy, a vector a mask, with JSON or pictures")
     unlabelled = "of pixels without a mask"
-    masks.add_argument("--unlabelled", type=_grey, default=0, metavar="VALUE", help=f"{unlabelled}; default 0")
+    masks.add_argument("--unlabelled", type=GREY, default=0, metavar="VALUE", help=f"{unlabelled}; default 0")
     masks.add_argument("--encoder", metavar="SPEC", help="of the vectors of crops: open_clip:MODEL/TAG")
     photos = "photos of --encoder, or their folders"
     masks.add_argument("--photos", type=Path, nargs="+", metavar="PATH", help=photos)
     masks.add_argument("--device", default="cpu", metavar="NAME", help="of the model, as torch names it")
     prompts = formats.add_parser("prompts", parents=[shared], help="masks by phrase: PHRASE/VIEW.png or JSON")
     prompts.add_argument("--names", type=Path, metavar="FILE", help='of values, JSON: {"1": "red mug"}')
-    prompts.add_argument("--unlabelled", type=_grey, metavar="VALUE", help=unlabelled)
+    prompts.add_argument("--unlabelled", type=GREY, metavar="VALUE", help=unlabelled)
     unannotated = "images: left out, or without phrases"
     prompts.add_argument("--unannotated", choices=("skip", "negative"), default="skip", help=unannotated)
     retag = formats.add_parser("retag", parents=[shared], help="a pack with other names of its encoder or text space")
@@ -71,13 +72,6 @@ def add_arguments_encode(parser: Parser) -> None:
     parser.add_argument("--normalised", action=argparse.BooleanOptionalAction, default=True, help=unit)
 
 
-def _grey(text: str) -> int:
-    value = int(text) if text.isascii() and text.isdigit() and len(text) <= 5 else LARGEST_GREY + 1
-    if value > LARGEST_GREY:
-        raise argparse.ArgumentTypeError(f"expected a whole number from 0 to {LARGEST_GREY}, got {text!r}")
-    return value
-
-
 def run(options: argparse.Namespace) -> int:
     """Write the pack, completely or not at all, and describe it."""
     if options.format == "retag":
@@ -105,9 +99,7 @@ def run_encode(options: argparse.Namespace) -> int:
     values = {name: getattr(options, name) for name in names}
     with option_errors({name: f"--{name}" for name in ("encoder", "device", "size")}):
         document = encode_images(options.images, options.output, options.encoder, **values, progress=True)
-    line = f"{document['out']}: {document['views']} views, {document['channels']} channels, {document['bytes']} bytes"
-    lines = [line, *list_folders(document["folders"]), *(f"warning: {text}" for text in document["warnings"])]
-    reply(document, as_json=options.json, lines=lines)
+    reply(document, as_json=options.json, lines=_lines(document))
     return 0
 
 
@@ -127,8 +119,9 @@ def _retag(options: argparse.Namespace) -> int:
 
 def _lines(document: dict[str, Any]) -> Iterator[str]:
     yield f"{document['out']}: {document['views']} views, {document['channels']} channels, {document['bytes']} bytes"
-    yield f"  {short_text(document['sizes'])}"
-    if document["words"]:
+    if "sizes" in document:
+        yield f"  {short_text(document['sizes'])}"
+    if document.get("words"):
         yield f"  {len(document['words'])} words: {short_text(document['words'])}"
     yield from list_folders(document["folders"])
     yield from (f"warning: {warning}" for warning in document["warnings"])

@@ -35,7 +35,7 @@ from liftcore.values.views import NO_LABEL, Regions
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from liftcore.values.lift import Lift, LiftMetadata
+    from liftcore.values.lift import Lift
     from liftcore.values.pack import Views
     from liftcore.values.views import ViewFeatures
 
@@ -281,24 +281,21 @@ def _pack_warnings(packs: Views, facts: list[_ViewFacts], low: float, high: floa
 def describe_lift(lift: Lift) -> dict[str, Any]:
     """Return counts, ranges, provenance and warnings of a lift."""
     metadata = lift.metadata
-    count, channels = len(lift), lift.rows.shape[1]
-    feature_share = float(lift.has_feature.float().mean())
-    diagnostics = lift.diagnostics
     return {
-        "splats": count,
-        "channels": channels,
+        "splats": len(lift),
+        "channels": lift.rows.shape[1],
         "dtype": str(lift.rows.dtype).removeprefix("torch."),
-        "feature_share": feature_share,
+        "feature_share": float(lift.has_feature.float().mean()),
         "total_weight": _ends(lift.total_weight),
         "encoder": metadata.encoder,
         "text_space": metadata.text_space,
         "views": len(metadata.views),
         "settings": metadata.settings.model_dump(mode="json"),
-        "diagnostics": diagnostics,
+        "diagnostics": lift.diagnostics,
         "timings": metadata.timings,
         "version": metadata.version,
         "inputs": [file.path for file in (metadata.splats, metadata.cameras, *metadata.features)],
-        "warnings": _lift_warnings(lift, metadata),
+        "warnings": _lift_warnings(lift),
     }
 
 
@@ -309,8 +306,8 @@ def _ends(values: torch.Tensor) -> dict[str, float]:
     return {"min": float(low), "mean": float(values.mean()), "max": float(high)}
 
 
-def _lift_warnings(lift: Lift, metadata: LiftMetadata) -> list[str]:
-    count = len(lift)
+def _lift_warnings(lift: Lift) -> list[str]:
+    count, metadata = len(lift), lift.metadata
     unseen = int((~lift.has_feature).sum())
     is_bad = (~torch.isfinite(lift.rows)).any(dim=1)
     bad = int((is_bad if lift.code is None else is_bad[lift.code.long()]).sum())

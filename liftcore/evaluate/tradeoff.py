@@ -349,15 +349,10 @@ def _phrase_ious(spec: RunSpec, scene: Scene, masks: Mapping[str, Tensor]) -> li
 
 def _reference(spec: RunSpec, result: LiftResult) -> tuple[Tensor, Tensor]:
     """Return features [P, F] and total weight [P] of the exact run; empty before it."""
-    from safetensors.torch import load_file, save_file
-
-    path = spec.reference / "exact.safetensors"
+    path, tensors = spec.reference / "exact.pt", (result.features, result.total_weight)
     if spec.exact:
-        save_file({"features": result.features, "total_weight": result.total_weight}, path)
-    if not path.is_file():
-        return result.features[:0], result.total_weight[:0]
-    tensors = load_file(path)
-    return tensors["features"], tensors["total_weight"]
+        torch.save(tensors, path)
+    return torch.load(path, weights_only=True) if path.is_file() else (tensors[0][:0], tensors[1][:0])
 
 
 def _resized(labels: Tensor, mask: Tensor) -> Tensor:

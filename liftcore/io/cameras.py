@@ -318,7 +318,12 @@ def _unzip(archive: zipfile.ZipFile, folder: Path) -> list[str]:
     if (count := len(archive.infolist())) > MAX_ZIP_MEMBERS:
         raise ValueError(f"at most {MAX_ZIP_MEMBERS} files, got {count}")
     files = files_in_zip(archive)
-    of_cameras = {name: member for name, member in files.items() if _is_of_cameras(PurePosixPath(name).name)}
+    lasts = {name: PurePosixPath(name).name for name in files}
+    of_cameras = {
+        name: files[name]
+        for name, last in lasts.items()
+        if last in (*MODEL_FILES, FRAME_FILE) or _is_transforms(last)
+    }
     if (size := sum(member.file_size for member in of_cameras.values())) > MAX_UNZIPPED_BYTES:
         hint = "leave the points out of the zip"
         raise ValueError(f"at most {MAX_UNZIPPED_BYTES} bytes unzipped, got {size} bytes; {hint}")
@@ -327,10 +332,6 @@ def _unzip(archive: zipfile.ZipFile, folder: Path) -> list[str]:
         with archive.open(member) as source, (folder / name).open("wb") as sink:
             shutil.copyfileobj(source, sink)  # no more than the size that was added up
     return list(files)
-
-
-def _is_of_cameras(name: str) -> bool:
-    return name in (*MODEL_FILES, FRAME_FILE) or _is_transforms(name)
 
 
 def _is_transforms(name: str) -> bool:

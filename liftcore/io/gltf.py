@@ -26,7 +26,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.files import open_regular
 from liftcore.io.labels import COLUMN, IDS, stored_columns
 from liftcore.io.ply import MODEL
 from liftcore.io.quantised import MOST_GROWTH, Fields, gaussians_in, logits
@@ -36,7 +35,7 @@ from liftcore.scene.kernel import Kernel
 from liftcore.scene.origin import FILE_ORIGIN
 from liftcore.scene.quaternions import product_matrix, rotation_matrices
 from liftcore.scene.render_mode import mode_of_word
-from liftcore.scene.similarity import similarity_of
+from liftcore.scene.similarity import similarity_named
 from liftcore.scene.world import UPRIGHT, world_of
 
 if TYPE_CHECKING:
@@ -107,15 +106,13 @@ class _Asset:
     """An open file: its JSON, and its bytes as they lie in the file."""
 
     def __init__(self, path: Path) -> None:
-        with open_regular(path) as handle:
-            head = handle.read(20)
-        self.size = path.stat().st_size
+        content = np.memmap(path, np.uint8, "r")
+        self.size, head = len(content), content[:20].tobytes()
         if len(head) < 20 or head[16:20] != JSON_CHUNK or struct.unpack_from("<I", head, 4)[0] != 2:
             raise ValueError(f"a glTF 2.0 file that begins with JSON, got {head[4:20]!r}")
         end = 20 + int.from_bytes(head[12:16], "little")
         if end > min(MAX_JSON_BYTES, self.size):
             raise ValueError(f"at most {MAX_JSON_BYTES} bytes of JSON in the file, got {end}")
-        content = np.memmap(path, np.uint8, "r")
         is_binary = content[end + 4 : end + 8].tobytes() == BINARY_CHUNK
         self.binary = content[end + 8 :][: int.from_bytes(content[end : end + 4].tobytes(), "little") * is_binary]
         self.json: Any = json.loads(content[20:end].tobytes())
@@ -158,10 +155,7 @@ class _Asset:
         """Return the fields of one primitive, with its extras and warnings."""
         attributes, warnings = primitive["attributes"], _kernel_warnings(primitive)
         count = self._count(primitive)
-        try:
-            move = similarity_of(matrix)
-        except ValueError as error:
-            raise ValueError(f"a node's transform of {error}") from None
+        move = similarity_named("a node's transform", matrix)
         rotation = TO_FILE @ move.rotation
 
         def read(name: str, width: int) -> np.ndarray:

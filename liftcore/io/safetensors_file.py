@@ -10,6 +10,7 @@ import mmap
 import os
 import struct
 import sys
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -60,7 +61,7 @@ def check_header(path: Path) -> None:
 def _twice(pairs: list[tuple[str, Any]]) -> list[str]:
     """Return the names that an object has twice."""
     names = [name for name, _ in pairs]
-    return [name for name in names if names.count(name) > 1] if len({*names}) < len(names) else []
+    return [name for name, count in Counter(names).items() if count > 1] if len({*names}) < len(names) else []
 
 
 def write_tensors(path: Path, tensors: "Mapping[str, Tensor]", metadata: Mapping[str, str]) -> None:

@@ -29,7 +29,7 @@ from liftcore.scene.cameras import (
     viewmat_of,
 )
 from liftcore.scene.distortion import Distortion
-from liftcore.scene.similarity import similarity_of
+from liftcore.scene.similarity import similarity_named
 from liftcore.scene.views import cameras_of_views, view_names
 from liftcore.scene.world import UNKNOWN, WorldFrame
 
@@ -262,19 +262,12 @@ def read_frame(path: Path, applied: Mapping[str, Any], source: str) -> np.ndarra
         before = np.eye(4)
         if applied.get("applied_transform") is not None:
             before = _affine(applied["applied_transform"], "applied_transform")
-            _require_similarity(before, "applied_transform")
+            similarity_named("applied_transform", before)
         combined = transform @ np.linalg.inv(before)
         combined[:3] *= scale / _scale(applied.get("applied_scale", 1.0), "applied_scale")
     with reading(path, InvalidCameras, "the frame of a run"):
-        _require_similarity(combined, "transform")
+        similarity_named("transform", combined)
     return combined
-
-
-def _require_similarity(matrix: np.ndarray, name: str) -> None:
-    try:
-        similarity_of(matrix)
-    except ValueError as error:
-        raise ValueError(f"{name} of {error}") from None
 
 
 def _affine(value: Any, name: str) -> np.ndarray:

@@ -43,6 +43,14 @@ class Similarity:
         return self.scale * (points @ self.rotation.T) + self.translation
 
 
+def similarity_named(name: str, matrix: Numbers) -> Similarity:
+    """Return a similarity of its matrix; a ValueError names another one, and says what it is."""
+    try:
+        return similarity_of(matrix)
+    except ValueError as error:
+        raise ValueError(f"{name} of {error}") from None
+
+
 def similarity_of(matrix: Numbers) -> Similarity:
     """Return a similarity of its matrix, as `Similarity.of` does; a ValueError says what another matrix is."""
     numbers: Any = matrix

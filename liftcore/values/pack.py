@@ -75,7 +75,7 @@ class Views(Mapping[str, ViewFeatures]):
     _sources: Mapping[str, _Source] = field(repr=False)
     table: TableEncoder | None = None  # the packs' own words
     paths: tuple[Path, ...] = ()  # of the packs that it reads; () where views come from elsewhere
-    _cameras: Mapping[str, Camera] = field(default_factory=dict, repr=False)
+    _cameras: Mapping[str, Camera] = field(default_factory=dict, repr=False)  # of paired views
     _fit: str = ""  # of all grids, in place of those that are recorded
 
     @property
@@ -97,7 +97,7 @@ class Views(Mapping[str, ViewFeatures]):
         if features.codebook.shape[1] != self.channels:
             got = f"{features.codebook.shape[1]} in {view!r}"
             raise InvalidFeatures("features", expected=f"{self.channels} channels in every view", got=got)
-        camera = self.seeing(view)
+        camera = self._cameras.get(composed(view))
         if camera is None:
             return features
         window = self.window(view, camera)
@@ -117,7 +117,7 @@ class Views(Mapping[str, ViewFeatures]):
     def shapes(self, view: str) -> dict[str, tuple[int, ...]]:
         """Return the shapes of a view by part (labels and codebook, or grid), from the header alone."""
         shapes = dict(self._find(view).shapes)
-        camera = self.seeing(view)
+        camera = self._cameras.get(composed(view))
         if camera is None:
             return shapes
         if "labels" in shapes:
@@ -151,10 +151,6 @@ class Views(Mapping[str, ViewFeatures]):
     def only(self, views: Iterable[str]) -> "Views":
         """These of the views, as they are."""
         return replace(self, _sources={view: self._find(view) for view in views})
-
-    def seeing(self, view: str) -> Camera | None:
-        """Return the camera whose pinhole sees the view; None of views that are not paired."""
-        return self._cameras.get(composed(view))
 
     def _find(self, view: str) -> _Source:
         source = self._sources.get(composed(view))
