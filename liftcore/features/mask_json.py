@@ -95,8 +95,9 @@ def declared_size(content: Any) -> tuple[int, int] | None:
     return None
 
 
-def _text_of(record: Mapping[str, Any], *keys: str) -> str | None:
-    return next((text for text in map(record.get, keys) if isinstance(text, str) and text.strip()), None)
+def _text_of(record: Any, *keys: str) -> str | None:
+    texts = map(record.get, keys) if isinstance(record, dict) else ()
+    return next((text for text in texts if isinstance(text, str) and text.strip()), None)
 
 
 def _add_record(

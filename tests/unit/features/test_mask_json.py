@@ -251,6 +251,7 @@ def test_masks_with_vectors_may_be_polygons_or_have_a_unit_axis(tmp_path: Path) 
         {"shapes": [{"label": "mug", "points": [[1, 1], [4, 1], [4, 4]]}], "imagePath": "a.jpg"},
         {"videos": [{"id": 1, "file_names": ["a.jpg"]}], "annotations": [{"segmentations": [None]}]},
         {"annotations": [{"file_name": "a.png", "segments_info": [{"id": 1, "category_id": 1}]}]},
+        {"mask_name": "a.npy", "labels": {"1": []}},
     ],
 )
 def test_json_of_other_programs_is_refused_with_what_to_export(document: Any, tmp_path: Path) -> None:
