@@ -263,11 +263,9 @@ class Splats:
             if set(NORMALS) <= self.extras.keys():
                 normals = torch.stack([self.extras[name].double() for name in NORMALS], dim=1)
                 columns = (normals @ turn.T.to(normals.device)).unbind(dim=1)
-                kinds = [self.extras[name].dtype for name in NORMALS]
-                rotated_normals = {
-                    name: column.to(kind) for name, column, kind in zip(NORMALS, columns, kinds, strict=True)
-                }
-                fields["extras"] = {**self.extras, **rotated_normals}
+                fields["extras"] = dict(self.extras)
+                for name, column in zip(NORMALS, columns, strict=True):
+                    fields["extras"][name] = column.to(self.extras[name].dtype)
         return replace(self, **fields, origin=origin, world=self.world.transformed(move))
 
     def cpu(self) -> Splats:
