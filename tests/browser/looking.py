@@ -15,6 +15,7 @@ FIND_COLOUR = (
     "splatlift.query.questions.every(asked => asked.answer && (asked.objects.length || !asked.count)) && "
     "(!splatlift.viewer || splatlift.viewer.settled)"
 )
+BOTH_SETTLED = "splatlift.comparison.isLoaded && splatlift.comparison.left.settled && splatlift.viewer.settled"
 AMBER, SKY = "255,176,0", "56,182,255"  # colours of the first and the second question
 # Columns of the picture, in hundredths of its width, of pixels whose hue is near to a colour's.
 COLUMNS = """((wanted, near, canvas) => {
