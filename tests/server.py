@@ -40,12 +40,12 @@ def until(condition: Callable[[], Result | None], seconds: float = PATIENCE_SECO
     return value
 
 
-def wait_for_end(client: Any, job: str) -> dict[str, Any]:
-    """Poll the job at a path until it has ended; return it."""
+def wait_for_end(client: Any, job: str, *states: str) -> dict[str, Any]:
+    """Poll the job at a path until it is in one of the states, or has ended; return it."""
 
     def final_job() -> dict[str, Any] | None:
-        record = client.get(job).json()
-        return record if record["state"] in FINAL_STATES else None
+        record = client.get(job).raise_for_status().json()
+        return record if record["state"] in (*states, *FINAL_STATES) else None
 
     return until(final_job)
 
@@ -88,7 +88,7 @@ class Server:
 
     def __exit__(self, *exception: object) -> None:
         if self.is_alive():
-            self.kill()
+            self.end(signal.SIGKILL)
         self.client.close()
         until(lambda: not self.processes())  # nothing outlives its server
 
@@ -123,21 +123,10 @@ class Server:
         """Return True if it runs; a request may also be cut off while it lives."""
         return self._process is not None and self._process.poll() is None
 
-    def kill(self) -> None:
-        """SIGKILL, and wait for the end."""
-        assert self._process is not None
-        self._process.kill()
-        self.wait()
-
-    def stop(self) -> int:
-        """SIGTERM; return its exit status."""
-        assert self._process is not None
-        self._process.send_signal(signal.SIGTERM)
-        return self.wait()
-
-    def wait(self) -> int:
-        """Wait until it has ended; return its exit status."""
+    def end(self, number: signal.Signals) -> int:
+        """Send a signal to the HTTP process, and wait until it has ended; return its exit status."""
         assert self._process is not None and self._process.stdout is not None
+        self._process.send_signal(number)
         status = self._process.wait(PATIENCE_SECONDS)
         self._process.stdout.close()
         return status

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import random
 import zipfile
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from PIL import Image
 from liftcore.errors import InvalidInput, InvalidPhotos, NotFound
 from liftcore.io.photo_zip import describe_photos, photo_index
 from liftcore.io.photos import PhotosBeside
+from tests.promises.over_http import mutated
 
 METHODS = {
     "stored": zipfile.ZIP_STORED, "deflate": zipfile.ZIP_DEFLATED, "bzip2": zipfile.ZIP_BZIP2,
@@ -33,17 +33,6 @@ def photos_zip(method: str) -> bytes:
         for name in NAMES:
             archive.writestr(name, photo())
     return content.getvalue()
-
-
-def mutated(content: bytes, seed: int) -> bytes:
-    generator, mutant = random.Random(seed), bytearray(content)
-    for _ in range(generator.choice((1, 1, 3))):
-        place = generator.randrange(len(mutant))
-        if generator.random() < 0.8:
-            mutant[place] = generator.randrange(256)
-        else:
-            del mutant[place : place + generator.randrange(1, 9)]
-    return bytes(mutant)
 
 
 @pytest.mark.parametrize("method", METHODS)

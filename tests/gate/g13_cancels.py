@@ -53,7 +53,7 @@ def gate(options: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
         figures = f"{len(seconds)} {dict(kinds)}, slowest {max(seconds):.2f} s"
         verdicts.check("canceled within 2 s", max(seconds) < CANCEL_SECONDS, figures)
         verdicts.check("canceled: no process, no result; too late: refused", not broken, broken[:3])
-        verdicts.check("nothing lies in the scratch folders", not service.scratch(), service.scratch())
+        verdicts.check_rest(service)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,16 @@ def gate(_: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
     with Service(folder / "time", **{JOB_TIME: 1}) as service:
         work = scene(splats=60_000, views=40, width=480, channels=64)  # of a minute
         record = service.wait_for(service.order(service.upload(work)))
-        check_failure(service, record, "s", verdicts)
+        problem = record["problem"] or {}
+        is_failed = record["state"] == "failed" and "s" in problem.get("detail", "")
+        detail = problem.get("detail", record["state"])
+        verdicts.check("a job over its limit fails, and says so (s)", is_failed, detail)
+        deadline = time.monotonic() + IMPORT_SECONDS
+        while at_work := [pid for pid in service.children() if is_computing(pid)]:
+            if time.monotonic() > deadline:
+                break
+        verdicts.check("no process of it computes on", not at_work, len(at_work))
+        verdicts.check_rest(service)
     with Service(folder / "hang", **{JOB_TIME: 120}) as service:
         job = service.order(service.upload(long_scene()))
         service.wait_for(job, "running")
@@ -45,24 +54,7 @@ def gate(_: argparse.Namespace, folder: Path, verdicts: Verdicts) -> None:
             is_refused = reply.status_code == 422 and word in detail
             figures = f"{reply.status_code}: {detail[:90]}"
             verdicts.check(f"a check over its limit is refused, and says so ({word})", is_refused, figures)
-            verdicts.check("the service is alive and ready", service.client.get("/readyz").status_code == 200)
-            verdicts.check("nothing of it is left", not service.scratch(), service.scratch())
-
-
-def check_failure(service: Service, record: dict, word: str, verdicts: Verdicts) -> None:
-    """Judge a job that had to meet its limit."""
-    problem = record["problem"] or {}
-    is_failed = record["state"] == "failed" and word in problem.get("detail", "")
-    verdicts.check(
-        f"a job over its limit fails, and says so ({word})", is_failed, problem.get("detail", record["state"])
-    )
-    deadline = time.monotonic() + IMPORT_SECONDS
-    while at_work := [pid for pid in service.children() if is_computing(pid)]:
-        if time.monotonic() > deadline:
-            break
-    verdicts.check("no process of it computes on", not at_work, len(at_work))
-    verdicts.check("the service is alive and ready", service.client.get("/readyz").status_code == 200)
-    verdicts.check("nothing lies in the scratch folders", not service.scratch(), service.scratch())
+            verdicts.check_rest(service)
 
 
 def send_signal(pids: set[int], number: signal.Signals) -> None:

@@ -67,7 +67,7 @@ def crowd(service: Service, options: argparse.Namespace, verdicts: Verdicts) -> 
     verdicts.check("an upload beside it is not kept out for good", status in (201, 429, 503), status)
     for connection in tricklers + readers:
         connection.close()
-    verdicts.check("broken uploads leave nothing", not service.scratch(), service.scratch()[:3])
+    verdicts.check_rest(service)
     peak = usage(service)["peak_mb"]
     verdicts.check(f"the HTTP process stays below {PEAK_MB} MB", peak < PEAK_MB, f"{peak} MB at its peak; goal 120")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import signal
 import sys
 import tempfile
@@ -12,17 +11,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
-from tests.server import FINAL_STATES, Server, digest_of_lift, until
+from tests.server import Server, digest_of_lift, wait_for_end
 
 
 class Service(Server):
     """A service that takes scenes and orders; its process may be killed, stopped and started again."""
 
-    def end(self, number: signal.Signals) -> tuple[int, float]:
+    def timed_end(self, number: signal.Signals) -> tuple[int, float]:
         """Send a signal to the HTTP process; its status, and the seconds that it still lived."""
         start = time.monotonic()
-        os.kill(self.pid, number)
-        return self.wait(), time.monotonic() - start
+        return self.end(number), time.monotonic() - start
 
     def upload(self, files: dict[str, bytes]) -> dict[str, Any]:
         """Upload a scene; the body of an order of its lift."""
@@ -44,12 +42,7 @@ class Service(Server):
 
     def wait_for(self, job: str, *states: str) -> dict[str, Any]:
         """Poll the job until it is in one of the states, or has ended; return it."""
-
-        def final_job() -> dict[str, Any] | None:
-            record = self.client.get(f"/jobs/{job}").raise_for_status().json()
-            return record if record["state"] in (*states, *FINAL_STATES) else None
-
-        return until(final_job)
+        return wait_for_end(self.client, f"/jobs/{job}", *states)
 
     def digest(self, job: str) -> str:
         """Hash all of the lift of a job that does not tell of time."""
@@ -86,6 +79,12 @@ class Verdicts:
         """Judge a promise."""
         self.count, self.failures = self.count + 1, self.failures + (not holds)
         print("pass" if holds else "FAIL", promise, figures, flush=True)
+
+    def check_rest(self, service: Service) -> None:
+        """Judge readiness, and the folders for scratch."""
+        self.check("the service is alive and ready", service.client.get("/readyz").status_code == 200)
+        names = service.scratch()
+        self.check("nothing lies in the scratch folders", not names, names[:3])
 
 
 def run_gate(

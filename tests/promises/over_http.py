@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import random
 import re
 import zipfile
 from collections.abc import Iterator
@@ -74,6 +75,18 @@ def photos_zip(colour: tuple[int, int, int] = (9, 99, 199)) -> bytes:
     with zipfile.ZipFile(content, "w") as archive:
         archive.writestr("images/left.png", photo.getvalue())
     return content.getvalue()
+
+
+def mutated(content: bytes, seed: int) -> bytes:
+    """Return the bytes of a file changed or left out in one place or three."""
+    generator, mutant = random.Random(seed), bytearray(content)
+    for _ in range(generator.choice((1, 1, 3))):
+        place = generator.randrange(len(mutant))
+        if generator.random() < 0.8:
+            mutant[place] = generator.randrange(256)
+        else:
+            del mutant[place : place + generator.randrange(1, 9)]
+    return bytes(mutant)
 
 
 def array(content: bytes) -> np.ndarray:

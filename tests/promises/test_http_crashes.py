@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import signal
 import time
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -12,7 +12,7 @@ import pytest
 from tests.server import FINAL_STATES, Server, digest_of_lift, until, wait_for_end
 from tests.tiny_scene import TinyScene
 
-from .over_http import assert_problem, delete_lift, events_of, upload, upload_scene
+from .over_http import assert_problem, delete_lift, events_of
 
 pytestmark = pytest.mark.slow
 
@@ -54,36 +54,36 @@ def job_killed(server: Server, order: dict[str, Any], count: int) -> tuple[str, 
 
 
 def test_killed_or_stopped_server_finishes_each_job_once_with_the_same_digest(
-    client: httpx.Client, lift: dict[str, Any], tiny: TinyScene, encoder: str, tmp_path: Path
-) -> None:
-    undisturbed = digest_of_lift(client, lift["links"]["self"])
-    with Server(tmp_path / "data", encoder=encoder) as server:
-        body = upload_scene(server.client, tiny)
-
-        def order_job(key: str) -> httpx.Response:
-            return server.client.post("/lift", json=body, headers={"Idempotency-Key": key})
-
-        jobs = [order_job("0").headers["location"]]
-        for end in (server.kill, server.stop):
-            until(lambda: server.client.get(jobs[0]).json()["state"] in ("running", *FINAL_STATES))
-            if end == server.kill:
-                jobs.append(order_job("1").headers["location"])  # at once before
-            assert end() in (None, 0)
-            until(lambda: not server.processes())  # its children end with it
-            server.start()
-        for number, job in enumerate(jobs):
-            record = wait_for_end(server.client, job)
-            assert (record["state"], record["attempt"]) == ("succeeded", 1)  # faults of the server do not count
-            assert order_job(str(number)).headers["location"] == job
-            assert times_succeeded(server.client, job) == 1
-            assert digest_of_lift(server.client, record["links"]["lift"]) == undisturbed
-        assert len(server.client.get("/lifts").json()["lifts"]) == len(jobs)
-        assert server.client.get(f"/assets/{body['splats']}/content").content == tiny.splats
-
-
-def test_job_whose_process_is_killed_goes_on_until_its_third_attempt(
     server: Server, order: dict[str, Any], lift: dict[str, Any], tiny: TinyScene
 ) -> None:
+    client, undisturbed = server.client, digest_of_lift(server.client, lift["links"]["self"])
+
+    def order_job(key: str) -> httpx.Response:
+        return client.post("/lift", json=order, headers={"Idempotency-Key": key})
+
+    before = {entry["id"] for entry in client.get("/lifts").json()["lifts"]}
+    jobs = [order_job("0").headers["location"]]
+    for number, status in ((signal.SIGKILL, -signal.SIGKILL), (signal.SIGTERM, 0)):
+        wait_for_end(client, jobs[0], "running")
+        if number == signal.SIGKILL:
+            jobs.append(order_job("1").headers["location"])  # at once before
+        assert server.end(number) == status
+        until(lambda: not server.processes())  # its children end with it
+        server.start()
+    for key, job in enumerate(jobs):
+        record = wait_for_end(client, job)
+        assert (record["state"], record["attempt"]) == ("succeeded", 1)  # faults of the server do not count
+        assert order_job(str(key)).headers["location"] == job
+        assert times_succeeded(client, job) == 1
+        assert digest_of_lift(client, record["links"]["lift"]) == undisturbed
+    ids = {job.removeprefix("/jobs/") for job in jobs}
+    assert {entry["id"] for entry in client.get("/lifts").json()["lifts"]} == before | ids
+    assert client.get(f"/assets/{order['splats']}/content").content == tiny.splats
+    for job in ids:
+        delete_lift(client, job)
+
+
+def test_job_whose_process_is_killed_goes_on_until_its_third_attempt(server: Server, order: dict[str, Any]) -> None:
     client = server.client
     once, _ = job_killed(server, order, 1)
     assert (wait_for_end(client, once)["state"], times_succeeded(client, once)) == ("succeeded", 1)
@@ -93,12 +93,4 @@ def test_job_whose_process_is_killed_goes_on_until_its_third_attempt(
     assert record["problem"]["type"] == "/problems/crashed" and record["problem"]["detail"]
     assert_problem(client.get(f"/lifts/{record['id']}"), 404)
     assert client.delete(always).status_code == 204
-
-    # What else a child does works again: checks and questions.
-
-    server.kill_children()
-    answer = until(lambda: client.get("/query", params={"lift": lift["id"], "text": "lamp"}).json().get("count"))
-    assert answer == 20
-    table = upload(client, "table", tiny.table)
-    assert client.delete(f"/assets/{table}").status_code == 204
     until(lambda: client.get("/readyz").status_code == 200)  # for the tests that share the server

@@ -14,7 +14,7 @@ import pytest
 from tests.server import Server, until
 from tests.tiny_scene import TinyScene, colmap_zip, labels, masks, ply, splat_rows, text_table
 
-from .over_http import NO_ASSET, assert_problem, photos_zip, upload
+from .over_http import INPUTS, NO_ASSET, assert_problem, mutated, photos_zip, upload
 
 SCENE = TinyScene(
     ply(splat_rows()[::-1]), colmap_zip(), masks({}), text_table(words=("fig", "mug", "pen"))
@@ -90,6 +90,18 @@ def test_bad_file_is_refused_with_reasons_and_leaves_nothing(client: httpx.Clien
     assert client.get("/assets").json() == before
     assert_problem(client.get(f"/assets/sha256:{hashlib.sha256(content).hexdigest()}"), 404)
     until(lambda: stored_files(server) == stored, seconds=120)
+
+
+@pytest.mark.parametrize("kind", [*INPUTS, "table"])
+def test_changed_upload_is_stored_or_refused_and_never_a_fault(
+    client: httpx.Client, tiny: TinyScene, kind: str
+) -> None:
+    for seed in range(15):
+        reply = client.put(f"/assets/{kind}", content=mutated(getattr(tiny, kind), seed))
+        if reply.status_code == 201:
+            delete(client, reply.json()["id"])
+        elif reply.status_code != 200:
+            assert_problem(reply, 422)
 
 
 def stored_files(server: Server) -> int:
