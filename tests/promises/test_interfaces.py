@@ -38,8 +38,8 @@ FIELDS: dict[str, st.SearchStrategy[Any]] = {
     "absent": st.sampled_from(("drop", "keep")),
 }
 ROWS: list[dict[str, Any]] = [
-    {"text": ["apple"]},
-    {"text": ["apple"], "negatives": ["lamp"], "threshold": 0.25, "top": 3},
+    {"text": ["apple"], "top": 3},
+    {"text": ["apple"], "negatives": ["lamp"], "threshold": 0.25},
     {"like": ["middle:6,12"], "unlike": ["splat:47"]},
     {"like": ["middle:box:3,4,10,20"]},
     {"like": ["middle:stroke:26,5,26,12,27,19"], "keep": "largest"},
@@ -103,22 +103,21 @@ class Interfaces:
         self.scene.export(self.folder / file, source, content, **options)
         return (self.folder / file).read_bytes()
 
+    def words_of(self, fields: dict[str, Any]) -> list[object]:
+        """Return the options of a question, its text first, and of the text table, which only words need."""
+        words: list[object] = list(fields.get("text", []))
+        for name, value in fields.items():
+            flag = {"negatives": "--negative"}.get(name, f"--{name.replace('_', '-')}")
+            for item in (value if isinstance(value, list) else [value]) if name != "text" else []:
+                words += [flag, item]
+        return words + (["--table", self.files["table"]] if {"text", "negatives"} & set(fields) else [])
+
     def ask(self, fields: dict[str, Any]) -> lc.Answer | None:
         """Return the library's answer; None where it is refused."""
         try:
             return self.scene.ask(lc.Query(**fields), encoder=self.encoder, places=True)
         except lc.SplatliftError:
             return None
-
-
-def words_of(fields: dict[str, Any]) -> list[object]:
-    """Return the options of a question; a text stands first."""
-    words: list[object] = list(fields.get("text", []))
-    for name, value in fields.items():
-        flag = {"negatives": "--negative"}.get(name, f"--{name.replace('_', '-')}")
-        for item in (value if isinstance(value, list) else [value]) if name != "text" else []:
-            words += [flag, item]
-    return words
 
 
 @pytest.fixture(scope="module")
@@ -143,13 +142,8 @@ def assert_equal_answers(interfaces: Interfaces, fields: dict[str, Any]) -> None
             document = {name: value for reply in replies for name, value in reply.json().items()}
             assert {name: document[name] for name in expected} == expected
     top = [] if "top" in fields else ["--top", "10"]
-    document = interfaces.command("query", *words_of(fields), *top, "--objects", *encoder_of(interfaces, fields))
+    document = interfaces.command("query", *interfaces.words_of(fields), *top, "--objects")
     assert (document and document["answer"]) == expected
-
-
-def encoder_of(interfaces: Interfaces, fields: dict[str, Any]) -> list[object]:
-    """Return the option of the text table, which only questions with words need."""
-    return ["--table", interfaces.files["table"]] if {"text", "negatives"} & set(fields) else []
 
 
 @pytest.mark.parametrize("fields", ROWS, ids="-".join)
@@ -168,14 +162,11 @@ def test_any_fields_of_a_question_have_the_same_answer(interfaces: Interfaces, f
 def test_scores_and_selections_are_the_same_arrays(interfaces: Interfaces, fields: dict[str, Any]) -> None:
     answer = interfaces.ask(fields)
     assert answer is not None
-    words, question = (
-        [*words_of(fields), *encoder_of(interfaces, fields)],
-        {k: v for k, v in fields.items() if k != "top"},
-    )
+    words = interfaces.words_of(fields)
     scores = [array(interfaces.written_file("query", "--scores", "scores.npy", *words))]
     for send in (interfaces.get, interfaces.post):
-        scores.append(array(send("/query/scores", **question).content))
-        selected = array(send("/query/selection", **question).content)
+        scores.append(array(send("/query/scores", **fields).content))
+        selected = array(send("/query/selection", **fields).content)
         assert selected.dtype == np.bool_ and np.array_equal(selected, answer.selected)
     assert all(array.dtype == np.float32 and np.array_equal(array, answer.scores) for array in scores)
     assert 0 < answer.count < len(answer.scores)
@@ -184,16 +175,13 @@ def test_scores_and_selections_are_the_same_arrays(interfaces: Interfaces, field
 @pytest.mark.parametrize("fields", [ROWS[1], ROWS[4]], ids=["words", "click"])
 def test_masks_and_attention_of_a_view_are_the_same_pictures(interfaces: Interfaces, fields: dict[str, Any]) -> None:
     answer = interfaces.ask(fields)
-    words, question = (
-        [*words_of(fields), *encoder_of(interfaces, fields)],
-        {k: v for k, v in fields.items() if k != "top"},
-    )
+    words = interfaces.words_of(fields)
     views = []
     for kind in ("mask", "attention"):
         for view in ("left", "right"):
             pictures = [interfaces.exported("picture.png", answer, kind, view=view)]
             pictures += [
-                send(f"/query/{kind}", view=view, **question).content for send in (interfaces.get, interfaces.post)
+                send(f"/query/{kind}", view=view, **fields).content for send in (interfaces.get, interfaces.post)
             ]
             pictures.append(interfaces.written_file("query", f"--{kind}", "picture.png", *words, "--view", view))
             assert all(np.array_equal(picture(content), picture(pictures[0])) for content in pictures)
@@ -254,7 +242,7 @@ def test_hidden_objects_are_left_out_of_pictures(interfaces: Interfaces) -> None
 
 def test_splats_of_an_answer_are_the_same_files(interfaces: Interfaces) -> None:
     fields = {"text": ["lamp"], "threshold": 0.5}
-    answer, words = interfaces.ask(fields), [*words_of(fields), *encoder_of(interfaces, fields)]
+    answer, words = interfaces.ask(fields), interfaces.words_of(fields)
     for name in ("object", "coloured"):
         expected = interfaces.exported("out.ply", answer, name)
         assert interfaces.written_file("query", f"--{name}", "out.ply", *words) == expected
