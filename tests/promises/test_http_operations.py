@@ -5,9 +5,12 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import os
 import re
 import shutil
 import socket
+import subprocess
+import sys
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any
@@ -15,7 +18,7 @@ from typing import Any
 import httpx
 import pytest
 
-from tests.server import PATIENCE_SECONDS, Server, run_command, until
+from tests.server import PATIENCE_SECONDS, ROOT, Server, run_command, until
 from tests.tiny_scene import TinyScene
 
 from .over_http import assert_problem, delete_lift, operations_of, upload_scene
@@ -25,6 +28,20 @@ def test_service_is_alive_ready_and_of_a_version(client: httpx.Client, lift: dic
     assert client.get("/healthz").json() == {"status": "ok"}
     until(lambda: client.get("/readyz").status_code == 200)
     assert client.get("/openapi.json").json()["info"]["version"] == lift["version"]
+
+
+def test_health_check_of_the_image_tells_a_live_server_from_a_dead_one(client: httpx.Client) -> None:
+    dockerfile = (ROOT / "docker/Dockerfile").read_text(encoding="utf-8")
+    check = re.search(r"^HEALTHCHECK .*?CMD (\[.*?\])", dockerfile, re.MULTILINE | re.DOTALL)
+    assert check is not None
+    program, *command = json.loads(check[1])
+    assert program == "python"
+    with closing(socket.socket()) as silent_socket:  # bound, and not listening
+        silent_socket.bind(("127.0.0.1", 0))
+        for port, is_alive in ((client.base_url.port, True), (silent_socket.getsockname()[1], False)):
+            environment = os.environ | {"SPLATLIFT_PORT": str(port)}
+            ending = subprocess.run([sys.executable, *command], env=environment, capture_output=True, check=False)
+            assert (ending.returncode == 0) is is_alive
 
 
 def test_metrics_count_jobs_and_requests(client: httpx.Client, lift: dict[str, Any]) -> None:
@@ -45,6 +62,8 @@ def test_openapi_document_describes_every_operation(client: httpx.Client) -> Non
         assert " " in description["summary"], f"{method} {path}"
         assert set(description["responses"]) & {"200", "201", "202", "204"}, f"{method} {path}"
     assert len(set(names)) == len(names) and all(re.fullmatch("[a-z]+(_[a-z]+)*", name) for name in names)
+    titles = [schema["title"] for schema in document["components"]["schemas"].values()]
+    assert len(titles) == len(set(titles))  # a generated client gets one class for each name
     for reference in set(re.findall(r'"\$ref": ?"#/([^"]+)"', json.dumps(document))):
         node = document
         for part in reference.split("/"):
@@ -94,10 +113,12 @@ def test_page_serves_the_libraries_that_it_names_compressed(client: httpx.Client
     assert part.content == client.get(script).content[:32]
 
 
-@pytest.mark.parametrize("host", ["localhost.example.org:80", ""])
-def test_request_to_another_host_is_misdirected(client: httpx.Client, host: str) -> None:
-    for path in ("/healthz", "/lifts", "/"):
-        assert_problem(client.get(path, headers={"Host": host}), 421)
+def test_hosts_of_the_machine_are_taken_and_others_misdirected(client: httpx.Client) -> None:
+    for host in ("localhost", "LOCALHOST:80", "127.0.0.1:9", "[::1]"):
+        assert client.get("/lifts", headers={"Host": host}).status_code == 200, host
+    for host in ("localhost.example.org:80", ""):
+        for path in ("/healthz", "/lifts", "/"):
+            assert_problem(client.get(path, headers={"Host": host}), 421)
 
 
 def test_only_more_parameters_than_a_picture_has_are_too_many(client: httpx.Client, lift: dict[str, Any]) -> None:
@@ -106,11 +127,6 @@ def test_only_more_parameters_than_a_picture_has_are_too_many(client: httpx.Clie
         reply = client.get("/render", params=parameters)
         assert reply.status_code == status, reply.text[:200]
     assert_problem(reply, 414)
-
-
-def test_hosts_of_the_machine_are_taken(client: httpx.Client) -> None:
-    for host in ("localhost", "LOCALHOST:80", "127.0.0.1:9", "[::1]"):
-        assert client.get("/lifts", headers={"Host": host}).status_code == 200, host
 
 
 @pytest.mark.parametrize("origin", ["http://127.0.0.1.example.org", "null", "http://localhost:1"])
@@ -179,20 +195,13 @@ def test_slow_clients_keep_nobody_waiting(client: httpx.Client) -> None:
 # Data
 
 
-@pytest.fixture
-def backup(server: Server, lift: dict[str, Any], tmp_path: Path) -> Path:
-    """A backup that was made beside the running server."""
-    del lift
-    folder = tmp_path / "backup"
-    run_command("store", "backup", str(folder), data=server.data)
-    run_command("store", "backup", str(folder), data=server.data, status=2)  # it replaces nothing
-    run_command("store", "verify", data=folder)
-    return folder
-
-
-def test_backup_is_served_as_it_was_and_a_full_disk_takes_nothing_more(
-    backup: Path, client: httpx.Client, lift: dict[str, Any], order: dict[str, Any], tiny: TinyScene, encoder: str
+def test_backup_is_served_as_it_was_and_its_damage_is_found(
+    server: Server, lift: dict[str, Any], order: dict[str, Any], tiny: TinyScene, encoder: str, tmp_path: Path
 ) -> None:
+    client, backup = server.client, tmp_path / "backup"
+    run_command("store", "backup", str(backup), data=server.data)
+    run_command("store", "backup", str(backup), data=server.data, status=2)  # it replaces nothing
+    run_command("store", "verify", data=backup)
     floor = 10 * shutil.disk_usage(backup).total
     with Server(backup, encoder=encoder, disk_floor_bytes=floor) as full:
         paths = (lift["links"]["self"], f"/query?lift={lift['id']}&text=lamp", "/healthz", "/assets")
@@ -204,13 +213,10 @@ def test_backup_is_served_as_it_was_and_a_full_disk_takes_nothing_more(
             full.client.put("/assets/splats", content=tiny.splats + b"\n"),
             full.client.post("/lift", json=order),
         ):
-            assert_problem(reply, 507)
+            assert_problem(reply, 507)  # a full disk takes nothing more
         assert full.client.get("/jobs").json() == jobs
         delete_lift(full.client, lift["id"])  # which makes room
     assert client.get(lift["links"]["features"]).status_code == 200
-
-
-def test_damage_of_a_file_is_found(backup: Path, order: dict[str, Any]) -> None:
     digest = order["splats"].removeprefix("sha256:")
     (file,) = (path for path in backup.rglob("*") if digest in path.name)
     content = file.read_bytes()
@@ -221,14 +227,10 @@ def test_damage_of_a_file_is_found(backup: Path, order: dict[str, Any]) -> None:
         assert digest[:8] in run_command("store", "verify", data=backup, status=1)
         assert file.exists() is (damage is not None)  # it changes nothing
         file.touch()
-
-
-def test_files_without_a_database_are_refused_and_stay(backup: Path, order: dict[str, Any]) -> None:
     for path in backup.glob("*.sqlite*"):
         path.unlink()
     line = run_command("serve", "--port", "0", data=backup, status=2)
-    assert line.count("\n") == 1 and "database" in line
-    assert [path for path in backup.rglob("*") if order["splats"].removeprefix("sha256:") in path.name]
+    assert line.count("\n") == 1 and "service.sqlite" in line and file.exists()
 
 
 def test_second_server_of_a_directory_is_refused(server: Server, tmp_path: Path) -> None:

@@ -54,12 +54,6 @@ def require_no_fault(reply: httpx.Response, *request: object) -> None:
         assert problem["request_id"] == reply.headers["x-request-id"]
 
 
-def test_a_generated_client_gets_one_class_for_each_name(fast: httpx.Client) -> None:
-    schemas = fast.get("/openapi.json").json()["components"]["schemas"].values()
-    titles = [schema["title"] for schema in schemas]
-    assert len(titles) == len(set(titles))
-
-
 def test_odd_parts_of_paths_are_refused(fast: httpx.Client, operations: Operations) -> None:
     for method, path, _ in operations:
         if re.search(r"\{(job|lift|tradeoff|asset)\}", path):  # which take an odd part
