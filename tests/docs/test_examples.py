@@ -58,7 +58,9 @@ def scene_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("page", ["README.md", PYTHON])
 def test_python_example_of_files_finds_the_apple(page: str, scene_folder: Path) -> None:
-    names = run_example(page, 'read_splats("scene.ply")')
+    (example,) = (block for block in blocks(page, "python") if 'read_splats("scene.ply")' in block)
+    names: dict[str, Any] = {}
+    exec(compile(example, page, "exec"), names)
     result, means = lc.load_lift("scene.lift.safetensors"), names["splats"].means
     assert torch.equal(result.features, names["result"].features)
     selected = names["apple"].selected
@@ -75,14 +77,6 @@ def commands_between(page: str, begin: str, end: str, folder: Path) -> list[list
     section = text(page).partition(begin)[2].partition(end)[0]
     lines = [line for line in section.splitlines() if line.startswith("splatlift ")]
     return [shlex.split(line)[1:] for line in lines]
-
-
-def run_example(page: str, start: str) -> dict[str, Any]:
-    """The names that the one Python example of a page with such a line leaves behind."""
-    (example,) = (block for block in blocks(page, "python") if start in block)
-    names: dict[str, Any] = {}
-    exec(compile(example, page, "exec"), names)
-    return names
 
 
 def test_the_way_from_own_maps_to_a_mask_leads_there(scene_folder: Path) -> None:
@@ -135,25 +129,22 @@ def commands() -> list[list[str]]:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(scene_folder: Path) -> Path:
     """The tiny scene as nerfstudio would have trained it, and its run's file; the working directory."""
-    scene, back = make_scene(), np.linalg.inv(similarity())
-    (tmp_path / "splat.ply").write_bytes(scene.splats)
-    (tmp_path / "features.safetensors").write_bytes(scene.features)
-    (tmp_path / "words.safetensors").write_bytes(scene.table)
+    back = np.linalg.inv(similarity())
+    (scene_folder / "scene.ply").rename(scene_folder / "splat.ply")
     document = cameras_document()
     for frame in document["frames"]:
         pose = back @ np.array(frame["transform_matrix"])
         pose[:3, :3] *= SCALE  # of cameras only the places are scaled
         frame["transform_matrix"] = pose.tolist()
-    (tmp_path / "data").mkdir()
-    (tmp_path / "data" / "transforms.json").write_text(json.dumps({**document, "ply_file_path": "sparse_pc.ply"}))
-    run = tmp_path / commands()[0][1]
+    (scene_folder / "data").mkdir()
+    (scene_folder / "data" / "transforms.json").write_text(json.dumps({**document, "ply_file_path": "sparse_pc.ply"}))
+    run = scene_folder / commands()[0][1]
     run.parent.mkdir(parents=True)
     output = similarity()[:3] / np.array([[SCALE]])
     run.write_text(json.dumps({"transform": output.tolist(), "scale": SCALE}))
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+    return scene_folder
 
 
 def test_lift_of_nerfstudios_scene_finds_the_apple(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

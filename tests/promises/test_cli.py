@@ -159,18 +159,9 @@ def test_stopped_lift_leaves_no_half_and_goes_on(tmp_path: Path) -> None:
     files = [tmp_path / name for name in ("splats.ply", "cameras.json", "f.safetensors")]
     lift, checkpoint = tmp_path / "out/x.safetensors", tmp_path / "kept"
     lift.parent.mkdir()
-    words = [
-        "lift",
-        *files,
-        "-o",
-        lift,
-        "--preset",
-        "row-sum",
-        "--set",
-        "diagnostic_rays=0",
-        "--checkpoint",
-        checkpoint,
-    ]
+    settings = lc.LiftSettings.of(preset="row-sum", diagnostic_rays=0)
+    options = ["--preset", "row-sum", "--set", "diagnostic_rays=0", "--checkpoint", checkpoint]
+    words = ["lift", *files, "-o", lift, *options]
     command = [sys.executable, "-m", "liftcore.cli", *map(str, words)]
     for number, status in ((signal.SIGINT, cli.INTERRUPTED), (signal.SIGKILL, -signal.SIGKILL)):
         lift.unlink(missing_ok=True)  # of one that ended before its signal
@@ -182,7 +173,6 @@ def test_stopped_lift_leaves_no_half_and_goes_on(tmp_path: Path) -> None:
         if process.returncode:  # it had not ended before
             assert not lift.exists() and (number == signal.SIGKILL or err == "splatlift: interrupted\n")
     assert run(*words).status == 0
-    settings = lc.LiftSettings.of(preset="row-sum", diagnostic_rays=0)
     expected = lc.lift_files(files[0], files[1], files[2:], settings, progress=False).as_codes()
     assert arrays_of(lc.load_lift(lift)) == arrays_of(expected)
     assert [path.name for path in lift.parent.iterdir()] == [lift.name]
@@ -195,7 +185,6 @@ REFUSALS = {  # words -> what the line says
     "lift {s} {c} {f} -o {out}": "the folder",
     "lift {s} {c} {f} -o {out}/x.sog": "x.sog",
     "lift {s} {c} nope -o {out}/x.safetensors": "nope: expected a feature pack (.safetensors), got a file",
-    "lift {s} {c} {f} -o {out}/x.safetensors --set power=3": "power: expected",
     "lift {s} {c} {f} -o {out}/x.safetensors --set power": "--set: expected key=value, got 'power'",
     "lift {s} {c} {f} -o {out}/x.safetensors --set strides=2": "an unknown setting; nearest: stride",
     "lift {s} {c} {f} -o {out}/x.safetensors --set stride=2 --set stride=3": "expected one value, got --set stride=2",
@@ -205,14 +194,12 @@ REFUSALS = {  # words -> what the line says
     "lift {s} {c} {f} -o {out}/x.safetensors --up 0 0 0": "--up: expected",
     "plan {c} {s} {f}": "splats as SPLATS, got cameras; the order is SPLATS CAMERAS FEATURES",
     "plan {s} {c} {maps}": "splatlift pack masks",
-    "inspect nope": "nope: expected",
     "pack npy {maps}/left.png.npy -o {out}/p.safetensors": "a folder",
     "pack masks {maps} -o {out}/p.safetensors --unlabelled 65536": "a whole number from 0 to 65535, got '65536'",
     "pack masks {maps} -o {out}/p.safetensors": "left",
     "pack retag {f} -o {out}/p.safetensors": "--text-space or --encoder-name: expected",
     "encode {photo} -o {out}/p.safetensors --encoder magic": "--encoder: expected one of maskclip",
     "encode {photo} -o {photo} --encoder timm:resnet18": "another file than the inputs",
-    "transfer {f} {s} -o {out}/t.safetensors": "f.safetensors: expected lift as LIFT, got features",
     "tradeoff {s} {c} {f} -o {out}/t --budget none": "expected seconds, got 'none'",
     "tradeoff {s} {c} {f} -o {out}/t --labels nope --table {w} --classes apple book lamp": "nope",
     "render {lift} -o {out}/r.png": "a view to render, got no --view",

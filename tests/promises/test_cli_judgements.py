@@ -56,6 +56,13 @@ def test_check_names_cameras_and_maps_of_others(sheet: Path, tmp_path: Path) -> 
     scale[:3, 3] = 0.5
     near = lc.Cameras([camera.replace(viewmat=camera.viewmat * scale) for camera in cameras.values()])
     assert "with positions times about 2 " in wrong(splats, near, photos)
+    sides = ("fx", "fy", "cx", "cy")
+    third = lc.Cameras(
+        [camera.replace(**{side: getattr(camera, side) / 3 for side in sides}) for camera in cameras.values()]
+    )
+    text = wrong(splats, third, photos)  # of a picture of another size
+    assert "with intrinsics times" in text and "a picture of 0.33" in text and "share a frame" not in text
+    assert " | " not in text
     far = replace(splats, means=splats.means + 1000)
     assert wrong(far, cameras).startswith("cameras: ")
     swapped = dict(zip(photos, [*[*photos.values()][1:], photos["v0"]], strict=True))
@@ -88,16 +95,6 @@ def test_check_calls_nothing_wrong_that_has_nothing_to_compare(tmp_path: Path) -
     object_splats = splats[CLUSTER == 1]  # of one object on nothing, seen from nearly one place
     far = lc.Cameras([camera.replace(fx=9.0, fy=9.0) for camera in cameras.values()])
     assert evaluate.check_scene(object_splats, far, photos_of(object_splats, far, tmp_path)).wrong == ()
-
-
-def test_check_names_intrinsics_of_a_picture_of_another_size(sheet: Path) -> None:
-    splats, cameras = lc.read_splats(sheet / "splats.ply"), lc.read_cameras(sheet / "cameras.json")
-    sides = ("fx", "fy", "cx", "cy")
-    third = lc.Cameras(
-        [camera.replace(**{side: getattr(camera, side) / 3 for side in sides}) for camera in cameras.values()]
-    )
-    (text,) = evaluate.check_scene(splats, third, sheet / "photos").wrong
-    assert "with intrinsics times" in text and "a picture of 0.33" in text and "share a frame" not in text
 
 
 def test_check_names_mirrored_masks(sheet: Path, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from tests.server import Server
 from tests.tiny_scene import FOCAL, HEIGHT, SPLATS_A_CLUSTER, VIEWS, WIDTH, WORDS
 
-from .over_http import NO_ID, array, assert_problem, delete_lift, photos_zip, picture, upload
+from .over_http import array, assert_problem, delete_lift, photos_zip, picture, upload
 
 COUNT = 3 * SPLATS_A_CLUSTER
 
@@ -28,9 +28,6 @@ def test_lift_says_what_it_is_and_of_what(client: httpx.Client, lift: dict[str, 
     assert lift["id"] in [entry["id"] for entry in client.get("/lifts").json()["lifts"]]
     for name, link in lift["links"].items():
         assert client.get(link + "apple" * (name == "query")).status_code == 200, name
-    for path in ("", "/features", "/objects", "/tree", "/views", "/splats", "/selections"):
-        assert_problem(client.get(f"/lifts/{NO_ID}{path}"), 404)
-    assert_problem(client.get("/lifts/..%2f..%2fetc%2fpasswd"))
 
 
 def test_lift_has_the_name_that_somebody_gave_it(client: httpx.Client, lift: dict[str, Any]) -> None:
@@ -42,7 +39,6 @@ def test_lift_has_the_name_that_somebody_gave_it(client: httpx.Client, lift: dic
         assert_problem(client.patch(path, json={"name": wrong}), 422)
     assert client.get(path).json()["name"] == "Kitchen \u2013 Tuesday"
     assert client.patch(path, json={"name": None}).json() == lift
-    assert_problem(client.patch(f"/lifts/{NO_ID}", json={"name": "x"}), 404)
 
 
 def test_downloaded_lift_is_the_file_that_the_library_reads(
@@ -54,8 +50,6 @@ def test_downloaded_lift_is_the_file_that_the_library_reads(
     (tmp_path / "lift.safetensors").write_bytes(reply.content)
     loaded = lc.load_lift(tmp_path / "lift.safetensors")
     assert loaded.features.shape == (COUNT, 8) and loaded.metadata.text_space == "tiny"
-    part = client.get(lift["links"]["features"], headers={"Range": "bytes=100-199"})
-    assert (part.status_code, part.content) == (206, reply.content[100:200])
 
 
 def test_each_splat_has_a_colour_of_its_features(client: httpx.Client, lift: dict[str, Any]) -> None:
