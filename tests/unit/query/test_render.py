@@ -102,6 +102,12 @@ def test_pictures_have_a_limit(scene: Scene, monkeypatch: pytest.MonkeyPatch) ->
             draw(channel)
 
 
+def test_colours_of_many_clusters_differ() -> None:
+    colours = cluster_colours(24).astype(int)
+    distances = np.abs(colours[:, None] - colours).max(axis=2)[~np.eye(25, dtype=bool)]
+    assert distances.min() >= 16 and len(set(colours[-1].tolist())) == 1  # the last is grey
+
+
 def test_colours_follow_the_spherical_harmonics() -> None:
     camera = look_at("v", np.array([0.0, 0.0, -3.0]), 8, 8, 8.0)
     splats = random_splats(0, 5)

@@ -64,6 +64,11 @@ def test_scores_that_are_equal_or_none_say_so(method: str) -> None:
     assert find_threshold(torch.empty(0), method).value == math.inf
 
 
+def test_paper_takes_otsus_split_where_no_valley_lies_above_the_largest_peak() -> None:
+    threshold = find_threshold(hills((0.2, 0.03, 9000), (0.4, 0.005, 3000)), "paper")
+    assert 0.29 < threshold.value < 0.39 and "Otsu" in threshold.explanation
+
+
 def test_weights_count_like_repeated_scores() -> None:
     scores = hills((0.2, 0.01, 2000), (0.3, 0.01, 500))
     weights = torch.where(scores > 0.25, 3.0, 1.0)
