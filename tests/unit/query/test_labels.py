@@ -41,6 +41,7 @@ def test_every_source_gives_instances_that_lie_in_their_boxes(scene: Scene) -> N
             assert inside.sum() == instance["splats"]
             if classes:
                 assert set(labels.columns["class_id"][inside]) == {instance["class_id"]}
+                assert instance["name"] == labels.document["classes"][instance["class_id"] - 1]["name"]
             places = scene.splats.positions()[inside]
             low, high = instance["box"]["low"], instance["box"]["high"]
             assert (places >= np.array(low) - 1e-6).all() and (places <= np.array(high) + 1e-6).all()

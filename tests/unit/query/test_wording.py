@@ -1,9 +1,11 @@
 """Words as people type them: the word of the table that stands for each, and errors for those without one."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
+import torch
 
 from liftcore.errors import InvalidQuery
 from liftcore.query.scene import Scene
@@ -132,3 +134,11 @@ def test_words_of_the_scene_are_suggested_for_an_unknown_one(scene: Scene) -> No
     assert set(info.value.nearest or ()) == {"apple", "book", "lamp"}  # what is in the scene
     assert scene.suggested_words("ap", encoder=table).words[0].word == "apple"
     assert set(scene.suggested_words(encoder=table).scene_words) == {"apple", "book", "lamp"}
+
+
+def test_a_word_near_to_all_of_the_scene_names_none_of_its_objects(scene: Scene) -> None:
+    axes = np.eye(scene.channels, dtype=np.float32)
+    table = TableEncoder("words", ["apple", "book", "lamp", "desk"], axes[[0, 1, 2, 5]])
+    near_to_all = 0.8 * axes[5] + 0.6 * axes[scene.object]
+    lift = replace(scene.lift, rows=torch.from_numpy(near_to_all), code=None)
+    assert Scene(lift).suggested_words(encoder=table).scene_words == ()
