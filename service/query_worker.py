@@ -189,10 +189,14 @@ class Answers:
         return self._cache.get(_key(request, "words"), make)
 
     def _named_tree(self, request: Request) -> SceneTree:
+        """Return the tree of a lift with the names that people gave, which have no score."""
         words, encoder = self._words(request)
-        return self._cache.get(
+        tree = self._cache.get(
             _key(request, "world", "tree"), lambda: self._scene(request).tree(words, encoder=encoder)
         )
+        labels = request["object_labels"]
+        given = {int(number): {"name": name, "score": None} for number, (name, _) in labels.items() if name}
+        return tree.replace(nodes=tuple(node.model_copy(update=given.get(node.id)) for node in tree.nodes))
 
     # Documents
 
@@ -233,7 +237,7 @@ class Answers:
         tree, labels = self._named_tree(request), request["object_labels"]
         first, last = request["first"], request["first"] + request["count"]
         objects = [
-            item.model_dump(mode="json") | {"hidden": False} | _object_label(labels.get(str(item.id)))
+            item.model_dump(mode="json") | {"hidden": labels.get(str(item.id), ("", False))[1]}
             for item in tree.objects[first:last]
         ]
         count = len(tree.objects)
@@ -309,30 +313,14 @@ class Answers:
         elif request["of"] == "words":
             source = self._segmentation(request)
         else:
-            source = self._labelled_objects(request)
+            source = self._named_tree(request)
         return scene.blocks_of(source, request["content"], view=request["of_view"], suffix=request["suffix"])
-
-    def _labelled_objects(self, request: Request) -> SceneTree:
-        """Return the tree of a lift with the names that people gave."""
-        labels = {int(number): {"name": name} for number, (name, _) in request["object_labels"].items() if name}
-        tree = self._named_tree(request)
-        return tree.model_copy(
-            update={"nodes": tuple(item.model_copy(update=labels.get(item.id)) for item in tree.nodes)}
-        )
 
 
 def _select(scene: Scene, name: str, bits: str) -> Any:
     """Return a selection of these splats; drop the history of a selection with the same name."""
     scene.selections.pop(name, None)
     return scene.select(name).edit(Edit(operation="set", bits=bits))
-
-
-def _object_label(label: list[Any] | None) -> dict[str, Any]:
-    """Return the label of an object: whether it is hidden, and its name, which has no score."""
-    if label is None:
-        return {}
-    name, is_hidden = label
-    return {"hidden": is_hidden} | ({} if name is None else {"name": name, "score": None})
 
 
 def _key(request: Request, *names: str) -> str:

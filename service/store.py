@@ -282,7 +282,11 @@ class Store:
                    json.dumps(content["warnings"]), time.time())  # fmt: skip
             with self.write() as connection:
                 connection.execute("INSERT OR IGNORE INTO assets VALUES (?, ?, ?, ?, ?, ?, ?, ?)", row)
-        return self.asset(owner, f"sha256:{sha256}")
+        asset = self.asset(owner, f"sha256:{sha256}")
+        if asset.kind != kind:
+            hint = f"delete that asset, or upload a file of the {kind} alone"
+            raise Conflict("asset", expected="bytes of one kind", got=f"{kind}, here as {asset.kind}", hint=hint)
+        return asset
 
     def find_asset(self, owner: Owner, asset: str) -> Asset | None:
         """Return the asset of that id; None if there is none."""

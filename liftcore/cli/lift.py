@@ -243,7 +243,8 @@ def _matrix(path: Path) -> list[list[float]]:
     try:
         numbers = [float(word) for word in path.read_text(encoding="utf-8-sig").replace(",", " ").split()]
     except (OSError, ValueError) as error:
-        raise InvalidInput("--matrix", expected="a file of 12 or 16 numbers", got=str(error)[:120]) from None
+        expected = "a text of 12 or 16 numbers, as numpy.savetxt writes it"
+        raise InvalidInput("--matrix", expected=expected, got=str(error)[:120]) from None
     if len(numbers) not in NUMBERS:
         raise InvalidInput("--matrix", expected="a file of 12 or 16 numbers", got=str(len(numbers)))
     return [numbers[first : first + 4] for first in range(0, len(numbers), 4)]

@@ -154,7 +154,8 @@ def evaluate_lift(
     if lifted := set(scene.metadata.views).intersection(cameras.values()):
         warnings.append(f"{len(lifted)} of {len(cameras)} labelled views were lifted: {first_names(sorted(lifted))}")
     query_texts = tuple(as_list(negatives))
-    queries = {phrase: Query.of(phrase, query_texts, threshold=threshold) for phrase in phrases}
+    # In quotes, as labels are names whatever is in them: "other furniture", "salt and pepper shakers".
+    queries = {phrase: Query.of(f'"{phrase}"', query_texts, threshold=threshold) for phrase in phrases}
     answers = [ask(scene, query, words) for query in queries.values()]
     # A splat without a feature adds nothing to a ray.
     columns = [np.where(answer.has_feature, answer.scores, np.float32(0.0)) for answer in answers]

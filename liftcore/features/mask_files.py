@@ -54,7 +54,13 @@ def binary_picture(path: Path, unlabelled: int | None) -> tuple[np.ndarray, np.n
             hint = "write only the mask: cv2.imwrite(name, 255 * mask.astype(numpy.uint8))"
             raise ValueError(f"a PNG without transparent pixels, got colours with transparency; {hint}")
         values = np.asarray(image.convert("RGB") if "A" in image.mode else image)
-    return binary_mask(values.max(axis=2) if values.ndim == 3 else values, unlabelled)
+    if values.ndim == 2:
+        return binary_mask(values, unlabelled)
+    inside, void = binary_mask(values.max(axis=2), unlabelled)
+    colours = values[inside].astype(np.int32) @ (1 << 16, 1 << 8, 1)
+    if len(colours) and colours.min() != colours.max():
+        raise ValueError(f"one colour besides black, a mask, got several, as of classes or instances; {AS_COCO}")
+    return inside, void
 
 
 def binary_mask(values: np.ndarray, unlabelled: int | None) -> tuple[np.ndarray, np.ndarray]:

@@ -237,7 +237,7 @@ def _scene_of(model: PurePosixPath) -> PurePosixPath:
 
 
 def _parse_inria(document: list[Any], source: str) -> Cameras:
-    """Parse the cameras.json of Inria's trainer, which puts the principal point at the image's centre."""
+    """Parse the cameras.json of Inria's trainer; its successors add ``cx`` and ``cy``, else the image's centre."""
     with reading(source, InvalidCameras, JSON_FORMATS):
         foreign = [record for record in document if not isinstance(record, dict) or "img_name" not in record]
         if foreign:
@@ -248,12 +248,13 @@ def _parse_inria(document: list[Any], source: str) -> Cameras:
     def camera(name: str, record: dict[str, Any]) -> Camera:
         with reading(f"{source} camera {name!r}", InvalidCameras, "a camera"):
             width, height = (pixels(record[key], key) for key in ("width", "height"))
-            fx, fy = (number(record[key], key) for key in ("fx", "fy"))
+            centre = {"cx": width / 2, "cy": height / 2}
+            fx, fy, cx, cy = (number((centre | record)[key], key) for key in ("fx", "fy", "cx", "cy"))
         with reading(f"{source} camera {name!r}", InvalidPose, "a pose"):
             rotation = matrix(record["rotation"], (3,), 3, "rotation")
             position = matrix([record["position"]], (1,), 3, "position")
         viewmat = viewmat_of(np.concatenate([rotation, position.T], axis=1), "opencv")
-        return Camera.pinhole(name, width, height, fx, fy, width / 2, height / 2, viewmat)
+        return Camera.pinhole(name, width, height, fx, fy, cx, cy, viewmat)
 
     views, warnings = read_views(zip(names, document, strict=True), camera)
     return Cameras(views, warnings=warnings)

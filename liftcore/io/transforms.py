@@ -116,7 +116,11 @@ def _named_frames(frames: Any) -> tuple[list[str], list[dict[str, Any]]]:
     """Return the names of views, and their records."""
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise ValueError(f"a list of objects as frames, got {repr(frames)[:60]}")
-    return view_names([str(frame["file_path"]) for frame in frames]), frames
+    paths = [frame["file_path"] for frame in frames]
+    for path in paths:
+        if not path or not isinstance(path, str):
+            raise ValueError(f"the path of a photo as file_path, got {repr(path)[:60]}")
+    return view_names(paths), frames
 
 
 def nerfstudio_world(cameras: Sequence[Camera]) -> WorldFrame:

@@ -116,7 +116,7 @@ def ask(scene: Scene, query: Query | str, encoder: AnyEncoder = None) -> Answer:
     Raises:
         InvalidQuery, NotFound, InvalidLift: as `Scene.ask`.
     """
-    query = Query.of(query) if isinstance(query, str) else query
+    query = query if isinstance(query, Query) else Query.of(query)
     check_texts(query.texts)  # before an encoder is opened
     # The table is in the metadata, which are checked so: a lift of other rows than its splats answers nothing.
     reader = scene.encoder(encoder) if query.texts or encoder is not None else scene.table

@@ -59,6 +59,10 @@ def blocks_of(export: Export) -> Iterable[bytes]:
     source, content = export.source, export.content
     kinds = {Mapping: "answers", np.ndarray: "array", int: "object", type(None): "scene"}
     kind = next((kinds[base] for base in kinds if isinstance(source, base)), type(source).__name__.lower())
+    if kind not in FILES:
+        hint = "of a selection ask Query(sets=['selection:NAME'])"
+        expected = "an answer, a segmentation, a tree, an array, or the number of an object"
+        raise InvalidQuery("source", expected=expected, got=kind, hint=hint)
     files = FILES[kind]
     if kind in ("segmentation", "scenetree", "answers"):
         by_suffix = BY_SUFFIX | ({".ply": "labelled"} if kind == "scenetree" else {})
@@ -120,15 +124,13 @@ def object_splats(scene: Scene, answer: Answer, suffix: str = ".ply") -> Iterabl
     if answer.is_dropped:
         hint = "absent=keep selects the most similar splats; or ask in other words or by example"
         raise InvalidQuery("object", expected="an object in the scene", got=answer.reason.rstrip("."), hint=hint)
-    if answer.count == 0:
-        raise InvalidQuery(
-            "object",
-            expected="splats at or above the threshold",
-            got=f"none of {len(answer.scores)}: nothing stands out",
-            hint="name a lower threshold, or ask in other words or by example",
-        )
     is_ungrouped = answer.count > MOST_SPLATS and not answer.query.keeps_some
     mask = answer.selected if is_ungrouped else objects(scene, answer).numbers >= 0
+    if not mask.any():
+        got = f"{answer.count} in smaller objects" if answer.count else f"none of {len(mask)}: nothing stands out"
+        expected = f"splats at or above the threshold, in objects of {answer.query.min_size} or more"
+        hint = "name a lower threshold or min_size, or ask in other words or by example"
+        raise InvalidQuery("object", expected=expected, got=got, hint=hint)
     if suffix in (".glb", ".usdc", ".usdz") and not is_ungrouped:
         return labelled(scene.splat_file, labels(scene, answer), suffix, mask)
     return some_rows(scene.splat_file, mask, suffix, scene.world)

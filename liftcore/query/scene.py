@@ -10,7 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 from shutil import rmtree
 from tempfile import mkdtemp
-from typing import TYPE_CHECKING, Any, Literal, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, Self, TypeAlias, get_args
 from weakref import finalize
 
 import numpy as np
@@ -19,6 +19,7 @@ from liftcore.errors import InvalidLift, InvalidQuery, NotFound
 from liftcore.io.splats import quick_count
 from liftcore.query.colours import NOT_SEEN_COLOUR, cluster_colours, heat_colours
 from liftcore.query.scores import Features, cosines, norms_of, spaced
+from liftcore.runtime.arguments import check_choice
 from liftcore.runtime.progress import Progress, shown_progress
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.world import UNKNOWN, WorldFrame
@@ -255,8 +256,10 @@ class Scene:
         Raises:
             NotFound, InvalidQuery, InvalidLift: as `liftcore.query.render.render`.
         """
+        from liftcore.query.question import Rendered
         from liftcore.query.render import expected_depth, render
 
+        check_choice("channel", channel, get_args(Rendered), InvalidQuery)
         scene = self.without(hide)
         return expected_depth(scene, view)[0] if channel == "depth" else render(scene, view, channel)
 

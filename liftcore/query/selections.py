@@ -14,7 +14,7 @@ from liftcore.errors import InvalidQuery
 from liftcore.query.edits import Edit
 from liftcore.query.objects import MOST_SPLATS, object_box, objects
 from liftcore.query.question import Answer, Box, Query
-from liftcore.query.scene import Scene
+from liftcore.query.scene import Scene, as_numpy
 from liftcore.query.terms import Area
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.touching import REACH, spreads_along, touching_pairs
@@ -102,7 +102,8 @@ def _edit_of(scene: Scene, operation: str | Edit, source: Any, fields: dict[str,
     answer = source if isinstance(source, Answer) else None
     if isinstance(operation, Edit):
         return operation, answer
-    if isinstance(source, np.ndarray):
+    if isinstance(source, np.ndarray) or hasattr(source, "detach"):
+        source = as_numpy(source)
         if source.dtype != np.bool_ or source.shape != (len(scene.features),):
             expected = f"a boolean for each of {len(scene.features)} splats"
             raise InvalidQuery("splats", expected=expected, got=f"{source.dtype} {list(source.shape)}")
@@ -146,7 +147,7 @@ def _source(scene: Scene, edit: Edit, answer: Answer | None) -> np.ndarray:
         camera = scene.camera(area.view if edit.camera is None else edit.camera.camera())
         return splats_under(scene, camera, area_mask(area, camera.photo_size, edit.radius), through=edit.through)
     if edit.box is not None:
-        low, high = (np.array(corner)[:, None] for corner in edit.box)
+        low, high = np.sort(np.array([*edit.box]), axis=0)[..., None]
         return np.all((scene.axes >= low) & (scene.axes <= high), axis=0)
     if edit.bits is None:
         return np.zeros(count, np.bool_)
@@ -167,7 +168,7 @@ def area_mask(area: Area, size: tuple[int, int], radius: float) -> np.ndarray:
     """
     mask = np.zeros(size[::-1], np.bool_)
     if area.kind == "box":
-        (x0, y0), (x1, y1) = np.maximum(area.corners, 0).tolist()
+        (x0, y0), (x1, y1) = np.sort(np.maximum(area.corners, 0), axis=0).tolist()  # drawn from any corner
         mask[y0:y1, x0:x1] = True
         return mask
     reach = radius + ROUNDING

@@ -15,9 +15,10 @@ from pathlib import PurePosixPath
 from liftcore.errors import InvalidCameras, InvalidFeatures, InvalidInput
 
 # Only these are cut off, so that "frame.0001", which some files name without its extension, stays whole.
-IMAGE_SUFFIXES = frozenset(
-    (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".exr", ".ppm", ".pgm", ".gif", ".heic", ".dng")
-)
+IMAGE_SUFFIXES = frozenset({
+    ".jpg", ".jpeg", ".jfif", ".jp2", ".jxl", ".png", ".webp", ".avif", ".bmp", ".tif", ".tiff", ".exr", ".ppm",
+    ".pgm", ".gif", ".heic", ".heif", ".dng", ".arw", ".cr2", ".nef",
+})  # fmt: skip
 NAMED_AFTER = (
     "a view is named after its image, without the extension, and with its folders where file names of the scene "
     "repeat (camA/000)"

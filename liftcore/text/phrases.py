@@ -5,7 +5,8 @@
 | name | "the small red mug", "where is the mug?", "cup of tea", "mug with a lid" | the end of it that is a word |
 | part | "the mug's handle", "handle of the mug"; "mug handle" if both are words | a part of an object |
 | list | "mug, bowl", "mug and bowl", "mug or bowl" | several texts |
-| negation | "bowl but not the mug", "bowl without mugs", "not the mug but the bowl" | texts and negatives |
+| negation | "bowl but not the mug", "bowl -mug", "not the mug but the bowl" | texts and negatives |
+| quoted | '"first aid kit"' | what is in the quotes, as it is |
 
 Places ("left of the mug", "the left mug"), actions ("man riding a horse"), numbers ("two mugs") and all but a thing
 ("not the mug", "everything except the mug") are refused: scores of texts answer none of them. An encoder of any text
@@ -61,9 +62,9 @@ _NUMBERS = frozenset({
     "many", "few", "no.", "half",
 })  # fmt: skip
 _NEGATION = re.compile(
-    r"(?:^|[\s,;]+)(?:but not|and not|or not|rather than|instead of|other than|apart from|aside from|except for|"
-    r"except|excluding|exclude|remove|hide|delete|ignore|without|minus|but|not|no|non|never|neither|nor|isn't|aren't|"
-    r"don't)(?=\s|$)"
+    r"(?:^|[\s,;(]+)(?:[-!](?=\w)|(?:but not|and not|or not|rather than|instead of|other than|apart from|"
+    r"aside from|except for|except|excluding|exclude|remove|hide|delete|ignore|without|w/o|minus|but|not|no|non|"
+    r"never|neither|nor|isn't|aren't|don't)(?=\s|$))"
 )
 _ALTERNATIVES = frozenset({"but", "rather than", "instead of"})
 _UNIVERSALS = frozenset({
@@ -71,8 +72,8 @@ _UNIVERSALS = frozenset({
     "stuff", "rest", "whatever", "scene", "none",
 })  # fmt: skip
 _RELATIVE = re.compile(r"(?:\s+(?:that|which|who|is|are|has|have|but|and|,))+$")
-_COMMAS = re.compile(r"\s*[,;|]\s*|(?:^|\s)\d+[.)]\s|\s+[-/&+]\s+|(?<=[a-z]{3})/(?=[a-z]{3})")
-_CONJUNCTIONS = re.compile(r"\s+(?:and|or|and/or|plus|as well as|along with|together with)\s+")
+_COMMAS = re.compile(r"\s*[,;|\u00b7\u2022]\s*|(?:^|\s)\d+[.)]\s|\s+[-/&+]\s+|(?<=[a-z]{3})/(?=[a-z]{3})")
+_CONJUNCTIONS = re.compile(r"\s+(?:and|or|and/or|vs\.?|plus|as well as|along with|together with)\s+")
 _QUALIFIER = re.compile(r"\s(?:with|from|for|that|which|who|made|is|are|has|having|to)(?=\s|$)")
 # Adjectives that "and" joins before a noun, as in "a black and white mug".
 _COLOURS = frozenset({
@@ -106,6 +107,9 @@ def read_phrase(text: str, is_word: Callable[[str], bool] | None) -> Reading:
     Args:
         is_word: whether a table has a word for a text as a whole; None for an encoder that reads any text.
     """
+    whole = text.strip()
+    if len(whole) > 2 and whole[0] == whole[-1] == '"':
+        return Reading((whole[1:-1],), ())
     is_name = is_word or (lambda _: False)
     typed = _tidy(text)
     if is_name(typed):
@@ -154,6 +158,7 @@ def _check(text: str, names: list[str], is_word: Callable[[str], bool] | None) -
 def _refuse(subject: str, text: str, rest: str) -> None:
     expected = f"a name, a part, a list or a negation: {subject} are not understood"
     hint = f"ask for {rest!r}" if rest not in _DETERMINERS | _UNIVERSALS else "ask for the thing by its name"
+    hint += "; or put the text in double quotes, to ask for it as it is"
     raise InvalidQuery("text", expected=expected, got=repr(text[:80]), hint=hint)
 
 
@@ -169,7 +174,7 @@ def _before_action(name: str, is_word: Callable[[str], bool] | None) -> str:
 
 
 def _tidy(text: str) -> str:
-    lines = ", ".join(line.strip("-*\u2022 ") for line in text.strip().splitlines())
+    lines = ", ".join(line.strip("-*\u2022 ") for line in re.split(r"[\n\r\t]", text.strip()))
     typed = " ".join(lines.casefold().replace("_", " ").replace("\u2019", "'").split())
     return typed.strip(PUNCTUATION.replace("'", ""))
 

@@ -193,9 +193,7 @@ def list_objects(
     lift: str, request: Request, deps: Deps, owner: Caller, options: Annotated[models.NodesRequest, Query()]
 ) -> Response:
     """List the objects of the scene, found by masks when it was lifted; a vocabulary names them."""
-    record = deps.store.lift(owner, lift)
-    order = _nodes("scene_objects", record, deps, owner, options) | {"object_labels": labels_of(record, deps)}
-    return respond(request, deps, order)
+    return respond(request, deps, _nodes("scene_objects", deps.store.lift(owner, lift), deps, owner, options))
 
 
 @router.get("/lifts/{lift}/tree", response_model=models.LiftTree)
@@ -212,7 +210,8 @@ def _nodes(operation: str, lift: Lift, deps: Parts, owner: Owner, options: model
         order = with_encoder(order, options, lift, deps, owner)
     encoder = None if order["encoder"] is None else encoder_label(order["encoder"])
     head = {"lift": lift.id, "encoder": encoder}
-    return order | {"first": options.cursor, "count": options.limit, "head": head}
+    order |= {"object_labels": labels_of(lift, deps), "head": head}
+    return order | {"first": options.cursor, "count": options.limit}
 
 
 register_url_convertor("file", OneOf("splats", "colours"))
