@@ -108,7 +108,7 @@ def _facts(entry: Mapping[str, Any], unit: str = "", whole: str = "total weight"
     if "name" not in entry:
         facts += [f"{name} {entry[name]:.4g}" for name in ("score", "margin") if name in entry]
     if "confidence" in entry:
-        facts.append(f"masked in {entry['confidence']:.0%} of the views that see it")
+        facts.append(f"masked as a whole in {entry['confidence']:.0%} of the views that see it")
     if "centre" in entry:
         facts.append(f"at {place_of(entry['centre'])}")
     low, high = entry["box"].values()

@@ -109,6 +109,8 @@ ROWS: list[Row] = [
     (QUERY, {"positives": np.ones(5)}, Q, "vector"),
     (QUERY, {"positives": VECTORS, "threshold": "high"}, Q, "threshold"),
     (QUERY, {"positives": VECTORS, "splats": "scene.ply"}, S, "splats"),
+    (result_of("render"), {"view": CAMERA, "channel": "x"}, Q, "channel"),
+    (result_of("export"), {"path": "a.ply", "source": 3.5}, Q, "source"),
     (SEGMENT, {"words": "ab", "vectors": VECTORS}, Q, "words"),
     (lc.open_encoder, {"spec": "bert"}, lc.SplatliftError, "encoder"),
     (lc.pack_folder, {"folder": None, "out": "x", "kind": "npy"}, N, "folder"),
