@@ -148,17 +148,19 @@ def _check(text: str, names: list[str], is_word: Callable[[str], bool] | None) -
             place = None
         subject = name[: place.start()] if place else _before_action(name, is_word)
         if place or subject:
-            _refuse("places and actions", text, _without_articles(re.sub(r"\s\w+(?:ing|ed)$", "", subject)))
+            subject = _without_articles(re.sub(r"\s\w+(?:ing|ed)$", "", subject))
+            _refuse("places and actions", text, subject, is_word)
         if len(words) > 1 and words[0] in _SIDES and words[1] != "of":
-            _refuse("places and comparisons", text, " ".join(words[1:]))
+            _refuse("places and comparisons", text, " ".join(words[1:]), is_word)
         if len(words) > 1 and is_word is not None and (words[0] in _NUMBERS or words[0].isdecimal()):
-            _refuse("numbers", text, " ".join(words[1:]))
+            _refuse("numbers", text, " ".join(words[1:]), is_word)
 
 
-def _refuse(subject: str, text: str, rest: str) -> None:
+def _refuse(subject: str, text: str, rest: str, is_word: Callable[[str], bool] | None) -> None:
     expected = f"a name, a part, a list or a negation: {subject} are not understood"
     hint = f"ask for {rest!r}" if rest not in _DETERMINERS | _UNIVERSALS else "ask for the thing by its name"
-    hint += "; or put the text in double quotes, to ask for it as it is"
+    if is_word is None:
+        hint += "; or put the text in double quotes, to ask for it as it is"
     raise InvalidQuery("text", expected=expected, got=repr(text[:80]), hint=hint)
 
 

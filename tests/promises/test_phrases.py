@@ -24,7 +24,7 @@ READ = {
     "I want the bowl as well as the lamp": "bowl lamp", "mug, mug": "mug", "mug but not the bowl": "mug",
     "the lamp, not the mug": "lamp", "lamp without bowls": "lamp", "mug and bowl except the lamp": "mug bowl",
     "mug -bowl": "mug", "mug (not bowl)": "mug", "mug w/o bowls": "mug", "mug \u00b7 bowl": "mug bowl",
-    "mug\tbowl": "mug bowl", "mug vs. bowl": "mug bowl", '"the left mug"': "mug",
+    "mug\tbowl": "mug bowl", "mug vs. bowl": "mug bowl", '"mug"': "mug",
     "not the mug but the bowl": "bowl", "bowl rather than mug": "bowl", "bowl, not mug, not lamp": "bowl",
 }  # fmt: skip
 REFUSALS = {

@@ -197,7 +197,7 @@ def test_mask_is_where_the_rendered_selection_is_above_a_half(lift: Path) -> Non
 
 def test_selections_by_hand_are_asked_as_they_are(lift: Path) -> None:
     scene = lc.Scene(lift)
-    selection = scene.select("mine", CLUSTER == 0).edit("add", CLUSTER == 2).undo()
+    selection = scene.select("mine", torch.from_numpy(CLUSTER == 0)).edit("add", CLUSTER == 2).undo()
     assert np.array_equal(scene.ask(lc.Query(sets=["selection:mine"])).selected, CLUSTER == 0)
     assert np.array_equal(selection.redo().splats, CLUSTER != 1)
     assert [group.splats for group in scene.objects(lc.Query(sets=["selection:mine"])).objects] == [

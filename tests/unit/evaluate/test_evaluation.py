@@ -70,6 +70,20 @@ def test_a_call_evaluates_as_the_command_does(folder: Path) -> None:
         assert json.loads(json.dumps(evaluation.document())) == document
 
 
+def test_a_label_is_a_name_whatever_is_in_it(folder: Path, tmp_path: Path) -> None:
+    class Reader:
+        """An encoder of any text, which takes its last word from the table."""
+
+        name, channels = "any", lc.Scene(folder / LIFT).channels
+
+        def encode(self, texts: list[str]) -> np.ndarray:
+            return lc.open_encoder(f"table:{folder / TABLE}").encode([text.split()[-1] for text in texts])
+
+    labels = write_labels(tmp_path, truth_of(folder), ("other apple", "salt and book", "no left lamp"))
+    evaluation = evaluate_lift(folder / LIFT, labels, encoder=Reader())
+    assert min(row.iou or 0 for row in evaluation.objects) > 0.9
+
+
 def test_unlabelled_pixels_count_nowhere(folder: Path, tmp_path: Path) -> None:
     """The book's right half is unlabelled, and the apple is called a book: only labelled pixels are counted."""
     apple, book, _ = truth_of(folder)["middle"]

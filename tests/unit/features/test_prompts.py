@@ -97,6 +97,7 @@ def test_masks_that_overlap_count_for_both_phrases(tmp_path: Path) -> None:
     [
         ({"a.png": MASKS["left"]["Lamp"]}, "outside of folders of phrases, without names"),
         ({"mug/a.png": numbered_masks("left")}, r"one value besides 0, a mask, got values from 7 to 14"),
+        ({"mug/a.png": 128 * np.eye(3, dtype=np.uint8)[[[0, 1]]]}, r"one colour besides black, a mask, got several"),
         ({"mug/a.png": MASKS["left"]["Lamp"], "a.json": "[]"}, "got a.json and a.png; .*--names"),
         (
             {"a.json": '[{"phrase": "mug", "segmentation": [[0, 0, 4, 0, 4, 4]]}]'},
