@@ -310,6 +310,7 @@ CAMERA_FILES = [
     ("list of annotations", b'[{"bbox": [1, 2]}]', "a list with {'bbox'"),
     ("frames of numbers", with_camera(frames=[1]), "objects"),
     ("frame without a name", with_camera(frames=[{}]), "'file_path'"),
+    ("frame of no name", with_camera(frames=[{"file_path": None}]), "as file_path, got None"),
     ("views twice", with_camera(frames=TWICE), "one view a name"),
     ("no size", with_camera(w=None), "size"),
     ("size of half a pixel", with_camera(w=9.5), "whole number"),

@@ -61,6 +61,7 @@ REFUSALS = {  # words behind the lift -> what the line says
     "query --like splat:0 --scores {m}.csv": "ending in .npy",
     "query --like splat:0 --object {m}.sog": "splat-transform",
     "query --like splat:0 --unlike splat:0 --threshold 1 --object {m}.ply": "nothing stands out",
+    "query --like splat:0 --min-size 99 --object {m}.ply": "20 in smaller objects",
     "segment --words nope --table {t}": "--words: expected a file of words, one a line",
     "segment --table {t} --map {m}.png": "got no --view and no --camera",
 }

@@ -104,6 +104,7 @@ def test_object_takes_a_name_and_is_hidden(client: httpx.Client, lift: dict[str,
     assert client.patch(f"{path}/0", json={"name": "the mug", "hidden": True}).status_code == 200
     first = client.get(path).json()["objects"][0]
     assert (first["name"], first["hidden"]) == ("the mug", True)
+    assert client.get(lift["links"]["tree"]).json()["nodes"][0]["name"] == "the mug"
     assert client.get("/render", params=view).content == rest
     assert client.patch(f"{path}/0", json={"name": None, "hidden": False}).status_code == 200
     assert client.get(path).json()["objects"] == before

@@ -51,7 +51,7 @@ def test_selection_is_begun_corrected_and_undone(client: httpx.Client, route: st
     selection = begin(client, route, **LAMP)
     lamp = rows_of(client, selection)
     assert selection["count"] == len(lamp) and set(lamp) <= set(range(40, 60)) and selection["box"]
-    addition = edit_of(client, selection, operation="add", area="middle:box:0,0,10,24", through=True)
+    addition = edit_of(client, selection, operation="add", area="middle:box:10,24,0,0", through=True)
     assert rows_of(client, addition) == [*range(SPLATS_A_CLUSTER), *lamp] and addition["count"] == 20 + len(lamp)
     back = client.patch(selection["links"]["self"], json={"step": 0}).json()
     assert (back["step"], rows_of(client, back)) == (0, lamp)

@@ -108,6 +108,11 @@ def test_image_names_that_are_no_utf8_give_a_warning(tmp_path: Path) -> None:
         require_pairs(["K\u00fcche_0", "K\u00fcche_1"], cameras)
 
 
+def test_centres_that_successors_of_inrias_trainer_write_are_read(tmp_path: Path) -> None:
+    camera = read_cameras(with_json(tmp_path, [{**RECORD, "cx": 3, "cy": 4.5}]))["r_0"]
+    assert (camera.cx, camera.cy) == (3, 4.5)
+
+
 def test_broken_poses_of_json_are_named_and_the_others_are_read(tmp_path: Path) -> None:
     good = {**RECORD, "img_name": "good.png"}
     records = [
