@@ -195,8 +195,8 @@ class Answers:
             _key(request, "world", "tree"), lambda: self._scene(request).tree(words, encoder=encoder)
         )
         labels = request["object_labels"]
-        given = {int(number): {"name": name, "score": None} for number, (name, _) in labels.items() if name}
-        return tree.replace(nodes=tuple(node.model_copy(update=given.get(node.id)) for node in tree.nodes))
+        names = {int(number): {"name": name, "score": None} for number, (name, _) in labels.items() if name}
+        return tree.replace(nodes=tuple(node.model_copy(update=names.get(node.id)) for node in tree.nodes))
 
     # Documents
 

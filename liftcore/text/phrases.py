@@ -107,9 +107,9 @@ def read_phrase(text: str, is_word: Callable[[str], bool] | None) -> Reading:
     Args:
         is_word: whether a table has a word for a text as a whole; None for an encoder that reads any text.
     """
-    whole = text.strip()
-    if len(whole) > 2 and whole[0] == whole[-1] == '"':
-        return Reading((whole[1:-1],), ())
+    phrase = text.strip()
+    if len(phrase) > 2 and phrase[0] == phrase[-1] == '"':
+        return Reading((phrase[1:-1],), ())
     is_name = is_word or (lambda _: False)
     typed = _tidy(text)
     if is_name(typed):

@@ -47,10 +47,10 @@ def test_splats_of_no_word_and_unseen_ones_are_named_none(clear: Scene) -> None:
     assert np.array_equal(segmentation.rows == -1, CLUSTER == 2)
     assert np.array_equal(segmentation.labels == 0, CLUSTER == 2)
     assert not segmentation.margin[rest].any() and not segmentation.score[rest].any()
-    along, named = clear.features[:] @ EYE[:2].T / clear.norms[:, None], np.arange(2 * SPLATS_A_CLUSTER)
-    own, other = along[named, CLUSTER[named]], along[named, 1 - CLUSTER[named]]
-    np.testing.assert_allclose(segmentation.score[named], own, atol=1e-6)
-    np.testing.assert_allclose(segmentation.margin[named], own - other, atol=1e-6)
+    cosines, rows = clear.features[:] @ EYE[:2].T / clear.norms[:, None], np.arange(2 * SPLATS_A_CLUSTER)
+    scores = cosines[rows, CLUSTER[rows]]
+    np.testing.assert_allclose(segmentation.score[rows], scores, atol=1e-6)
+    np.testing.assert_allclose(segmentation.margin[rows], scores - cosines[rows, 1 - CLUSTER[rows]], atol=1e-6)
     without_feature = Scene(replace(clear.lift, has_feature=torch.arange(COUNT) != 3), clear.splats)
     assert segment(without_feature, ["apple", "book", "lamp"], EYE[:3]).rows[3] == -1
     flat = Scene(replace(clear.lift, rows=torch.ones(COUNT, CHANNELS)), clear.splats)  # of equal scores
