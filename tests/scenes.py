@@ -118,10 +118,7 @@ def scenes(
 
 def centred(camera: Camera) -> Camera:
     """The camera with its principal point at the image's centre, as Inria's files assume."""
-    return Camera.pinhole(
-        camera.name, camera.width, camera.height, camera.fx, camera.fy,
-        camera.width / 2, camera.height / 2, camera.viewmat,
-    )  # fmt: skip
+    return camera.replace(cx=camera.width / 2, cy=camera.height / 2)
 
 
 def write_scene(

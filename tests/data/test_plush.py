@@ -11,7 +11,6 @@ import torch
 from liftcore.io.cameras import read_cameras
 from liftcore.io.splats import read_splats
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.scene.cameras import Cameras
 from liftcore.scene.compositing import CompositingParams
 
 if TYPE_CHECKING:
@@ -21,24 +20,10 @@ if TYPE_CHECKING:
 SAMPLE = 8  # views
 
 
-@pytest.fixture(scope="module")
-def plush(shared_data: Path) -> Path:
-    return shared_data / "plush"
-
-
-@pytest.fixture(scope="module")
-def cameras(plush: Path) -> Cameras:
-    return read_cameras(plush / "cameras.json")
-
-
-@pytest.fixture(scope="module")
-def raster(plush: Path) -> CpuRaster:
-    return CpuRaster(read_splats(plush / "point_cloud.ply"))
-
-
-def test_rays_are_as_full_as_the_training_measured(plush, cameras, raster):
-    stats = json.loads((plush / "stats.json").read_text())
-    names = sorted(cameras)[:: len(cameras) // SAMPLE]
+def test_rays_are_as_full_as_the_training_measured(shared_data: Path) -> None:
+    plush = shared_data / "plush"
+    stats, cameras = json.loads((plush / "stats.json").read_text()), read_cameras(plush / "cameras.json")
+    raster, names = CpuRaster(read_splats(plush / "point_cloud.ply")), sorted(cameras)[:: len(cameras) // SAMPLE]
     sums = torch.stack([raster.row_sums(cameras[name], CompositingParams()) for name in names])
     assert float(sums.mean()) == pytest.approx(stats["row_sum_mean"], abs=1e-3)  # of all views
     assert float(sums.std()) == pytest.approx(stats["row_sum_std"], abs=2e-2)

@@ -22,7 +22,6 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "clusters": {"preset": "row-sum", "aggregation": True, "aggregation_cluster_size": 5},
     "optimum": {"preset": "row-sum", "reference_channels": 2},
 }
-GRIDS = {"default", "smooth"}
 
 
 class Interruption(Exception):
@@ -54,22 +53,21 @@ def grids() -> RandomScene:
     return random_scene(grids=True)
 
 
-@pytest.mark.parametrize("name", SETTINGS)
-def test_threads_engines_and_resumption_change_no_bit(name: str, regions: RandomScene, tmp_path: Path) -> None:
-    settings = SETTINGS[name]
-    expected = lift(regions, threads=1, **settings)
-    assert lift(regions, threads=3, **settings) == expected
-    assert lift(regions, engine=ShuffledEngine(2), **settings) == expected
+@pytest.mark.parametrize(
+    ("name", "kind"), [*((name, "regions") for name in SETTINGS), ("default", "grids"), ("smooth", "grids")]
+)
+def test_threads_engines_and_resumption_change_no_bit(
+    name: str, kind: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    scene, settings = request.getfixturevalue(kind), SETTINGS[name]
+    expected = lift(scene, threads=1, **settings)
+    assert lift(scene, threads=3, **settings) == expected
+    assert lift(scene, engine=ShuffledEngine(2), **settings) == expected
     for stage in ("geometry", "solve"):
         with pytest.raises(Interruption):
-            lift(regions, interrupt_at(stage), checkpoint=tmp_path, **settings)
+            lift(scene, interrupt_at(stage), checkpoint=tmp_path, **settings)
     assert any(tmp_path.iterdir())
-    assert lift(regions, threads=2, checkpoint=tmp_path, **settings) == expected
-
-
-@pytest.mark.parametrize("name", sorted(GRIDS))
-def test_threads_engines_and_resumption_change_no_bit_of_grids(name: str, grids: RandomScene, tmp_path: Path) -> None:
-    test_threads_engines_and_resumption_change_no_bit(name, grids, tmp_path)
+    assert lift(scene, threads=2, checkpoint=tmp_path, **settings) == expected
 
 
 @pytest.mark.parametrize("kernel", KERNELS[1:])
@@ -80,11 +78,9 @@ def test_threads_and_engines_change_no_bit_of_any_kernel(kernel: str) -> None:
     assert lift(scene, engine=lc.open_engine("local", threads=1)) == expected
 
 
-@pytest.mark.parametrize("name", ["regions", "grids"])
-def test_container_of_the_views_changes_no_bit(
-    name: str, regions: RandomScene, grids: RandomScene, tmp_path: Path
-) -> None:
-    scene = {"regions": regions, "grids": grids}[name]
+@pytest.mark.parametrize("kind", ["regions", "grids"])
+def test_container_of_the_views_changes_no_bit(kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    scene = request.getfixturevalue(kind)
     expected = lift(scene)
     reversed_views = dict(reversed(scene.views.items()))
     for views in (

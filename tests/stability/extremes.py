@@ -1,4 +1,4 @@
-"""Lifts of extreme inputs against exact arithmetic: one table an aspect, each row a test (``test_table.py``).
+"""Lifts of extreme inputs against exact arithmetic: one table an aspect, each row a test (``test_extremes.py``).
 
 The error of weights is the largest difference from the float64 reference over all weights, their squares, the row
 sums and the total weight, on all rays of the view; rays that float32 decided otherwise at a cut-off are left out. The

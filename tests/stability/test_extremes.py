@@ -1,4 +1,4 @@
-"""Sums over many rays, footprints by their formula, and lifts at any length of features."""
+"""The tables of extremes, sums over many rays, footprints by their formula, and lifts at any length of features."""
 
 from __future__ import annotations
 
@@ -15,10 +15,19 @@ from liftcore.scene.compositing import CompositingParams, Weighting
 from liftcore.scene.splats import Kernel
 from liftcore.values.views import Regions
 from tests.scenes import camera_at_origin, splats_at
-from tests.stability.extreme_measures import cloud, run, trace_weights
-from tests.stability.extremes import checkerboard
+from tests.stability.extreme_measures import Extreme, cloud, run, trace_weights
+from tests.stability.extremes import EXTREMES, checkerboard
 
 pytestmark = pytest.mark.usefixtures("every_kernel")
+ROWS = [(extreme, kernel) for extreme in EXTREMES for kernel in extreme.kernels]
+
+
+@pytest.mark.parametrize(("extreme", "kernel"), ROWS, ids=[f"{row.name}-{kernel}" for row, kernel in ROWS])
+def test_extreme_is_survived_with_the_stated_error(extreme: Extreme, kernel: Kernel) -> None:
+    measured = extreme.measure(kernel)
+    assert measured.holds
+    assert measured.error <= extreme.bound
+    assert extreme.text in " ".join(measured.text)
 
 
 def test_sums_over_a_million_rays_are_those_of_float64():

@@ -1,4 +1,4 @@
-"""Progress bars and progress callbacks of the library."""
+"""Progress bars of the library."""
 
 import io
 from typing import Any
@@ -36,9 +36,3 @@ def test_bars_are_drawn_on_a_terminal_alone_and_not_where_they_are_declined(monk
     assert output["declined"] == output["file"] == ""
     monkeypatch.setattr("sys.stderr", None)  # as under pythonw
     lifted()
-
-
-def test_function_is_called() -> None:
-    stages: list[str] = []
-    lifted(progress=lambda stage, completed, total, unit: stages.append(stage))
-    assert "geometry" in stages
