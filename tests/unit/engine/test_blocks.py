@@ -74,9 +74,6 @@ def test_lift_goes_on_from_the_pieces_in_its_folder(scene: dict[str, Any], tmp_p
     assert result.metadata.text_space == "words" and not draft.exists()
     assert_same(result, in_blocks(LocalEngine(1), scene, settings))
     assert_same(result, in_blocks(LocalEngine(1), stored, settings, folder=folder))  # smooth once, not twice
-    settings = LiftSettings.of(preset="row-sum")
-    second = in_blocks(LocalEngine(1), stored, settings, folder=folder)  # pieces of another lift
-    assert_same(second, in_blocks(LocalEngine(1), scene, settings))
 
 
 def test_folder_that_is_full_or_that_workers_do_not_see_is_named(scene: dict[str, Any], tmp_path: Path) -> None:

@@ -294,6 +294,11 @@ def exported(cameras: Cameras, path: Path, **fields: Any) -> Path:
     return path
 
 
+def test_an_export_has_the_intrinsics_of_the_transforms_beside_it(expected: Cameras, run: Path) -> None:
+    """The poses of an export are in the frame of the run's splats already."""
+    assert_same(read_cameras(exported(expected, run / "transforms_train.json")), expected)
+
+
 def test_an_export_without_intrinsics_is_refused_as_what_it_is(expected: Cameras, tmp_path: Path) -> None:
     path = exported(expected, tmp_path / "transforms_train.json")
     with pytest.raises(

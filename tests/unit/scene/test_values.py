@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,14 +10,10 @@ import pytest
 import torch
 
 from liftcore.errors import InvalidCameras, NotFound
-from liftcore.io.cameras import read_cameras
-from liftcore.io.transforms import transforms_of
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
 from liftcore.scene.views import MAX_VIEWS, view_names
-from tests.camera_files import IMAGES, binary_files, text_files, with_json, write_files
-from tests.inria_file import write_inria_cameras
 
 K = np.array([[50.0, 0.0, 32.0], [0.0, 51.0, 24.0], [0.0, 0.0, 1.0]])
 
@@ -107,25 +101,6 @@ def test_more_views_than_a_scene_may_have_are_refused_by_their_names() -> None:
     names = [f"{k}.jpg" for k in range(MAX_VIEWS + 1)]
     with pytest.raises(InvalidCameras, match="at most 100000 views, got 100001; lift fewer photos"):
         view_names(names)
-
-
-RIG = [f"camA/{k:03}.jpg" for k in range(4)] + [f"camB/{k:03}.jpg" for k in range(3)]
-
-
-@pytest.mark.parametrize("kind", ["folder", "text", "zip", "transforms", "inria"])
-def test_every_view_of_a_rig_keeps_its_folder_in_every_format(kind: str, tmp_path: Path) -> None:
-    images = [(*IMAGES[0][:3], name) for name in RIG]
-    path = write_files(tmp_path / "rig", (text_files if kind == "text" else binary_files)(images=images))
-    if kind == "zip":
-        path = Path(shutil.make_archive(str(path), "zip", path))
-    elif kind == "transforms":
-        path = with_json(tmp_path, transforms_of(read_cameras(path)))
-    elif kind == "inria":
-        cameras = [view.replace(cx=view.width / 2, cy=view.height / 2) for view in read_cameras(path).values()]
-        path = tmp_path / "cameras.json"
-        write_inria_cameras(Cameras(cameras), path)
-    names = [name.removeprefix("images/") for name in read_cameras(path)]
-    assert names == [name.removesuffix(".jpg") for name in RIG]
 
 
 def test_a_view_is_found_by_its_last_part_and_else_its_neighbours_are_named() -> None:
