@@ -361,8 +361,8 @@ def compare_seconds(options: argparse.Namespace) -> int:
         lifts = partial(lift_in_process, folder=folder.resolve(), pack=pack, preset=preset, threads=threads)
         list(map(lifts, checkouts))  # compiles kernels and reads files, not counted
         turns = np.array([list(map(lifts, checkouts)) for _ in range(options.turns)])  # [turns, 2, 2]
-        (own_median, other_median), ratios = np.median(turns[..., 0], axis=0), turns[:, 0, 0] / turns[:, 1, 0]
-        seconds = f"{own_median:.2f} | {other_median:.2f} | {own_median / other_median:.3f} | {ratios.min():.3f}, {ratios.max():.3f}"
+        (first, second), ratios = np.median(turns[..., 0], axis=0), turns[:, 0, 0] / turns[:, 1, 0]
+        seconds = f"{first:.2f} | {second:.2f} | {first / second:.3f} | {ratios.min():.3f}, {ratios.max():.3f}"
         peaks = " | ".join(f"{peak:.0f}" for peak in turns[..., 1].max(axis=0))
         print(f"| {folder.name} | {preset} | {seconds} | {peaks} |", flush=True)
     return 0
