@@ -48,12 +48,6 @@ def default_lift(truth: Truth, folder: Path) -> lc.LiftResult:
     return truth.lift(read_pack(folder, "features", stride=4))
 
 
-@pytest.fixture(scope="module")
-def hard(truth: Truth, folder: Path) -> lc.LiftResult:
-    """The lift of masks of which many are wrong, by default; every fourth view."""
-    return truth.lift(read_pack(folder, "features_hard", stride=4))
-
-
 def test_the_splats_that_count_are_those_of_the_data_readme(truth: Truth) -> None:
     share = float(truth.evaluated.float().mean())
     assert share == pytest.approx(0.9056, abs=5e-4)
@@ -80,7 +74,8 @@ def ranked(truth: Truth, lifted: lc.LiftResult) -> float:
     return float((ranks[right].sum() - hits * (hits + 1) / 2) / (hits * (right.size - hits)))
 
 
-def test_hard_masks_gain_and_confidence_tells_right_from_wrong(truth: Truth, hard: lc.LiftResult) -> None:
+def test_hard_masks_gain_and_confidence_tells_right_from_wrong(truth: Truth, folder: Path) -> None:
+    hard = truth.lift(read_pack(folder, "features_hard", stride=4))  # by default
     figures = truth.evaluate(hard)
     assert figures.accuracy > 0.893  # .818 with row-sum, .862 with a robust step
     assert figures.miou > 0.894  # .834 and .878

@@ -181,7 +181,7 @@ POSES = {  # name of the photo -> quaternion w x y z and translation, from the w
     "frame 1.jpg": ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 2.0)),
     "left/000.png": ((0.5, 0.5, 0.5, 0.5), (1.0, 2.0, 3.0)),
     "right/000.png": ((0.5, 0.5, 0.5, 0.5), (1.1, 2.0, 3.0)),  # of a rig: all views keep their folders
-    "c.0003.JPG": ((0.0, 0.0, 2.0, 0.0), (0.5, -0.5, 1.0)),  # no unit quaternion
+    "left/c.0003.JPG": ((0.0, 0.0, 2.0, 0.0), (0.5, -0.5, 1.0)),  # no unit quaternion
 }
 SIZE, INTRINSICS = (640, 480), (500.0, 510.0, 320.0, 240.0)  # fx, fy and the principal point
 PINHOLE = (1, "PINHOLE", INTRINSICS)  # COLMAP's number, name and parameters
@@ -229,7 +229,7 @@ CAMERA_FILES = {
 
 
 def assert_cameras(cameras: lc.Cameras) -> None:
-    assert {name.removeprefix("images/") for name in cameras} == {"frame 1", "left/000", "right/000", "c.0003"}
+    assert {name.removeprefix("images/") for name in cameras} == {"frame 1", "left/000", "right/000", "left/c.0003"}
     for name, matrix in viewmats().items():
         camera = cameras[name.rpartition(".")[0]]
         np.testing.assert_allclose(camera.viewmat, matrix, atol=1e-9)

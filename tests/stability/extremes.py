@@ -61,7 +61,6 @@ def _visible(A: np.ndarray) -> bool:
 
 # fmt: off
 OPACITIES: tuple[Extreme, ...] = (
-
     view_of("opacity logits of +-infinity, as converters of quantised splats write them",
         at(ROW, logits=[math.inf, -math.inf, 0.5, math.inf, -math.inf]), _opaque_or_absent),
     view_of("every splat transparent (logits of -20)", at(ROW, logits=-20.0), lambda A: A.max() == 0, kernels=FLOORED,
@@ -70,7 +69,6 @@ OPACITIES: tuple[Extreme, ...] = (
         bound=1e-12),
     view_of("every splat opaque (logits of 1e4)", at(MIDDLE * 6, logits=OPAQUE),
         lambda A: (A > 0.5).sum(axis=1).max() == 1 and A[CENTRE, 1:].max() <= 0.0099 + 1e-6),
-
     view_of("a cap of 0.9999999", at(MIDDLE * 3, logits=OPAQUE, params=replace(ENDLESS, alpha_cap=0.9999999)),
         lambda A: A[CENTRE, 0] > 0.999999),
 )
@@ -97,7 +95,6 @@ SHAPES: tuple[Extreme, ...] = (
         _visible, kernels=DISC),
     view_of("quaternions of zero", at(ROW, [0.0, -2.0, -3.0], quats=(0.0, 0.0, 0.0, 0.0)),
         like=at(ROW, [0.0, -2.0, -3.0]), text="zero quaternion"),
-
     view_of("dust under the mip filter's compensation", at(ROW, DUST, params=lc.CompositingParams(antialiased=True)),
         lambda A: A.max() == 0, kernels=GAUSSIAN, text="smaller than 1e-07 scene units"),
     view_of("700 discs behind each other, of which a ray meets few before it has stopped",
@@ -174,7 +171,6 @@ PLACES: tuple[Extreme, ...] = (
     view_of("splats on the near plane, a rounding before it, at the camera and behind",
         at([(0.0, 0.0, z) for z in (ON_NEAR_PLANE, math.nextafter(0.01, 0), 0.0, -0.01, -5.0)], -4.0),
         lambda A: A[:, 0].max() > 0 and A[:, 1:].max() == 0),
-
     Extreme("a million splats on one ray", _crowd(-5.0), kernels=FLOORED),
     Extreme("a million DBS splats of alpha 1e-6 on one ray", _crowd(math.log(1e-6)), kernels=BETA, bound=1e-4),
 )
@@ -195,8 +191,6 @@ VIEWS: tuple[Extreme, ...] = (
     view_of("a principal point 1e6 px outside the image",
         at([*ROW, (-2e6 / 16 + 1.0, 0.0, 2.0)], 0.5, camera=_pinhole(16, 12, 16.0, (1e6, 6.5), np.eye(4))),
         lambda A: A[:, 5].max() > 0.1, text="principal point far off the centre"),
-
-
 )
 # fmt: on
 
@@ -276,14 +270,11 @@ LENGTHS: tuple[Extreme, ...] = (
             text="" if stored == torch.float16 else "float16 does not hold",
         )
         for scale, dtype, stored in (
-
             (65_504.0, torch.float32, torch.float16),
             (70_000.0, torch.float32, torch.float32),
-
             (1e-30, torch.float32, torch.float32),
         )
     ),
-
     lift_of("a codebook of zeros", lc.Regions(checkerboard(3).labels, torch.zeros(3, 7)),
         lambda lift: not lift.features.any(), bound=0.0, text="codebook rows are zero"),
     lift_of("vectors that cancel: +1e4 and -9990 in turn", _cancelling()),
@@ -292,12 +283,10 @@ LENGTHS: tuple[Extreme, ...] = (
 
 # fmt: off
 MAPS: tuple[Extreme, ...] = (
-
     lift_of("a region a pixel", _region_a_pixel()),
     lift_of("labels of 32,766 and 32,767, the last of int16",
         _labelled(LARGEST_I16 - np.indices((HEIGHT, WIDTH)).sum(axis=0) % 2, LARGEST_I16 + 1), kernels=GAUSSIAN,
         text="are read by no label"),
-
     lift_of("a view without any label", _labelled(np.full((3, 4), -1), 2),
         lambda lift: not bool(lift.has_feature.any()) and bool((lift.total_weight > 0).any()), bound=0.0,
         text="no labelled ray reached any splat"),
@@ -310,8 +299,6 @@ MAPS: tuple[Extreme, ...] = (
         splats=splats_at([(0.125, 0.125, 0.0)], -12.0, logits=-4.0), kernels=GAUSSIAN),
     lift_of("a grid of 1 x 1 cell", lc.FeatureGrid(torch.ones(1, 1, 6)),
         lambda lift: bool((lift.features[lift.has_feature] - 1).abs().max() < 1e-6)),
-
-
     lift_of("a grid finer than the pixels", random_grid(0, (50, 70))),
     lift_of("squared weights and a gain of 16", checkerboard(), settings={"power": 2, "gain": 16.0},
         kernels=GAUSSIAN),

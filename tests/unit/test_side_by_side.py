@@ -25,7 +25,6 @@ class Staged:
 
     def __init__(self, waits: dict[str, str] | None = None) -> None:
         self.events: list[str] = []
-        self.is_forgotten = False
         self._waits = waits or {}
         self._condition = threading.Condition()
 
@@ -48,7 +47,7 @@ class Staged:
         """Return nothing."""
 
     def forget(self) -> None:
-        self.is_forgotten = True
+        """Have no view to forget."""
 
 
 def requests_of(*names: str) -> Iterator[ViewRequest]:

@@ -19,13 +19,7 @@ from torch import Tensor, nn
 from liftcore.errors import InvalidFeatures, InvalidInput, Unavailable
 from liftcore.features.encoders import Pixels, open_image_encoder
 from liftcore.features.encoders.clip import ClipImageEncoder, resnet_values, vit_values
-from liftcore.features.encoders.encode import (
-    MAX_CELLS,
-    encode_images,
-    find_images,
-    grid_size,
-    read_image,
-)
+from liftcore.features.encoders.encode import MAX_CELLS, encode_images, find_images, grid_size, read_image
 from liftcore.features.encoders.timm_backbone import TimmEncoder
 from liftcore.io.photos import Reading, read_header
 from liftcore.text import open_clip as weights

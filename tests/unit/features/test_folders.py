@@ -122,7 +122,6 @@ class _Code:
     [
         _Code(), {"a": torch.ones(2, 3, 4)}, torch.ones(1).expand(1 << 10, 1 << 10, 1 << 10),
         torch.ones(2, 3, 4).to_sparse(), torch.ones(2, 3, 4, dtype=torch.int64),
-
     ],
 )  # fmt: skip
 def test_tensors_that_are_no_maps_are_refused_and_no_code_runs(

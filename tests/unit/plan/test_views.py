@@ -5,11 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from liftcore.lifting.planning.views import (
-    count_covering_views,
-    view_order,
-    visibility,
-)
+from liftcore.lifting.planning.views import count_covering_views, view_order, visibility
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.compositing import CompositingParams, Weighting
 from liftcore.scene.splats import Kernel

@@ -15,13 +15,7 @@ from liftcore.query.ask import ask
 from liftcore.query.colours import cluster_colours
 from liftcore.query.objects import objects
 from liftcore.query.question import Query
-from liftcore.query.render import (
-    expected_depth,
-    render,
-    render_png,
-    shown_depth,
-    view_mask,
-)  # fmt: skip
+from liftcore.query.render import expected_depth, render, render_png, shown_depth, view_mask
 from liftcore.query.scene import Scene
 from liftcore.query.splat_colours import principal_colours, view_colours
 from liftcore.query.terms import Vector

@@ -41,7 +41,6 @@ def test_every_word_of_a_table_is_asked_as_it_is() -> None:
          ("a photo of cows", "cow", "head"), ("cup of tea", "cup", "head"),
          ("a pizza slice", "pizza", "head"), ("man with a hat", "person", "head"),
          ("the fish's tail", "fish", "head"),
-
     ],
 )  # fmt: skip
 def test_text_is_asked_as_the_word_that_stands_for_it(text: str, word: str, match: str) -> None:

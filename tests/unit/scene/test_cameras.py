@@ -24,11 +24,6 @@ TRANSFORMS = {
 }
 
 
-@pytest.fixture
-def model(tmp_path: Path) -> Path:
-    return write_files(tmp_path / "model", binary_files())
-
-
 RECORD = {
     "img_name": "r_0",
     "width": 9,

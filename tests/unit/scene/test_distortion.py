@@ -10,7 +10,7 @@ import pytest
 from liftcore.errors import InvalidCameras
 from liftcore.io.colmap import MODELS_BY_NAME, calibration
 from liftcore.scene.cameras import Camera, behind_lens
-from liftcore.scene.distortion import FARTHEST, Brown, Distortion, Fisheye, Lens
+from liftcore.scene.distortion import FARTHEST, Brown, Distortion, Fisheye
 
 POINTS = np.array([[0.1, 0.2], [-0.6, 0.45], [0.7, -0.5], [0.0, 0.55]])
 RATIONAL = Brown(k1=-0.28, k2=0.09, k3=-0.015, k4=0.02, k5=-0.01, k6=0.004, p1=0.0012, p2=-0.0007)
@@ -93,27 +93,17 @@ def camera(distortion: Distortion) -> Camera:
     return behind_lens(Camera.pinhole("v", 64, 48, 50.0, 51.0, 31.36, 24.96, np.eye(4)), distortion)
 
 
-def corners(view: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions on the plane of all corners of a pinhole's pixels."""
-    x, y = np.meshgrid(np.arange(view.width + 1), np.arange(view.height + 1))
-    return (x - view.cx) / view.fx, (y - view.cy) / view.fy
-
-
-def lens_of(view: Camera) -> Lens:
-    assert view.lens is not None
-    return view.lens
-
-
 @pytest.mark.parametrize("name", LENSES)
 def test_the_pinhole_of_a_photo_is_the_largest_that_it_shows_whole(name: str) -> None:
     view = camera(LENSES[name])
-    lens = lens_of(view)
-    assert view.photo_size == (64, 48)
+    lens = view.lens
+    assert lens is not None and view.photo_size == (64, 48)
     assert (view.fx, view.fy) == (lens.fx, lens.fy)
 
     def outside(of: Camera) -> float:
         """Return the distance of the farthest corner from the photo, in pixels of the photo."""
-        u, v = lens.on_photo(*corners(of))
+        x, y = np.meshgrid(np.arange(of.width + 1), np.arange(of.height + 1))
+        u, v = lens.on_photo((x - of.cx) / of.fx, (y - of.cy) / of.fy)
         return float(max(-u.min(), u.max() - lens.width, -v.min(), v.max() - lens.height))
 
     assert outside(view) < 1e-9

@@ -71,24 +71,16 @@ GSPLAT = "absgrad: false\nantialiased: {}\napp_opt: false\nresult_dir: results\n
 NERFSTUDIO = "!!python/object:T\npipeline: !!python/object:V\n  model: !!python/object:S\n    rasterize_mode: {}\n"
 SAYING: dict[str, tuple[Callable[[Path], Path], tuple[Kernel, bool], str | None]] = {
     "nothing": (ply_saying, CLASSIC, None),
-
-
     "2dgs of three scales": (lambda f: ply_saying(f, "comment SplatRenderMode: 2dgs"), DISCS, "2dgs"),
-
     "Postshot's 1": (lambda f: ply_saying(f, "comment antialiased 1"), MIP, "antialiased 1"),
-
     "the last of two": (
         lambda f: ply_saying(f, "comment antialiased 0", "comment SplatRenderMode: mip"), MIP, "mip"
     ),
     "a comment on it": (lambda f: ply_saying(f, "comment not antialiased 1 at all"), CLASSIC, None),
     "compressed PLY": (lambda f: compressed_saying(f, "comment SplatRenderMode: mip"), MIP, "mip"),
-
     **{f"SPZ {v}": (lambda f, v=v: spz_saying(f, v, 1), MIP, "flag") for v in (1, 2, 3, 4)},
-
     "SOG": (lambda f: sog_saying(f, "antialiased"), MIP, "model"),
-
     "gsplat's configuration": (lambda f: checkpoint_beside(f, "cfg.yml", GSPLAT.format("true")), MIP, "cfg.yml"),
-
     "gsplat's discs": (lambda f: checkpoint_beside(f, "cfg.yml", "model_type: 2dgs\n"), DISCS, "cfg.yml"),
     "nerfstudio's": (
         lambda f: checkpoint_beside(f, "config.yml", NERFSTUDIO.format("antialiased")), MIP, "config.yml"

@@ -17,11 +17,7 @@ import torch
 
 from liftcore.errors import InvalidSplats
 from liftcore.io.formats import SplatFormat
-from liftcore.io.splats import (
-    read_splats,
-    recoloured,
-    some_rows,
-)
+from liftcore.io.splats import read_splats, recoloured, some_rows
 from liftcore.io.spz import FRAME_EXTENSION, FRAMES
 from liftcore.query.splat_colours import _sh_basis
 from liftcore.scene.harmonics import band_rotation, band_values, constant_terms

@@ -124,11 +124,6 @@ def books_of(W: RegionWeights, seed: int) -> list[torch.Tensor]:
     return [torch.from_numpy(rng.normal(size=(int(n), 5)).astype(np.float32)) for n in W.offsets.diff()]
 
 
-def all_regions(W: RegionWeights) -> torch.Tensor:
-    """All regions, [M] bool."""
-    return torch.ones(int(W.offsets[-1]), dtype=torch.bool)
-
-
 def step_of(
     W: RegionWeights, books: list[torch.Tensor], q: np.ndarray, masks: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
@@ -166,7 +161,7 @@ def step_of(
 @pytest.mark.parametrize("seed", [1, 2])
 def test_reliability_and_confidence_equal_their_definition(seed: int) -> None:
     W, levels = random_scene(seed, views=5)
-    masks = all_regions(W)
+    masks = torch.ones(int(W.offsets[-1]), dtype=torch.bool)
     masks[: int(W.offsets[seed % 3])] = False  # of some views, as those of grids
     books, q = books_of(W, seed), mask_consensus(W, levels)
     consensus = torch.from_numpy(q)
