@@ -167,10 +167,7 @@ class ListSettings(argparse.Action):
 
 
 def add_fields(
-    parser: argparse.ArgumentParser,
-    model: type[Body],
-    names: Iterable[str],
-    overrides: Mapping[str, dict[str, Any]],
+    parser: argparse.ArgumentParser, model: type[Body], names: Iterable[str], overrides: Mapping[str, dict[str, Any]]
 ) -> None:
     """Add an option for each field of a model, with its description and type.
 

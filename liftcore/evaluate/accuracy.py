@@ -56,10 +56,7 @@ def shared_pixels(labels: Tensor, truth: Tensor, count: int) -> tuple[Tensor, Te
 
 
 def centred_cosines(
-    raster: Raster,
-    views: Sequence[tuple[Camera, ViewFeatures]],
-    features: Tensor,
-    params: CompositingParams,
+    raster: Raster, views: Sequence[tuple[Camera, ViewFeatures]], features: Tensor, params: CompositingParams
 ) -> list[float]:
     """Compute the mean cosine of rendered and observed features, a figure a view.
 

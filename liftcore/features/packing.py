@@ -25,11 +25,7 @@ OPTIONS = {  # of each kind of files
     "masks": ("unlabelled", "encoder", "photos", "device"),
     "prompts": ("unlabelled", "names", "unannotated"),
 }
-CHOICES = {
-    "layout": get_args(Layout),
-    "map_fit": FITS,
-    "unannotated": get_args(Unannotated),
-}
+CHOICES = {"layout": get_args(Layout), "map_fit": FITS, "unannotated": get_args(Unannotated)}
 NAMES = ("encoder", "text_space")  # of a pack
 
 

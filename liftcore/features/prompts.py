@@ -122,11 +122,7 @@ class Prompts:
 
 
 def prompt_views(
-    folder: Path,
-    names: Path | None = None,
-    *,
-    unlabelled: int | None = None,
-    unannotated: Unannotated = "skip",
+    folder: Path, names: Path | None = None, *, unlabelled: int | None = None, unannotated: Unannotated = "skip"
 ) -> Prompts:
     """Open the regions of a folder of masks by phrase (see the module). Each view is read at every access.
 

@@ -30,13 +30,7 @@ from liftcore.io.photos import PhotosBeside
 from liftcore.io.transforms import FRAME_FILE, cameras_in_frame, is_export, parse_export, parse_transforms, read_frame
 from liftcore.runtime.arguments import as_path
 from liftcore.runtime.folders import scratch_folder
-from liftcore.scene.cameras import (
-    Camera,
-    Cameras,
-    InvalidPose,
-    read_views,
-    viewmat_of,
-)
+from liftcore.scene.cameras import Camera, Cameras, InvalidPose, read_views, viewmat_of
 from liftcore.scene.views import view_names
 
 TRANSFORMS, TRAINED_ON = "transforms.json", "transforms_train.json"

@@ -12,13 +12,7 @@ import numpy as np
 
 from liftcore.errors import InvalidCameras, naming, reading
 from liftcore.io.files import open_regular, refuse_pointer
-from liftcore.scene.cameras import (
-    Camera,
-    Cameras,
-    InvalidPose,
-    behind_lens,
-    read_views,
-)
+from liftcore.scene.cameras import Camera, Cameras, InvalidPose, behind_lens, read_views
 from liftcore.scene.distortion import Brown, Distortion, Fisheye
 from liftcore.scene.quaternions import rotation_matrices
 from liftcore.scene.views import REPLACED, view_names

@@ -85,10 +85,7 @@ _WEB_PAGE = FileKind(
 )
 _PICKLE = FileKind("a Python pickle, which may run code when it is opened", EXPORT_PLY)
 _GLTF = FileKind("a glTF model without splats (KHR_gaussian_splatting)", f"a mesh has none: {NOT_CONVERTED}")
-_USD = FileKind(
-    "a USD scene",
-    "USD is written and not read: give the splats as .ply or .glb",
-)
+_USD = FileKind("a USD scene", "USD is written and not read: give the splats as .ply or .glb")
 _STREAMED = FileKind(
     "a streamed SOG, whose levels of detail lie in many files", "give the .ply or .sog that it was made of"
 )

@@ -162,10 +162,7 @@ def ply_blocks(splats: Splats) -> Iterator[bytes]:
 
 
 def rewritten(
-    path: Path,
-    count: int,
-    columns: Mapping[str, np.ndarray] = MappingProxyType({}),
-    mask: np.ndarray | None = None,
+    path: Path, count: int, columns: Mapping[str, np.ndarray] = MappingProxyType({}), mask: np.ndarray | None = None
 ) -> Iterator[bytes]:
     """Yield a PLY with other columns and fewer rows, a block at a time; all else stays byte for byte.
 

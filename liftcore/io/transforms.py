@@ -19,15 +19,7 @@ from liftcore.errors import InvalidCameras, InvalidInput, reading
 from liftcore.io.colmap import PANORAMA, PINHOLES, Intrinsics, distortion_of
 from liftcore.io.json_file import FORMATS, matrix, number, pixels, read_json
 from liftcore.io.photos import PhotoHeader, PhotosBeside
-from liftcore.scene.cameras import (
-    CAMERA_AXES,
-    Camera,
-    Cameras,
-    InvalidPose,
-    behind_lens,
-    read_views,
-    viewmat_of,
-)
+from liftcore.scene.cameras import CAMERA_AXES, Camera, Cameras, InvalidPose, behind_lens, read_views, viewmat_of
 from liftcore.scene.distortion import Distortion
 from liftcore.scene.similarity import similarity_named
 from liftcore.scene.views import cameras_of_views, view_names
@@ -48,15 +40,7 @@ SUPPORTED_COEFFICIENTS = {
     False: ("k1", "k2", "k3", "p1", "p2"),
 }  # of a fisheye, and of others
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
-OTHER_LENSES = (
-    "latlong",
-    "equirectangular",
-    "ftheta_p0",
-    "ftheta_p1",
-    "ftheta_p2",
-    "ftheta_p3",
-    "ftheta_p4",
-)
+OTHER_LENSES = ("latlong", "equirectangular", "ftheta_p0", "ftheta_p1", "ftheta_p2", "ftheta_p3", "ftheta_p4")
 UNDISTORT = (
     "undistort the photos first (OpenCV does it, or 'colmap image_undistorter' where there is a COLMAP model), train "
     "and lift on them, and write their fl_x, fl_y, cx and cy without distortion"

@@ -17,13 +17,7 @@ from liftcore.lifting import steps
 from liftcore.solve.consensus import mean_share
 from liftcore.solve.diagnostics import ViewMeasures, measure_samples
 from liftcore.solve.directions import RegionDirections
-from liftcore.solve.objects import (
-    NodeVectors,
-    RegionObjects,
-    add_regions,
-    choose_nodes,
-    number_objects,
-)
+from liftcore.solve.objects import NodeVectors, RegionObjects, add_regions, choose_nodes, number_objects
 from liftcore.solve.region_tree import RegionTree, region_tree
 from liftcore.solve.reweight import SceneConsistency, median_reliability
 

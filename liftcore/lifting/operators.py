@@ -106,10 +106,7 @@ def weights_at(
 
 
 def _open_view(
-    splats: Splats,
-    camera: Camera,
-    params: CompositingParams | None,
-    threads: int | None,
+    splats: Splats, camera: Camera, params: CompositingParams | None, threads: int | None
 ) -> tuple[Raster, CompositingParams]:
     """Check the arguments of `render`, and return the raster of the splats with the parameters of compositing."""
     splats = check_splats_and_threads(splats, threads)

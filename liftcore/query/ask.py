@@ -11,13 +11,7 @@ import numpy as np
 
 from liftcore.errors import InvalidQuery
 from liftcore.query.candidates import candidates, parts_of
-from liftcore.query.directions import (
-    directions,
-    object_words,
-    part_phrase,
-    read_query,
-    wordings,
-)
+from liftcore.query.directions import directions, object_words, part_phrase, read_query, wordings
 from liftcore.query.presence import (
     NOT_IN_WORDS,
     References,
@@ -30,14 +24,7 @@ from liftcore.query.presence import (
     small_table_of,
     table_of,
 )
-from liftcore.query.question import (
-    Answer,
-    Candidate,
-    Presence,
-    Query,
-    Threshold,
-    WordMatch,
-)
+from liftcore.query.question import Answer, Candidate, Presence, Query, Threshold, WordMatch
 from liftcore.query.scene import AnyEncoder, Scene, as_numpy
 from liftcore.query.scores import LEAST_LIKENESS, LOWEST_COSINE, combine, cosines, cosines_about, spaced
 from liftcore.query.selection import (
@@ -161,10 +148,7 @@ def resolve_query(scene: Scene, query: Query, encoder: TextEncoder | None) -> Re
 
 
 def _resolve(
-    scene: Scene,
-    query: Query,
-    encoder: TextEncoder | None,
-    phrase: PartPhrase | None = None,
+    scene: Scene, query: Query, encoder: TextEncoder | None, phrase: PartPhrase | None = None
 ) -> ResolvedQuery:
     """Resolve a query as a whole, or for the part that a phrase names.
 

@@ -110,10 +110,7 @@ def object_words(scene: Scene, words: Sequence[str], vectors: np.ndarray) -> tup
 
 
 def directions(
-    scene: Scene,
-    query: Query,
-    encoder: TextEncoder | None,
-    asked_as: Mapping[int, Wording] = {},
+    scene: Scene, query: Query, encoder: TextEncoder | None, asked_as: Mapping[int, Wording] = {}
 ) -> np.ndarray:
     """Return the unit vector of every term, [n, F] f32.
 

@@ -13,14 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, get_args
 
-from pydantic import (
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    PlainSerializer,
-    PrivateAttr,
-    model_validator,
-)
+from pydantic import BeforeValidator, ConfigDict, Field, PlainSerializer, PrivateAttr, model_validator
 
 from liftcore.errors import InvalidQuery
 from liftcore.query.terms import NOTATIONS, SETS, Example, SplatSet, Term, Vector, parse_example, parse_set
@@ -67,13 +60,9 @@ EXAMPLES = f"{NOTATIONS}, of at most {MOST_CHARACTERS} characters, or a vector"
 Notation = Annotated[str, Field(min_length=1, max_length=MOST_CHARACTERS, description=NOTATIONS)]
 Numbers = Annotated[tuple[float, ...], Field(min_length=1)]
 Texts = Annotated[list[str], BeforeValidator(_several)]
-Examples = Annotated[
-    list[Annotated[Notation | Numbers, takes(EXAMPLES)]],
-    BeforeValidator(_examples),
-]
+Examples = Annotated[list[Annotated[Notation | Numbers, takes(EXAMPLES)]], BeforeValidator(_examples)]
 Sets = Annotated[
-    list[Annotated[str, Field(min_length=1, max_length=120, description=SETS)]],
-    BeforeValidator(_several),
+    list[Annotated[str, Field(min_length=1, max_length=120, description=SETS)]], BeforeValidator(_several)
 ]
 Method = Literal["auto", "paper"]
 METHODS: tuple[str, ...] = get_args(Method)
@@ -170,8 +159,7 @@ class Query(Viewpoint):
 
     text: Texts = Field(default=[], description="what to look for; may be given several times")
     like: Examples = Field(
-        default=[],
-        description=f"an example of it: {NOTATIONS}, or a vector; may be given several times",
+        default=[], description=f"an example of it: {NOTATIONS}, or a vector; may be given several times"
     )
     negatives: Texts = Field(default=[], description="what it is not; may be given several times")
     unlike: Examples = Field(default=[], description="an example of what it is not, likewise")

@@ -226,7 +226,7 @@ class Scene:
         """Return the pixels of a view with the answer's objects, [H, W] bool; arguments as in `view_mask`."""
         return self.view_mask(query, view, encoder=encoder).mask
 
-    def select(self, name: str, source: Answer | Query | str | np.ndarray | int | None = None) -> Selection:
+    def select(self, name: str, source: Answer | Query | str | np.ndarray | Tensor | int | None = None) -> Selection:
         """Return the selection of a name, a new one if there is none; `Selection.edit` changes its splats.
 
         Queries take it as ``Query(sets=["selection:NAME"])``, and as an example by ``like="selection:NAME"``.
@@ -455,11 +455,7 @@ class Scene:
         return query if isinstance(query, Answer) else self.ask(query, encoder=encoder, places=False)
 
     def encoder(
-        self,
-        encoder: AnyEncoder = None,
-        *,
-        hint: str = "give encoder=, or vectors",
-        stand_in: bool = True,
+        self, encoder: AnyEncoder = None, *, hint: str = "give encoder=, or vectors", stand_in: bool = True
     ) -> TextEncoder:
         """Open the encoder of a specification once, with a cache of its last texts; return an encoder as it is.
 

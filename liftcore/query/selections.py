@@ -20,6 +20,8 @@ from liftcore.runtime.one_line import one_line
 from liftcore.scene.touching import REACH, spreads_along, touching_pairs
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from liftcore.scene.cameras import Camera
 
 MOST_HISTORY = 100  # steps in the history of a selection
@@ -64,7 +66,10 @@ class Selection:
         return object_box(self._scene.splats, rows, self._scene.weights_of(rows)) if rows.size else None
 
     def edit(
-        self, operation: str | Edit, source: Answer | Query | str | np.ndarray | int | None = None, **fields: Any
+        self,
+        operation: str | Edit,
+        source: Answer | Query | str | np.ndarray | Tensor | int | None = None,
+        **fields: Any,
     ) -> Self:
         """Edit the selection; edits that were undone before are dropped.
 

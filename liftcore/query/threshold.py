@@ -54,10 +54,7 @@ Result = tuple[float, str, bool]  # a threshold, its explanation, and True if th
 
 
 def find_threshold(
-    scores: ArrayLike,
-    method: str | float = "auto",
-    weights: ArrayLike | None = None,
-    least: float = -math.inf,
+    scores: ArrayLike, method: str | float = "auto", weights: ArrayLike | None = None, least: float = -math.inf
 ) -> Threshold:
     """Find a threshold on scores by one of the methods above.
 

@@ -81,14 +81,7 @@ class Camera:
     name: str
 
     def __init__(
-        self,
-        viewmat: Matrix,
-        K: Matrix,
-        width: int,
-        height: int,
-        *,
-        lens: Lens | None = None,
-        name: str = "",
+        self, viewmat: Matrix, K: Matrix, width: int, height: int, *, lens: Lens | None = None, name: str = ""
     ) -> None:
         if not isinstance(name, str):
             raise InvalidCameras("camera name", expected="a text, as of a photo", got=repr(name)[:MAX_TEXT])
@@ -110,15 +103,7 @@ class Camera:
 
     @classmethod
     def pinhole(
-        cls,
-        name: str,
-        width: int,
-        height: int,
-        fx: float,
-        fy: float,
-        cx: float,
-        cy: float,
-        viewmat: Matrix,
+        cls, name: str, width: int, height: int, fx: float, fy: float, cx: float, cy: float, viewmat: Matrix
     ) -> Camera:
         """Make a camera of intrinsics in pixels, the principal point from the left and top edge of the image."""
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
@@ -126,14 +111,7 @@ class Camera:
 
     @classmethod
     def from_camera_to_world(
-        cls,
-        pose: Matrix,
-        K: Matrix,
-        width: int,
-        height: int,
-        *,
-        convention: Convention,
-        name: str = "",
+        cls, pose: Matrix, K: Matrix, width: int, height: int, *, convention: Convention, name: str = ""
     ) -> Camera:
         """Return a camera of its pose in the world, whose axes follow a named convention.
 

@@ -15,13 +15,7 @@ from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, model_validat
 from liftcore.errors import InvalidSettings
 from liftcore.runtime.arguments import device_name
 from liftcore.runtime.fields import Body, takes
-from liftcore.scene.compositing import (
-    LARGEST_ALPHA,
-    MOST_OF_A_RAY,
-    CompositingParams,
-    Weighting,
-    check_antialiased,
-)
+from liftcore.scene.compositing import LARGEST_ALPHA, MOST_OF_A_RAY, CompositingParams, Weighting, check_antialiased
 
 if TYPE_CHECKING:  # it loads torch
     from liftcore.scene.splats import Splats
@@ -105,10 +99,7 @@ class LiftSettings(Body):
         "the result and its place": ("dtype", "codes", "diagnostic_rays", "reference_channels", "seed", "device"),
     }  # fmt: skip
 
-    preset: Preset = Field(
-        Preset.DEFAULT,
-        description="sets `top_k`, `power` and `gain`; `default` also `robust`",
-    )
+    preset: Preset = Field(Preset.DEFAULT, description="sets `top_k`, `power` and `gain`; `default` also `robust`")
     quality: Quality = Field(
         Quality.EXACT,
         description="level of quality: `exact`, `balanced`, `fast` or `draft`, from the slowest to the fastest. It "
@@ -157,10 +148,7 @@ class LiftSettings(Body):
     )
     levels: Annotated[
         Literal["rows"] | Annotated[int, Field(strict=True, ge=0)], takes("'rows' or the number of a level")
-    ] = Field(
-        "rows",
-        description="levels of a region map: `rows` are those of all, a number is the one to take",
-    )
+    ] = Field("rows", description="levels of a region map: `rows` are those of all, a number is the one to take")
     robust: bool = Field(
         False,
         description="multiply each region's weight at a splat by its agreement with the other views; masks also by "
@@ -199,10 +187,7 @@ class LiftSettings(Body):
         500, ge=2, le=10_000_000, description="the least number of splats in a cluster"
     )
     diagnostic_rays: int = Field(
-        4_000,
-        ge=0,
-        le=MOST_DIAGNOSTIC_RAYS,
-        description="rays sampled for the diagnostics, a million at most",
+        4_000, ge=0, le=MOST_DIAGNOSTIC_RAYS, description="rays sampled for the diagnostics, a million at most"
     )
     seed: int = Field(
         0,

@@ -68,11 +68,7 @@ class Regions:
             vars(self).update(labels=_labels(labels, len(self.codebook)))
 
     @classmethod
-    def from_masks(
-        cls,
-        masks: Array | Sequence[Array],
-        vectors: Array,
-    ) -> Self:
+    def from_masks(cls, masks: Array | Sequence[Array], vectors: Array) -> Self:
         """Return regions of masks that may overlap, as those of SAM, with a vector each.
 
         A pixel under several masks has a label of each, on a level of its own (`label_levels`): it reads all their

@@ -55,11 +55,7 @@ add_list(router, "lifts", Lift, Lift.of_row)
 
 @router.post("/lifts", status_code=201, responses=REPEATED, **UPLOAD)
 async def create_lift(
-    request: Request,
-    response: Response,
-    deps: Deps,
-    owner: Caller,
-    cameras: LiftCameras = None,
+    request: Request, response: Response, deps: Deps, owner: Caller, cameras: LiftCameras = None
 ) -> Lift:
     """Upload a lift file of the command line. It is checked whole.
 

@@ -14,15 +14,7 @@ from liftcore.cli import build_parser
 from liftcore.values.settings import Quality
 from service.settings import ServiceSettings
 
-from .readme import (
-    FOR_USERS,
-    PAGES,
-    ROOT,
-    SERVICE,
-    inline_code,
-    shell_commands,
-    text,
-)
+from .readme import FOR_USERS, PAGES, ROOT, SERVICE, inline_code, shell_commands, text
 
 
 @pytest.mark.parametrize("document", PAGES)

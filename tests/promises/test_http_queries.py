@@ -11,17 +11,7 @@ import numpy as np
 import pytest
 
 from tests.server import Server, until
-from tests.tiny_scene import (
-    CHANNELS,
-    HEIGHT,
-    SPLATS_A_CLUSTER,
-    WIDTH,
-    WORDS,
-    codebook,
-    ply,
-    splat_rows,
-    text_table,
-)
+from tests.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH, WORDS, codebook, ply, splat_rows, text_table
 
 from .over_http import NO_ASSET, NO_ID, array, assert_problem, delete_lift, lift_of, picture, upload
 
@@ -157,11 +147,7 @@ def test_uploaded_table_answers_and_completes(client: httpx.Client, lift: dict[s
     path = "/query/suggested_words"
     words = client.get(path, params=fields | {"text": "no"}).json()
     assert [entry["word"] for entry in words["words"]] == ["novel"]
-    assert set(client.get(path, params=fields).json()["scene_words"]) == {
-        "fruit",
-        "novel",
-        "light",
-    }
+    assert set(client.get(path, params=fields).json()["scene_words"]) == {"fruit", "novel", "light"}
     assert_problem(client.get("/query", params=fields | {"text": "light", "encoder": "default"}), 422)
     assert_problem(client.get("/query", params=fields | {"text": "light", "table": lift["splats"]}), 422)
     for words in ([], ["novel", "novel"], ["zeppelin"]):

@@ -72,8 +72,7 @@ def dense_lift(scene: RandomScene, name_of_settings: str) -> tuple[np.ndarray, n
 
 @pytest.mark.parametrize("grids", [False, True])
 @pytest.mark.parametrize(
-    ("name", "kernel"),
-    [*((name, "3dgs") for name in SETTINGS), *(("row-sum", kernel) for kernel in KERNELS[1:])],
+    ("name", "kernel"), [*((name, "3dgs") for name in SETTINGS), *(("row-sum", kernel) for kernel in KERNELS[1:])]
 )
 def test_lift_equals_its_dense_definition(name: str, kernel: str, grids: bool) -> None:
     scene = random_scene(11, count=60, grids=grids, kernel=kernel, wrong=0.3 if kernel == "3dgs" else 0.0)

@@ -32,12 +32,7 @@ UNDECIDED = 0.03  # of rays too close to call in a weighting, which no compariso
 GAIN = CompositingParams(opacity_logit_scale=1.2)
 UNSCALED = (CompositingParams(), CompositingParams(alpha_cap=0.999, transmittance_stop=0.05))
 PARAMS = (*UNSCALED, GAIN, CompositingParams(opacity_logit_scale=0.5))
-SELECTIONS = (
-    Weighting(1, top_k=1),
-    Weighting(2, top_k=3),
-    Weighting(1, top_k=2),
-    Weighting(1, top_k=64),
-)
+SELECTIONS = (Weighting(1, top_k=1), Weighting(2, top_k=3), Weighting(1, top_k=2), Weighting(1, top_k=64))
 POWERS = (Weighting(1), Weighting(2))
 FOOTPRINTS = {str(kernel): (kernel, False) for kernel in Kernel} | {"3dgs antialiased": (Kernel.GAUSSIAN_3D, True)}
 

@@ -147,11 +147,7 @@ def at(
 
 
 def view_of(
-    name: str,
-    scene: Scene,
-    claim: Callable[[np.ndarray], bool] = always,
-    like: Scene | None = None,
-    **options: Any,
+    name: str, scene: Scene, claim: Callable[[np.ndarray], bool] = always, like: Scene | None = None, **options: Any
 ) -> Extreme:
     """An extreme whose weights are held to the oracle.
 

@@ -86,10 +86,7 @@ def test_diagnostics_name_the_device_that_lifted(tmp_path: Path) -> None:
 
 
 def test_room_that_ends_in_the_middle_is_said_in_words(card: pytest.MonkeyPatch) -> None:
-    with (
-        pytest.raises(Unavailable, match=r"memory for the lift on Card, got 4\.0 GiB free"),
-        within_memory(CARD),
-    ):
+    with pytest.raises(Unavailable, match=r"memory for the lift on Card, got 4\.0 GiB free"), within_memory(CARD):
         raise torch.OutOfMemoryError
     with pytest.raises(Unavailable, match=r"memory for the lift on Card, got 4\.0 GiB free"), within_memory(CARD):
         raise RuntimeError("Triton Error [CUDA]: out of memory")

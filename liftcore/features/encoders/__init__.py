@@ -8,12 +8,7 @@ from torch import Tensor
 
 from liftcore.errors import InvalidInput, Unavailable
 
-IMAGE_ENCODERS = (
-    "maskclip:MODEL/TAG",
-    "maskclip:MODEL@FILE",
-    "timm:NAME",
-    "timm:NAME@FILE",
-)
+IMAGE_ENCODERS = ("maskclip:MODEL/TAG", "maskclip:MODEL@FILE", "timm:NAME", "timm:NAME@FILE")
 
 
 @dataclass(frozen=True)

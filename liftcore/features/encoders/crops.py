@@ -58,11 +58,7 @@ class CropEncoder:
 
 
 def crop_vectors(
-    masks: Mapping[str, Path],
-    photos: Mapping[str, Path],
-    encoder: CropEncoder,
-    unlabelled: int,
-    progress: Progress,
+    masks: Mapping[str, Path], photos: Mapping[str, Path], encoder: CropEncoder, unlabelled: int, progress: Progress
 ) -> tuple[dict[str, np.ndarray], dict[str, Reading]]:
     """Encode the crops of masks: view -> unit vectors [M, F] f16; and view -> the orientation its photo was read in.
 

@@ -23,14 +23,7 @@ from liftcore.errors import InvalidSettings, Unavailable
 from liftcore.lifting.algebra import WeightStatistics
 from liftcore.lifting.checkpoint import Checkpoint
 from liftcore.lifting.engines import Engine
-from liftcore.lifting.engines.blocks import (
-    SCENE,
-    PiecesInFiles,
-    forget_files,
-    gather,
-    weigh,
-    write_scene,
-)
+from liftcore.lifting.engines.blocks import SCENE, PiecesInFiles, forget_files, gather, weigh, write_scene
 from liftcore.lifting.inputs import LiftInputs
 from liftcore.lifting.pieces import PIECE_VIEWS, ROWS, SELECTED, region_offsets
 from liftcore.lifting.planning.plan import Plan

@@ -40,12 +40,7 @@ class RayEngine:
     """
 
     def __init__(
-        self,
-        address: str | None = None,
-        *,
-        scratch: Path | str | None = None,
-        cpus: int = 1,
-        gpus: float = 1.0,
+        self, address: str | None = None, *, scratch: Path | str | None = None, cpus: int = 1, gpus: float = 1.0
     ) -> None:
         if cpus < 1:
             raise InvalidInput("cpus", expected="at least 1 core of a worker", got=str(cpus))

@@ -96,10 +96,7 @@ class Visibility:
 
 
 def visibility(
-    splats: Splats,
-    cameras: Sequence[Camera],
-    params: CompositingParams,
-    threads: int | None = None,
+    splats: Splats, cameras: Sequence[Camera], params: CompositingParams, threads: int | None = None
 ) -> Visibility:
     """Project evenly spaced splats, SAMPLE at most, into every camera."""
     sample = splats[spaced_indices(splats.count, min(SAMPLE, splats.count))]

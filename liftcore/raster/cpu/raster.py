@@ -20,20 +20,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from liftcore.raster.base import (
-    Raster,
-    RayRows,
-    ViewRequest,
-    ViewWeights,
-    check_params,
-)
-from liftcore.raster.cpu.composite import (
-    Frame,
-    kernel_in,
-    render_tiles,
-    strongest_tiles,
-    trace_rays,
-)
+from liftcore.raster.base import Raster, RayRows, ViewRequest, ViewWeights, check_params
+from liftcore.raster.cpu.composite import Frame, kernel_in, render_tiles, strongest_tiles, trace_rays
 from liftcore.raster.cpu.project import (
     COLUMNS,
     EXTENT_X,

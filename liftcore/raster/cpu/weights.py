@@ -362,13 +362,7 @@ def _read_lines(pixel_lines, pixel, lines, line_count, cell, share):
 
 
 def weigh_tiles(
-    first: int,
-    last: int,
-    frame: Frame,
-    reading: ViewReading,
-    squared: bool,
-    top_k: int,
-    with_unscaled: bool | None,
+    first: int, last: int, frame: Frame, reading: ViewReading, squared: bool, top_k: int, with_unscaled: bool | None
 ) -> tuple[np.ndarray, ...]:
     """Return the entries of tiles ``first..last``.
 

@@ -78,8 +78,5 @@ def launch(kernel: Any, programs: int, *arguments: object, warps: int = WARPS, *
         return
     device = next(argument.device for argument in arguments if isinstance(argument, torch.Tensor))
     current_device = torch.cuda.device(device) if device.type == "cuda" else nullcontext()  # as Triton's
-    with (
-        current_device,
-        np.errstate(all="ignore"),
-    ):  # numpy, in the interpreter: kernels expect infinities
+    with current_device, np.errstate(all="ignore"):  # numpy, in the interpreter: kernels expect infinities
         kernel[(programs,)](*arguments, **constants, num_warps=warps, num_stages=1, enable_fp_fusion=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -76,7 +77,7 @@ def test_a_label_is_a_name_whatever_is_in_it(folder: Path, tmp_path: Path) -> No
 
         name, channels = "any", lc.Scene(folder / LIFT).channels
 
-        def encode(self, texts: list[str]) -> np.ndarray:
+        def encode(self, texts: Sequence[str]) -> np.ndarray:
             return lc.open_encoder(f"table:{folder / TABLE}").encode([text.split()[-1] for text in texts])
 
     labels = write_labels(tmp_path, truth_of(folder), ("other apple", "salt and book", "no left lamp"))

@@ -56,11 +56,7 @@ def test_splats_without_weight_do_not_decide_the_threshold(exact: Scene) -> None
     outliers = np.zeros((COUNT, CHANNELS))
     outliers[:, 0], outliers[:, 1] = 1.0, np.linspace(0.0, 3.0, COUNT)  # scores all over the range
     weights = torch.cat([torch.ones(COUNT), torch.full((COUNT,), 1e-4)])
-    crowd = lifted(
-        exact,
-        np.concatenate([exact.features.rows, outliers]),
-        total_weight=weights,
-    )
+    crowd = lifted(exact, np.concatenate([exact.features.rows, outliers]), total_weight=weights)
     answer = ask(crowd, "x", Axes())
     assert np.array_equal(answer.selected[:COUNT], reference.selected)
     assert answer.selected[COUNT] and answer.count > reference.count  # the outliers are selected even so

@@ -26,14 +26,7 @@ def coloured(kernel: Kernel) -> lc.Splats:
     return replace(splats, sh=sh, sb_params=lobes, extras=extras)
 
 
-@pytest.mark.parametrize(
-    "keep",
-    [
-        np.arange(60) % 3 == 1,
-        list(range(1, 60, 3)),
-        torch.arange(-59, 0, 3),
-    ],
-)
+@pytest.mark.parametrize("keep", [np.arange(60) % 3 == 1, list(range(1, 60, 3)), torch.arange(-59, 0, 3)])
 def test_chosen_rows_have_all_their_columns(keep: Any) -> None:
     splats = coloured(Kernel.BETA)
     subset = splats[keep]
