@@ -276,17 +276,19 @@ class Store:
         size, path = draft.stat().st_size, self.root / "blobs" / f"{sha256}{content['suffix']}"
         sync(draft)
         with self._blobs_lock:  # else the deletion of the same bytes might take the new file
+            present = self.find_asset(owner, f"sha256:{sha256}")
+            if present is not None and present.kind != kind:
+                hint = f"delete that asset, or upload a file of the {kind} alone"
+                raise Conflict(
+                    "asset", expected="bytes of one kind", got=f"{kind}, here as {present.kind}", hint=hint
+                )
             draft.replace(path)
             sync(path.parent)
             row = (f"sha256:{sha256}", owner.owner, kind, size, f"blobs/{path.name}", json.dumps(content["counts"]),
                    json.dumps(content["warnings"]), time.time())  # fmt: skip
             with self.write() as connection:
                 connection.execute("INSERT OR IGNORE INTO assets VALUES (?, ?, ?, ?, ?, ?, ?, ?)", row)
-        asset = self.asset(owner, f"sha256:{sha256}")
-        if asset.kind != kind:
-            hint = f"delete that asset, or upload a file of the {kind} alone"
-            raise Conflict("asset", expected="bytes of one kind", got=f"{kind}, here as {asset.kind}", hint=hint)
-        return asset
+        return self.asset(owner, f"sha256:{sha256}")
 
     def find_asset(self, owner: Owner, asset: str) -> Asset | None:
         """Return the asset of that id; None if there is none."""
