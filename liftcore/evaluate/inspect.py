@@ -17,6 +17,7 @@ from liftcore.features.smoothness import some_grids, unlike_maps
 from liftcore.io.cameras import camera_source, read_cameras
 from liftcore.io.formats import SplatFormat
 from liftcore.io.kinds import identify
+from liftcore.io.npy import as_floats
 from liftcore.io.photo_zip import describe_photos
 from liftcore.io.ply import EXPORT_PLY, dialect_of
 from liftcore.io.safetensors_file import check_arrays, check_header, map_tensors
@@ -333,8 +334,8 @@ def describe_table(path: Path) -> dict[str, Any]:
         tensors, metadata = map_tensors(path)
         if other_tensors := sorted(tensors.keys() - {"embeddings"}):
             raise ValueError(f"embeddings alone, got {other_tensors[0][:80]!r} beside them")
-        embeddings = tensors["embeddings"]
-        check_arrays(tensors, {"embeddings": ("f2 f4", "n F")})
+        check_arrays(tensors, {"embeddings": ("f2 f4 V2", "n F")})
+        embeddings = as_floats(tensors["embeddings"])
     norms = torch.linalg.vector_norm(torch.from_numpy(embeddings).float(), dim=1)
     words = _words(metadata)
     warnings = [] if len(words) == len(embeddings) else [f"{len(words)} words for {len(embeddings)} rows"]

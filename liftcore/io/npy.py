@@ -43,14 +43,14 @@ def _mapped(path: Path, kinds: str) -> np.ndarray:
     with open_regular(path) as handle:
         size = handle.seek(0, 2)
         handle.seek(0)
-        dtype = _check_header(handle, size, kinds)
+        _check_header(handle, size, kinds)
         is_empty = handle.tell() == size  # which cannot be mapped
     array = np.load(path, mmap_mode=None if is_empty else "r", allow_pickle=False)
-    return _widened(array) if dtype == BFLOAT16 else array
+    return as_floats(array)
 
 
-def _check_header(handle: IO[bytes], size: int, kinds: str) -> np.dtype[Any]:
-    """Check the header of a file of ``size`` bytes, leave the handle at the data, and return the dtype."""
+def _check_header(handle: IO[bytes], size: int, kinds: str) -> None:
+    """Check the header of a file of ``size`` bytes, and leave the handle at the data."""
     version = np.lib.format.read_magic(handle)
     if version not in READERS:
         raise ValueError(f"format version {version}")
@@ -60,12 +60,13 @@ def _check_header(handle: IO[bytes], size: int, kinds: str) -> np.dtype[Any]:
         raise ValueError(f"an array of numbers, got {got}")
     if any(side < 0 for side in shape) or handle.tell() + math.prod(shape) * dtype.itemsize != size:
         raise ValueError(f"{dtype} {list(shape)} as its header says, got a file of {size} bytes")
-    return dtype
 
 
-def _widened(stored: np.ndarray) -> np.ndarray:
-    """Convert bfloat16, the upper half of a float32, to f32."""
-    return (stored.view(np.uint16).astype(np.uint32) << 16).view(np.float32)
+def as_floats(array: np.ndarray) -> np.ndarray:
+    """Convert bfloat16, the upper half of a float32, to f32; an array of another type is returned as it is."""
+    if array.dtype != BFLOAT16:
+        return array
+    return (array.view(np.uint16).astype(np.uint32) << 16).view(np.float32)
 
 
 def _zipped(path: Path, kinds: str) -> np.ndarray:
@@ -77,10 +78,10 @@ def _zipped(path: Path, kinds: str) -> np.ndarray:
         if members[0].file_size > MOST_UNZIPPED_BYTES:
             raise ValueError(f"at most {MOST_UNZIPPED_BYTES} bytes, got {members[0].file_size} bytes")
         with archive.open(members[0]) as handle:
-            dtype = _check_header(handle, members[0].file_size, kinds)
+            _check_header(handle, members[0].file_size, kinds)
         with archive.open(members[0]) as handle:
             array = np.lib.format.read_array(handle, allow_pickle=False)
-        return _widened(array) if dtype == BFLOAT16 else array
+        return as_floats(array)
 
 
 def _tensor(path: Path, kinds: str) -> np.ndarray:

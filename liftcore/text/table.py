@@ -10,6 +10,7 @@ from typing import Self
 import numpy as np
 
 from liftcore.errors import InvalidQuery, InvalidTable, reading
+from liftcore.io.npy import as_floats
 from liftcore.io.safetensors_file import check_arrays, check_header, map_tensors
 from liftcore.runtime.one_line import one_line
 from liftcore.text import check_texts
@@ -73,15 +74,15 @@ class TableEncoder:
 
     @classmethod
     def of(cls, name: str, words: str, embeddings: np.ndarray) -> Self:
-        """Create a table from the words of a file, a JSON list of n strings, and its embeddings [n, F] f16 or f32."""
+        """Create a table from the words of a file, a JSON list of n strings, and embeddings [n, F] of any floats."""
         with reading(name, InvalidTable, "metadata words, a JSON list of strings"):
             word_list = json.loads(words)
             if not isinstance(word_list, list) or not all(
                 isinstance(word, str) and not _HALF.search(word) for word in word_list
             ):
                 raise ValueError(repr(words[:80]))
-            check_arrays({"embeddings": embeddings}, {"embeddings": ("f2 f4", "n F")})
-        return cls(name, word_list, embeddings)
+            check_arrays({"embeddings": embeddings}, {"embeddings": ("f2 f4 V2", "n F")})
+        return cls(name, word_list, as_floats(embeddings))
 
     def encode(self, texts: Sequence[str]) -> np.ndarray:
         """Encode n words as [n, F] f32 unit rows."""

@@ -17,10 +17,10 @@ pytestmark = pytest.mark.slow
 WORDS = ["alarm_clock", "Teapot", "the end", "a", "scar", "car_(automobile)"]
 
 
-@pytest.fixture
-def table(tmp_path: Path) -> Path:
+@pytest.fixture(params=[torch.float16, torch.bfloat16])
+def table(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
     path = tmp_path / "words.safetensors"
-    rows = torch.eye(6).mul(3).half()
+    rows = torch.eye(6).mul(3).to(request.param)
     save_file({"embeddings": rows}, str(path), metadata={"words": json.dumps(WORDS)})
     return path
 
