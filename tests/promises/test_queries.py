@@ -205,21 +205,10 @@ def test_selections_by_hand_are_asked_as_they_are(lift: Path) -> None:
     ]  # one of its own
 
 
-@pytest.mark.parametrize(
-    "notation",
-    [
-        "",
-        ":1,2",
-        "v:1.5,2",
-        "v:1",
-        "splat:-1",
-        "region:v:1",
-        "v:box:1,2",
-        "v:box:1,2,3",
-        "v:box:1,2,3,inf",
-        "v:stroke:1,2,3",
-    ],
-)
+@pytest.mark.parametrize("notation", [
+    "", ":1,2", "v:1.5,2", "v:1", "splat:-1", "region:v:1", "v:box:1,2", "v:box:1,2,3", "v:box:1,2,3,inf",
+    "v:stroke:1,2,3",
+])  # fmt: skip
 def test_notation_of_no_example_is_refused(notation: str, lift: Path) -> None:
     with pytest.raises(lc.InvalidQuery, match="like"):
         lc.Scene(lift).ask(lc.Query(like=[notation]))

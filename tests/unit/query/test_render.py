@@ -67,6 +67,15 @@ def test_a_mask_is_where_objects_have_most_of_a_ray(scene: Scene) -> None:
     assert not empty.mask.any() and "the 0 objects that were found" in empty.explanation
 
 
+def test_of_very_many_splats_all_are_shown_unless_some_objects_are_kept(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answer = of(scene, 0, 1)
+    monkeypatch.setattr("liftcore.query.render.MOST_GROUPED", answer.count - 1)
+    assert "too many to group" in view_mask(scene, answer, "middle").explanation
+    assert "the 1 object that" in view_mask(scene, answer_with(answer, keep="largest"), "middle").explanation
+
+
 def test_clusters_have_their_colours_and_the_rest_is_grey(scene: Scene) -> None:
     with pytest.raises(InvalidQuery, match="aggregation"):
         render_png(scene, "middle", "cluster")
