@@ -58,6 +58,7 @@ def test_splats_without_weight_do_not_decide_the_threshold(exact: Scene) -> None
     weights = torch.cat([torch.ones(COUNT), torch.full((COUNT,), 1e-4)])
     crowd = lifted(exact, np.concatenate([exact.features.rows, outliers]), total_weight=weights)
     answer = ask(crowd, "x", Axes())
+    assert crowd.effective_count == pytest.approx(COUNT - 1, rel=0.01)
     assert np.array_equal(answer.selected[:COUNT], reference.selected)
     assert answer.selected[COUNT] and answer.count > reference.count  # the outliers are selected even so
 

@@ -62,14 +62,12 @@ def test_splat_of_no_word_gets_the_one_of_most_of_its_node(clear: Scene) -> None
     rows[:3], odd = torch.from_numpy(EYE[6]), [0, 1, 2]
     nodes = torch.from_numpy(np.where(np.arange(COUNT) == 2, -1, CLUSTER).astype(np.int32))
     views = torch.zeros((3, 5), dtype=torch.int32)
-    tree = {
-        "object": nodes,
-        "object_views": views,
-        "node": nodes,
+    tree = {"object": nodes, "object_views": views, "node": nodes, "node_views": views}
+    tree |= {
         "node_parents": views[:, 0] - 1,
-        "node_views": views,
+        "node_confidence": torch.ones(3),
+        "node_features": torch.from_numpy(EYE[:3]).half(),
     }
-    tree |= {"node_confidence": torch.ones(3), "node_features": torch.from_numpy(EYE[:3]).half()}
     lift = replace(clear.lift, rows=rows, has_feature=torch.arange(COUNT) != 1)
     without_tree, with_tree = (Scene(replace(lift, **fields), clear.splats) for fields in (dict.fromkeys(tree), tree))
     words = ["apple", "book", "lamp"]

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from liftcore.query.question import METHODS
-from liftcore.query.threshold import find_threshold
+from liftcore.query.threshold import find_threshold, has_one_mode
 
 
 def hills(*parts: tuple[float, float, int], seed: int = 0) -> torch.Tensor:
@@ -54,6 +54,13 @@ def test_auto_takes_no_score_below_least() -> None:
 def test_auto_says_when_nothing_stands_apart() -> None:
     assert "with care" in find_threshold(hills((0.2, 0.05, 50_000)), "auto").explanation
     assert "with care" not in find_threshold(hills((0.2, 0.02, 50_000), (0.4, 0.01, 500)), "auto").explanation
+
+
+def test_a_valley_counts_if_as_many_splats_can_show_it() -> None:
+    hills_apart, hill = hills((0.2, 0.03, 5000), (0.32, 0.03, 2500)).numpy(), hills((0.2, 0.03, 5000)).numpy()
+    value = find_threshold(hills_apart).value
+    assert not has_one_mode(hills_apart, value, None) and has_one_mode(hills_apart, value, None, count=20)
+    assert has_one_mode(hill, 0.2, None)
 
 
 @pytest.mark.parametrize("method", METHODS)

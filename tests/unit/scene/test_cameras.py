@@ -16,23 +16,12 @@ from liftcore.scene.views import require_pairs
 from tests.camera_files import CAMERAS, binary_files, text_files, with_json, write_files
 
 DISTORTED = {**CAMERAS, 1: (2, "SIMPLE_RADIAL", (500.0, 320.0, 240.0, 0.1))}
-TRANSFORMS = {
-    "fl_x": 5,
-    "w": 9,
-    "h": 9,
-    "frames": [{"file_path": "a.png", "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}],
-}
+FRAME = {"file_path": "a.png", "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}
+TRANSFORMS = {"fl_x": 5, "w": 9, "h": 9, "frames": [FRAME]}
 
 
-RECORD = {
-    "img_name": "r_0",
-    "width": 9,
-    "height": 9,
-    "fx": 5,
-    "fy": 5,
-    "position": [0, 0, 0],
-    "rotation": np.eye(3).tolist(),
-}
+POSE = {"position": [0, 0, 0], "rotation": np.eye(3).tolist()}
+RECORD = {"img_name": "r_0", "width": 9, "height": 9, "fx": 5, "fy": 5} | POSE
 
 
 def names(path: Path) -> list[str]:
@@ -115,10 +104,9 @@ def test_broken_poses_of_json_are_named_and_the_others_are_read(tmp_path: Path) 
         {**good, "img_name": "a", "rotation": [[2, 0, 0]] * 3},
         {**good, "img_name": "b", "position": None},
     ]
-    frame = TRANSFORMS["frames"][0]
     still = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
-    poses = {"a": [[2.0, 0, 0, 0], *frame["transform_matrix"][1:]], "b": None, "c": [[math.nan] * 4] * 3, "d": still}
-    frames = [{**frame, "file_path": "good.png"}]
+    poses = {"a": [[2.0, 0, 0, 0], *FRAME["transform_matrix"][1:]], "b": None, "c": [[math.nan] * 4] * 3, "d": still}
+    frames = [{**FRAME, "file_path": "good.png"}]
     frames += [{"file_path": name, "transform_matrix": pose} for name, pose in poses.items()]
     for document, skipped_count in ((records, 2), ({**TRANSFORMS, "frames": frames}, 4)):
         path = with_json(tmp_path, document)

@@ -1,16 +1,19 @@
-"""NaN and infinity in the colours of trained splats: they are grey, and warnings count them."""
+"""NaN and infinity in trained splats: their colours are grey, and warnings count them."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from liftcore.io.splats import read_places, read_splats
 from liftcore.query.splat_colours import view_colours
 from liftcore.scene.kernel import Kernel
 from tests.scenes import look_at, random_splats
+from tests.tiny_scene import PROPERTIES, ply, splat_rows
 
 COUNT = 40
 
@@ -31,3 +34,10 @@ def test_a_colour_that_is_no_number_is_grey_from_everywhere(kernel: Kernel) -> N
         torch.testing.assert_close(colours[grey], torch.full((len(grey), 3), 0.5), atol=1e-6, rtol=0)
         assert bool(torch.isfinite(colours).all())
     assert torch.equal(with_colours.opacity_logits, splats.opacity_logits)
+
+
+def test_places_of_no_number_are_those_that_the_splats_get(tmp_path: Path) -> None:
+    rows = splat_rows()
+    rows[4, PROPERTIES.index("x")] = np.nan
+    (tmp_path / "s.ply").write_bytes(ply(rows))
+    assert np.array_equal(read_places(tmp_path / "s.ply"), read_splats(tmp_path / "s.ply").means.numpy())
