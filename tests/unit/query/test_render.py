@@ -67,9 +67,7 @@ def test_a_mask_is_where_objects_have_most_of_a_ray(scene: Scene) -> None:
     assert not empty.mask.any() and "the 0 objects that were found" in empty.explanation
 
 
-def test_of_very_many_splats_all_are_shown_unless_some_objects_are_kept(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_of_very_many_splats_all_are_shown(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     answer = of(scene, 0, 1)
     monkeypatch.setattr("liftcore.query.render.MOST_GROUPED", answer.count - 1)
     assert "too many to group" in view_mask(scene, answer, "middle").explanation

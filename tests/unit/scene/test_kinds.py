@@ -45,6 +45,7 @@ FOREIGN_FILES = {  # content, a word of its name and of what to do
     "cloud.ply": (CLOUD + b"end_header\n", "point cloud", "trained splats"),
     "a.mp4": (b"\0\0\0\x20ftypisom" + bytes(60), "video", "COLMAP"),
     "a.ply.gz": (b"\x1f\x8b\x08" + bytes(60), "archive", "unpack"),
+    "cut.zip": (zipped({"a.png": bytes(60)})[:50], "damaged", "download it again"),
     "a.pkl": (b"\x80\x04\x95.", "pickle", "export"),
     "weights.safetensors": (save({"visual.conv1.weight": np.zeros(2, "f4")}), "safetensors", "pack"),
     "dataparser_transforms.json": (b'{"transform": [], "scale": 1.0}', "frame", "cameras"),
