@@ -134,6 +134,7 @@ def resolve_query(scene: Scene, query: Query, encoder: TextEncoder | None) -> Re
     """Resolve the terms of a query to directions; all errors of its terms are raised here (see `ask`)."""
     query, phrases = read_query(query, encoder)
     text = query.text[0] if query.text and len(query.positives) == 1 else ""  # that may name a part
+    text = "" if phrases.get(0, ("", ""))[1] == "quotes" else text
     phrase = part_phrase(text, encoder) if text and encoder is not None else None
     if phrase is None:
         request, source = _resolve(scene, query, encoder), table_of(encoder)

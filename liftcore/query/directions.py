@@ -25,7 +25,7 @@ class ReadQuery(NamedTuple):
     """A query whose texts are names, and the phrases that they were read from."""
 
     query: Query  # with the places of the phrases, for errors
-    phrases: Mapping[int, tuple[str, str]]  # by the index of a term: the phrase, and "list" or "negation"
+    phrases: Mapping[int, tuple[str, str]]  # by the index of a term: the phrase, and "list", "negation" or "quotes"
 
 
 def read_query(query: Query, encoder: TextEncoder | None) -> ReadQuery:
@@ -43,7 +43,7 @@ def read_query(query: Query, encoder: TextEncoder | None) -> ReadQuery:
             reading = read_phrase(term, is_word)
             if is_negative and reading.negatives:
                 raise InvalidQuery("negatives", expected="names of what it is not", got=repr(term[:80]))
-        form = "list" if reading.negatives or reading.names != (term,) else ""
+        form = "quotes" if reading.is_quoted else "list" if reading.negatives or reading.names != (term,) else ""
         terms.extend((is_negative, False, place, form, name) for name in reading.names)
         terms.extend((True, False, place, "negation", name) for name in reading.negatives)
     terms.sort(key=itemgetter(0, 1))

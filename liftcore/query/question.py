@@ -354,10 +354,13 @@ class WordMatch(Value):
 
     text: str
     word: str = Field(description="for a part: that part of the object in which it is searched")
-    match: Literal["spelling", "qualifier", "synonym", "number", "head", "part", "list", "negation"] = Field(
-        description="the kind of match: letters, a word that says which is meant, meaning, one or several, the "
-        "head of a phrase, a part that it names, one of several that it names, or one that a negation excludes"
-    )
+    match: Literal[
+        "spelling", "qualifier", "synonym", "number", "head", "part", "list", "negation", "quotes"
+    ] = Field(
+        description="the kind of match: letters, a word that says which is meant, meaning, one or several, the head "
+        "of a phrase, a part that it names, one of several that it names, one that a negation excludes, or what is "
+        "in quotes"
+    )  # fmt: skip
 
 
 class SuggestedWord(Value):

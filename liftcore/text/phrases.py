@@ -62,10 +62,11 @@ _NUMBERS = frozenset({
     "many", "few", "no.", "half",
 })  # fmt: skip
 _NEGATION = re.compile(
-    r"(?:^|[\s,;(]+)(?:[-!](?=\w)|(?:but not|and not|or not|rather than|instead of|other than|apart from|"
-    r"aside from|except for|except|excluding|exclude|remove|hide|delete|ignore|without|w/o|minus|but|not|no|non|"
-    r"never|neither|nor|isn't|aren't|don't)(?=\s|$))"
+    r"(?:^|[\s,;(]+)(?:[-!](?=[^\W\d]|[\"\u201c])|(?:but not|and not|or not|rather than|instead of|other than|"
+    r"apart from|aside from|except for|except|excluding|exclude|remove|hide|delete|ignore|without|w/o|minus|but|not|"
+    r"no|non|never|neither|nor|isn't|aren't|don't)(?=\s|$))"
 )
+_QUOTATION = re.compile(r"""\s*["\u201c]\s*([^"\u201c\u201d]*[^\s"\u201c\u201d])\s*["\u201d]\s*""")
 _ALTERNATIVES = frozenset({"but", "rather than", "instead of"})
 _UNIVERSALS = frozenset({
     "", "it", "everything", "anything", "something", "nothing", "all", "any", "every", "things", "thing", "objects",
@@ -88,6 +89,7 @@ class Reading(NamedTuple):
 
     names: tuple[str, ...]
     negatives: tuple[str, ...]
+    is_quoted: bool = False  # True for a name that was in quotes, which is read as it is
 
 
 class PartPhrase(NamedTuple):
@@ -107,9 +109,8 @@ def read_phrase(text: str, is_word: Callable[[str], bool] | None) -> Reading:
     Args:
         is_word: whether a table has a word for a text as a whole; None for an encoder that reads any text.
     """
-    phrase = text.strip()
-    if len(phrase) > 2 and phrase[0] == phrase[-1] == '"':
-        return Reading((phrase[1:-1],), ())
+    if quotation := _QUOTATION.fullmatch(text):
+        return Reading((quotation[1],), (), is_quoted=True)
     is_name = is_word or (lambda _: False)
     typed = _tidy(text)
     if is_name(typed):
@@ -160,7 +161,7 @@ def _refuse(subject: str, text: str, rest: str, is_word: Callable[[str], bool] |
     expected = f"a name, a part, a list or a negation: {subject} are not understood"
     hint = f"ask for {rest!r}" if rest not in _DETERMINERS | _UNIVERSALS else "ask for the thing by its name"
     if is_word is None:
-        hint += "; or put the text in double quotes, to ask for it as it is"
+        hint += "; or put all of the text in double quotes, to ask for it as it is"
     raise InvalidQuery("text", expected=expected, got=repr(text[:80]), hint=hint)
 
 

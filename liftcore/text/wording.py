@@ -27,7 +27,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from liftcore.errors import InvalidQuery
-from liftcore.text.phrases import ARTICLES, IRREGULAR, PUNCTUATION, PartPhrase, heads, part_phrases, read_phrase
+from liftcore.text.phrases import (
+    ARTICLES,
+    IRREGULAR,
+    PUNCTUATION,
+    PartPhrase,
+    Reading,
+    heads,
+    part_phrases,
+    read_phrase,
+)
 
 SYNONYMS = Path(__file__).with_name("synonyms.json")
 SUGGESTED = 5  # words suggested for an unknown one
@@ -115,7 +124,7 @@ class Vocabulary:
             reading = read_phrase(text, self.has_word)
         except InvalidQuery:
             return None
-        if reading != ((text,), ()):
+        if reading != Reading((text,), ()):
             return None
         head = self._head(text)
         return None if head is None else Wording(text, head[1], "head")

@@ -324,6 +324,13 @@ def test_directory_without_its_database_or_with_anothers_is_refused(tmp_path: Pa
     assert len(list((tmp_path / "blobs").iterdir())) == 1
 
 
+def test_bytes_that_are_here_as_another_kind_are_refused(store: Store) -> None:
+    asset = add_asset(store, ANNA, "splats", b"x")
+    with pytest.raises(Conflict, match="cameras, here as splats"):
+        add_asset(store, ANNA, "cameras", b"x")
+    assert store.asset(ANNA, asset, "splats").file.read_bytes() == b"x" and store.unnamed_files() == []
+
+
 def test_bytes_of_two_owners_go_with_the_last(store: Store) -> None:
     asset = add_asset(store, ANNA, "splats", b"x")
     assert add_asset(store, BERT, "splats", b"x") == asset

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import socket
-import zipfile
 from typing import Any
 
 import httpx
@@ -14,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.server import Server, until
-from tests.tiny_scene import TinyScene, cameras_json, colmap_zip, labels, masks, ply, splat_rows, text_table
+from tests.tiny_scene import TinyScene, colmap_zip, labels, masks, ply, splat_rows, text_table
 
 from .over_http import INPUTS, NO_ASSET, assert_problem, mutated, photos_zip, upload
 
@@ -53,15 +51,6 @@ def test_file_of_each_kind_is_stored_under_its_digest(client: httpx.Client, kind
     for path in (reply.headers["location"], asset["links"]["content"]):
         assert_problem(client.get(path), 404)
     assert_problem(client.delete(reply.headers["location"]), 404)
-
-
-def test_same_bytes_are_of_one_kind(client: httpx.Client) -> None:
-    content = io.BytesIO(photos_zip())
-    with zipfile.ZipFile(content, "a") as archive:
-        archive.writestr("transforms.json", cameras_json())
-    asset = upload(client, "cameras", content.getvalue())
-    assert "cameras" in assert_problem(client.put("/assets/photos", content=content.getvalue()), 409)["got"]
-    delete(client, asset)
 
 
 def test_same_bytes_are_the_same_asset_however_they_come(

@@ -25,6 +25,7 @@ READ = {
     "the lamp, not the mug": "lamp", "lamp without bowls": "lamp", "mug and bowl except the lamp": "mug bowl",
     "mug -bowl": "mug", "mug (not bowl)": "mug", "mug w/o bowls": "mug", "mug \u00b7 bowl": "mug bowl",
     "mug\tbowl": "mug bowl", "mug vs. bowl": "mug bowl", '"mug"': "mug",
+    '"mug", "bowl"': "mug bowl", 'mug -"bowl"': "mug", "\u201cmug\u201d": "mug",
     "not the mug but the bowl": "bowl", "bowl rather than mug": "bowl", "bowl, not mug, not lamp": "bowl",
 }  # fmt: skip
 REFUSALS = {

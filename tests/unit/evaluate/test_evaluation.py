@@ -80,7 +80,7 @@ def test_a_label_is_a_name_whatever_is_in_it(folder: Path, tmp_path: Path) -> No
         def encode(self, texts: Sequence[str]) -> np.ndarray:
             return lc.open_encoder(f"table:{folder / TABLE}").encode([text.split()[-1] for text in texts])
 
-    labels = write_labels(tmp_path, truth_of(folder), ("other apple", "salt and book", "no left lamp"))
+    labels = write_labels(tmp_path, truth_of(folder), ("other apple", "salt and book", "no left base of the lamp"))
     evaluation = evaluate_lift(folder / LIFT, labels, encoder=Reader())
     assert min(row.iou or 0 for row in evaluation.objects) > 0.9
 
