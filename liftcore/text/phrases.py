@@ -66,7 +66,7 @@ _NEGATION = re.compile(
     r"apart from|aside from|except for|except|excluding|exclude|remove|hide|delete|ignore|without|w/o|minus|but|not|"
     r"no|non|never|neither|nor|isn't|aren't|don't)(?=\s|$))"
 )
-_QUOTATION = re.compile(r"""\s*["\u201c]\s*([^"\u201c\u201d]*[^\s"\u201c\u201d])\s*["\u201d]\s*""")
+_QUOTATION = re.compile(r"""["\u201c]\s*([^\s"\u201c\u201d][^"\u201c\u201d]*)["\u201d]""")  # of a whole text
 _ALTERNATIVES = frozenset({"but", "rather than", "instead of"})
 _UNIVERSALS = frozenset({
     "", "it", "everything", "anything", "something", "nothing", "all", "any", "every", "things", "thing", "objects",
@@ -109,8 +109,8 @@ def read_phrase(text: str, is_word: Callable[[str], bool] | None) -> Reading:
     Args:
         is_word: whether a table has a word for a text as a whole; None for an encoder that reads any text.
     """
-    if quotation := _QUOTATION.fullmatch(text):
-        return Reading((quotation[1],), (), is_quoted=True)
+    if quotation := _QUOTATION.fullmatch(text.strip()):
+        return Reading((quotation[1].rstrip(),), (), is_quoted=True)
     is_name = is_word or (lambda _: False)
     typed = _tidy(text)
     if is_name(typed):
